@@ -267,7 +267,8 @@ def test_the_published_torus_point_is_not_itself_the_chenciner_point():
 
     from experiments.atlas.hybrid import modes
     from vrw_jax import StepOptions
-    from vrw_jax.numerics import simulate_hybrid, solve_fixed_point
+    from vrw_jax.continuation import solve_fixed_point
+    from vrw_jax.hybrid import simulate_hybrid
 
     case = import_atlas_module("chenciner")
     parts, options = modes(case.SYSTEM), StepOptions(rtol=1e-12, atol=1e-12, max_phase_time=60.0)

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.numerics import Termination
+from vrw_jax.hybrid import Termination
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parent.parent

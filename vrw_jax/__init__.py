@@ -4,12 +4,6 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-from vrw_jax.answers import (
-    MeasureResult,
-    MultifidelityMean,
-    measure_to_tolerance,
-    multifidelity_mean,
-)
 from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.branches import (
     Branch,
@@ -20,37 +14,51 @@ from vrw_jax.branches import (
     continue_map,
     continue_special_point,
 )
+from vrw_jax.contact import UnilateralStep, UnilateralWheel
+from vrw_jax.continuation import ArclengthOptions, FixedPointResult, solve_fixed_point
 from vrw_jax.cycles import (
     CycleOptions,
     LimitCycle,
     ReturnMapCycle,
     default_margins,
+    limit_cycle,
+    limit_cycles,
     sensitivities,
 )
-from vrw_jax.gaits import limit_cycle, limit_cycles
+from vrw_jax.measures import MEASURES
 from vrw_jax.models import (
     AbstractWheel,
     DoubleSupportIndicators,
     EnergyLoss,
-    LadderStep,
-    LadderWheel,
     Margins,
-    ModelChoice,
     RigidWheel,
     StepResult,
-    UnilateralStep,
-    UnilateralWheel,
     ViscoelasticWheel,
 )
-from vrw_jax.numerics import ArclengthOptions, FixedPointResult, StepOptions, solve_fixed_point
-from vrw_jax.results import MEASURES
+from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import grid, open_scan, saltelli, samples, scan, sobol, sobol_indices, uniform
+from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.simulation import (
+    Walk,
+    basin,
+    choose_model,
+    paper_start,
+    return_map,
+    simulate,
+    step,
+    walk,
+)
+from vrw_jax.tolerance import (
+    MeasureResult,
+    MultifidelityMean,
+    measure_to_tolerance,
+    multifidelity_mean,
+)
 from vrw_jax.tuning import TuneResult, tune
-from vrw_jax.walks import Walk, basin, choose_model, paper_start, return_map, simulate, step, walk
+from vrw_jax.validation import suggest_name
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import suggest_name
 
 __all__ = (
     "MEASURES",

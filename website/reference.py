@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from vrw_jax.app.config import (
+from vrw_jax.cli.config import (
     MODEL_CLASSES,
     RANDOM_DESIGNS,
     BranchConfig,
@@ -14,8 +14,7 @@ from vrw_jax.app.config import (
     ScanConfig,
     TuneConfig,
 )
-from vrw_jax.numerics import StepOptions
-from vrw_jax.results.measures import (
+from vrw_jax.measures.table import (
     CONTACT_MEASURES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
@@ -25,9 +24,10 @@ from vrw_jax.results.measures import (
     UNILATERAL_STEP_MEASURES,
     Measure,
 )
+from vrw_jax.numerics import StepOptions
+from vrw_jax.printing import format_markdown_table
 from vrw_jax.scans import design as designs
 from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
-from vrw_jax.wording import format_markdown_table
 
 FIELD = re.compile(r"^ *- ((?:`\w+`(?:, )?)+): (.*(?:\n +[^ -].*)*)", re.MULTILINE)
 

@@ -20,8 +20,8 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, format_markdown, write_table
 from experiments.shared.wheels import BOX
-from vrw_jax.answers.averages import N_STANDARD_ERRORS
-from vrw_jax.answers.result import MeasureStatus
+from vrw_jax.tolerance.measure_result import MeasureStatus
+from vrw_jax.tolerance.multifidelity import N_STANDARD_ERRORS
 
 TOL, FRICTION = 1e-3, (15.0, 100.0)
 TABLE = FIGURES / "answers_means.csv"

@@ -23,7 +23,7 @@ from tests.oracle import multiprecision
 from tests.oracle.hub_form import HubForm
 from tests.oracle.multiprecision import Flow, Number, Vector
 from vrw_jax import Outcome
-from vrw_jax.numerics import floquet
+from vrw_jax.continuation import floquet
 from vrw_jax.wheel import transitions
 
 

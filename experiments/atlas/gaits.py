@@ -17,7 +17,8 @@ from scipy.optimize import fsolve
 import vrw_jax as vrw
 from experiments.atlas.hybrid import METHODS, MethodRun, Part, modes
 from experiments.atlas.told import time_second_call
-from vrw_jax.numerics import flow_jacobian_determinant, simulate_hybrid, solve_fixed_point
+from vrw_jax.continuation import solve_fixed_point
+from vrw_jax.hybrid import flow_jacobian_determinant, simulate_hybrid
 
 DIFFERENCE = 1e-5
 """Of a peer's central differences, of fourth order: those of second are off in the sixth digit

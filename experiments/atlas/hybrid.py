@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.told import EXACT_ERROR, Row, compute_error, time_second_call
 from experiments.shared.command import require_extra
-from vrw_jax.numerics import Guard, Mode, Termination, simulate_hybrid, time_errors
+from vrw_jax.hybrid import Guard, Mode, Termination, simulate_hybrid, time_errors
 
 hy = require_extra("heyoka")
 Numbers = Sequence[Any]

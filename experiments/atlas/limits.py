@@ -17,16 +17,9 @@ from experiments.atlas.events import START, Rows
 from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
+from vrw_jax.hybrid import MonitoredFunctions, integrate_phase
 from vrw_jax.models.viscoelastic import make_diffrax_phase
-from vrw_jax.numerics import MonitoredFunctions, integrate_phase
-from vrw_jax.wheel import (
-    Motion,
-    Symbols,
-    dynamics,
-    landing_foot_height,
-    make_phases,
-    transitions,
-)
+from vrw_jax.wheel import Motion, Symbols, dynamics, landing_foot_height, make_phases, transitions
 
 # --- A leg of first order: SLS-I without the airborne leg's own inertia.
 

@@ -10,8 +10,8 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
+from vrw_jax.hybrid import MonitoredFunctions, PhaseEnd, integrate_phase
 from vrw_jax.models.viscoelastic import DiffraxPhase, make_diffrax_phase
-from vrw_jax.numerics import MonitoredFunctions, PhaseEnd, integrate_phase
 from vrw_jax.wheel import Motion, dynamics, make_phases, transitions
 
 ORACLE = Path(__file__).parents[2] / "tests" / "oracle"

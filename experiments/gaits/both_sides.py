@@ -19,7 +19,11 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax.branches.bordering import DEFAULT_BOUNDS, ParameterBounds, continue_special_points
+from vrw_jax.branches.special_point_curves import (
+    DEFAULT_BOUNDS,
+    ParameterBounds,
+    continue_special_points,
+)
 
 SPECIAL_POINT_NAMES = ("lambda_2_plus", "lambda_4_plus", "clearance_sls1", "clearance_sls2", "friction_fore",
            "friction_rear", "landing_friction_fore", "hit_planted_impulse")  # fmt: skip

@@ -15,7 +15,8 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from vrw_jax.cycles import search, surface
+from vrw_jax.cycles import collocation_search as search
+from vrw_jax.cycles import gait_surface as surface
 from vrw_jax.numerics import make_blockwise
 from vrw_jax.wheel import PARAMETER_NAMES, stack_parameters, wheel_from_parameters
 

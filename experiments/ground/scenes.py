@@ -19,7 +19,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_column, read_table, write_table
 from vrw_jax import figures as plots
-from vrw_jax.models import foot_heights, leg_directions, unpack_state
+from vrw_jax.contact import foot_heights, leg_directions, unpack_state
 
 NO_SLIP, FINITE_FRICTION = math.inf, 0.7
 GAIT_RANGE = (8.0, 215.0)  # dampings at which the paper's gait gives the start

@@ -34,7 +34,7 @@ from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
-from vrw_jax.batches.batch import sort_by_work
+from vrw_jax.batches.batch_steps import sort_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {

@@ -29,11 +29,11 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
 from experiments.shared.tables import FIGURES, format_markdown, replace_block, write_named_rows
 from vrw_jax import figures as plots
-from vrw_jax.app.config import load_config
+from vrw_jax.cli.config import load_config
 from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.tuning import tune
 from vrw_jax.tuning.objective import scale_slacks
-from vrw_jax.tuning.problem import TuneProblem, make_tune_problem
+from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem
 from vrw_jax.wheel import wheel_from_parameters
 
 cma = require_extra("cma")

@@ -30,14 +30,14 @@ from experiments.web.programs import (
     make_shared_programs,
     programs,
 )
-from vrw_jax.models import PAPER_START, DoubleSupportIndicators, EnergyLoss
-from vrw_jax.results import (
+from vrw_jax.measures import (
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     STEP_MEASURES,
     STOPPER_MARGIN_MEASURES,
     UNILATERAL_STEP_MEASURES,
 )
+from vrw_jax.models import PAPER_START, DoubleSupportIndicators, EnergyLoss
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parents[2]

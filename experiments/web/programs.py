@@ -13,25 +13,20 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.models import (
-    N_STEP_INPUTS,
-    RigidWheel,
-    StepResult,
-    UnilateralWheel,
-    gait_step,
-    jacobian_columns,
-)
-from vrw_jax.models.lane_step import make_lane_phase, run_batch_phases
-from vrw_jax.models.paper_step import evaluate_states, make_step_result
+from vrw_jax.contact import UnilateralWheel
+from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, IntervalPoint, motion_from_point
+from vrw_jax.contact.contact_state import ContactState
+from vrw_jax.contact.mechanics import kinetic_energy, potential_energy
+from vrw_jax.contact.section import embed_section_state, full_section_size
+from vrw_jax.contact.single_step import sample_interval
+from vrw_jax.contact.walk_kernel import BatchWalk, advance_round, init_lanes
+from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
+from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.models import N_STEP_INPUTS, RigidWheel, StepResult, gait_step, jacobian_columns
+from vrw_jax.models.batch_step import make_lane_phase, run_batch_phases
+from vrw_jax.models.phase_sequence import evaluate_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
-from vrw_jax.models.unilateral.lanes import BatchWalk, advance_round, init_lanes
-from vrw_jax.models.unilateral.march import N_ACCUMULATOR_ROWS, IntervalPoint, motion_from_point
-from vrw_jax.models.unilateral.mechanics import kinetic_energy, potential_energy
-from vrw_jax.models.unilateral.motion import ContactState
-from vrw_jax.models.unilateral.section import embed_section_state, full_section_size
-from vrw_jax.models.unilateral.single import sample_interval
-from vrw_jax.numerics import StepOptions, load_explicit_tableau, sample_batch_phase, sine_cosine
-from vrw_jax.results import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.numerics import StepOptions, sine_cosine
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_from_parameters
 
 LEGS = (6, 8, 10)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.answers.climbing import BroydenIteration, refine
-from vrw_jax.answers.top import GroundBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.refinement import BroydenIteration, refine
 
 POINT, JUMP = 0.3, 0.016
 SLOPES = np.array([[0.67, 0.1], [0.0, 0.05]])

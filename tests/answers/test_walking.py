@@ -5,8 +5,8 @@ from unittest.mock import Mock
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.answers.top import GroundBatch, StepQuantities
-from vrw_jax.answers.walking import (
+from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.settling import (
     MAX_LEAPS,
     REST_DRIFT,
     STEPS_PER_LEAP,

@@ -15,14 +15,15 @@ import xarray as xr
 from support.scanning import CountingEngine, evaluate_arithmetically
 from typer.testing import CliRunner, Result
 
-from vrw_jax.app import cli, scanning
-from vrw_jax.app.cli import app
-from vrw_jax.app.config import parse_config
-from vrw_jax.app.printing import make_scan_reporter
 from vrw_jax.branches.branch import Branch
+from vrw_jax.cli import commands as cli
+from vrw_jax.cli import scanning
+from vrw_jax.cli.commands import app
+from vrw_jax.cli.config import parse_config
+from vrw_jax.cli.console import make_scan_reporter
 from vrw_jax.scans import forecast
+from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.planning import ScanPlan
-from vrw_jax.scans.running import ScanProgress
 from vrw_jax.scans.store import open_scan
 from vrw_jax.wheel.outcomes import Outcome
 

@@ -10,7 +10,7 @@ import pytest
 from support.scanning import evaluate_arithmetically
 from typer.testing import CliRunner
 
-from vrw_jax.app.cli import app
+from vrw_jax.cli.commands import app
 from vrw_jax.scans.planning import ScanPlan
 
 WRONG_CONFIGS: dict[str, tuple[str, str]] = {

@@ -15,18 +15,18 @@ from support.batched import (
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, simd
-from vrw_jax.batches import batch as lane_batch
+from vrw_jax.batches import batch_steps as lane_batch
 from vrw_jax.batches import programs
 from vrw_jax.batches.stiffness import select_solver
-from vrw_jax.numerics.march import BatchPhase, integrate_batch_phase
-from vrw_jax.numerics.tableaus import (
+from vrw_jax.integrator.integrate import BatchPhase, integrate_batch_phase
+from vrw_jax.integrator.tableaus import (
     StageAcceleration,
     StageState,
     load_explicit_tableau,
     real_stability_limit,
     rk_step,
 )
-from vrw_jax.numerics.trig import sine_cosine
+from vrw_jax.numerics.trigonometry import sine_cosine
 
 STARTS = truth.stack_quantity("step", "start")
 VALUES = np.concatenate(

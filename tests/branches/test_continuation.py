@@ -8,14 +8,18 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.app.reports import write_branch
+from vrw_jax.branches.branch_location import continue_and_locate
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.run import continue_and_locate
-from vrw_jax.figures.branch import branch_figure
-from vrw_jax.numerics.arclength import AbstractContinuationProblem, FixedPointProblem, continue_from
-from vrw_jax.numerics.events import integrate_phase
-from vrw_jax.numerics.minima import MonitoredFunctions
-from vrw_jax.numerics.roots import locate_zeros
+from vrw_jax.cli.reports import write_branch
+from vrw_jax.continuation.arclength import (
+    AbstractContinuationProblem,
+    FixedPointProblem,
+    continue_from,
+)
+from vrw_jax.continuation.sign_changes import locate_zeros
+from vrw_jax.figures.branch_figures import branch_figure
+from vrw_jax.hybrid.minima import MonitoredFunctions
+from vrw_jax.hybrid.phase_integration import integrate_phase
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 LOCATION_TOLERANCE = 1e-9

@@ -5,13 +5,13 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.branches.mapping import (
+from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
     find_sign_change_cells,
     find_unexplained_changes,
     map_special_points,
 )
-from vrw_jax.results import MARGIN_MEASURES
+from vrw_jax.measures import MARGIN_MEASURES
 
 MAP_PARAMETERS = ("damping", "stiffness")
 C, K = np.linspace(50.0, 150.0, 11), np.linspace(400.0, 600.0, 9)

@@ -7,10 +7,10 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS, confirm_outcome, make_finder
-from vrw_jax.cycles.by_walking import ReturnMapFinder
 from vrw_jax.cycles.finder import STATE_AGREEMENT_TOLERANCE
+from vrw_jax.cycles.return_map_finder import ReturnMapFinder
+from vrw_jax.measures import MEASURES
 from vrw_jax.models import AbstractWheel
-from vrw_jax.results import MEASURES
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 MODELS = (vrw.RigidWheel(), vrw.ViscoelasticWheel(), vrw.UnilateralWheel(), vrw.LadderWheel())

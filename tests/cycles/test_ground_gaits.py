@@ -11,12 +11,12 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.cycles import on_ground
-from vrw_jax.models import embed_section_states, step_batch_with_jacobian
-from vrw_jax.models.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
-from vrw_jax.models.unilateral import queues as ground_lanes
-from vrw_jax.numerics.arclength import ArclengthOptions
-from vrw_jax.numerics.floquet import bifurcation_margins, floquet_multipliers, jury_margins
+from vrw_jax.contact import batch_walks as ground_lanes
+from vrw_jax.contact import embed_section_states, step_batch_with_jacobian
+from vrw_jax.continuation.arclength import ArclengthOptions
+from vrw_jax.continuation.floquet import bifurcation_margins, floquet_multipliers, jury_margins
+from vrw_jax.cycles import unilateral_finder as on_ground
+from vrw_jax.selection.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)

@@ -13,7 +13,7 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.numerics import floquet, solve_fixed_point_implicit
+from vrw_jax.continuation import floquet, solve_fixed_point_implicit
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_from_parameters
 

@@ -9,8 +9,9 @@ import pytest
 import xarray as xr
 
 from experiments.shared.eyes import simulate_color_vision
-from vrw_jax.figures import branch, indicators, style
-from vrw_jax.figures.branch import basin_figure
+from vrw_jax.figures import branch_figures as branch
+from vrw_jax.figures import indicators, style
+from vrw_jax.figures.branch_figures import basin_figure
 from vrw_jax.wheel import Outcome
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,7 @@ from matplotlib.mathtext import MathTextParser
 
 from vrw_jax import figures
 from vrw_jax.figures import style
-from vrw_jax.results import MEASURES
+from vrw_jax.measures import MEASURES
 from vrw_jax.wheel import Outcome
 
 MATHTEXT_PARSER = MathTextParser("path")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.gaits.reaching import REFINE_ABOVE_MESH_ERROR
+from vrw_jax.cycles.gait_search import REFINE_ABOVE_MESH_ERROR
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
     damping=[224.5, 214.0, 119.3, 200.0],

@@ -9,7 +9,7 @@ import pytest
 from oracle import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import (
+from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
     CONTACT_OFF,
     CONTACT_SLIP_DOWN,
@@ -20,7 +20,7 @@ from vrw_jax.models.unilateral.contacts import (
     choose_combination,
     solve_combination,
 )
-from vrw_jax.models.unilateral.mechanics import (
+from vrw_jax.contact.mechanics import (
     WheelMotion,
     find_slots,
     free_acceleration,

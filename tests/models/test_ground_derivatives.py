@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import (
+from vrw_jax.contact.contact_modes import (
     CONTACT_OFF,
     CONTACT_SLIP_DOWN,
     CONTACT_SLIP_UP,

@@ -9,13 +9,13 @@ from oracle import complementarity
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.march import (
+from vrw_jax.contact.batch_integrator import (
     PAINLEVE_TOLERANCES,
     EventBracket,
     _earliest_root,
     _earliest_secant,
 )
-from vrw_jax.models.unilateral.mechanics import leg_directions
+from vrw_jax.contact.mechanics import leg_directions
 
 N_WHEELS, N_STEPS = 128, 60
 HIGH_FRICTION, INFINITE_FRICTION = np.linspace(1.0, 3.0, N_WHEELS), np.full(N_WHEELS, math.inf)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.models.ladder import (
+from vrw_jax.selection.ladder import (
     SELECTION_MARGINS,
     UNILATERAL_MODEL,
     VISCOELASTIC_MODEL,

@@ -7,15 +7,10 @@ import pytest
 from oracle import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import CONTACT_OFF, CONTACT_STICK
-from vrw_jax.models.unilateral.events import (
-    ContactLaw,
-    classify_event,
-    project_motion,
-    resolve_event,
-)
-from vrw_jax.models.unilateral.mechanics import WheelMotion, kinetic_energy, leg_directions
-from vrw_jax.models.unilateral.motion import ContactState, make_guard_layout
+from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact.contact_state import ContactState, make_guard_layout
+from vrw_jax.contact.impacts import ContactLaw, classify_event, project_motion, resolve_event
+from vrw_jax.contact.mechanics import WheelMotion, kinetic_energy, leg_directions
 
 N_IMPACTS, RNG_SEED = 400, 3
 START = (0.1, 1.6, -0.1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.models.scales import SCALING_BY_PARAMETER
+from vrw_jax.models.unit_scaling import SCALING_BY_PARAMETER
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 N = 64

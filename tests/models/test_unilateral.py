@@ -12,21 +12,13 @@ from oracle import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.contacts import (
+from vrw_jax.contact.contact_modes import (
     CONTACT_OFF,
     CONTACT_SLIP_DOWN,
     CONTACT_SLIP_UP,
     CONTACT_STICK,
 )
-from vrw_jax.models.unilateral.events import ContactLaw, classify_event, resolve_event
-from vrw_jax.models.unilateral.mechanics import (
-    WheelMotion,
-    foot_heights,
-    kinetic_energy,
-    leg_directions,
-    potential_energy,
-)
-from vrw_jax.models.unilateral.motion import (
+from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
     airborne_stopper_force,
@@ -38,9 +30,17 @@ from vrw_jax.models.unilateral.motion import (
     unpack_state,
     vector_field,
 )
-from vrw_jax.models.unilateral.section import unpack_section_state
-from vrw_jax.numerics.events import integrate_phase
-from vrw_jax.numerics.minima import MonitoredFunctions
+from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
+from vrw_jax.contact.mechanics import (
+    WheelMotion,
+    foot_heights,
+    kinetic_energy,
+    leg_directions,
+    potential_energy,
+)
+from vrw_jax.contact.section import unpack_section_state
+from vrw_jax.hybrid.minima import MonitoredFunctions
+from vrw_jax.hybrid.phase_integration import integrate_phase
 
 START = (0.1, 1.6, -0.1)
 TIGHT_OPTIONS = vrw.StepOptions.tight()

@@ -7,7 +7,7 @@ from support import truth
 from support.batched import compute_states_and_work
 
 import vrw_jax as vrw
-from vrw_jax.numerics.tableaus import load_explicit_tableau, real_stability_limit
+from vrw_jax.integrator.tableaus import load_explicit_tableau, real_stability_limit
 
 STARTS = truth.stack_quantity("step", "start")
 VALUES = np.concatenate(

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.numerics import (
+from vrw_jax.continuation import solve_fixed_point
+from vrw_jax.hybrid import (
     Guard,
     LCPStatus,
     Mode,
@@ -20,7 +21,6 @@ from vrw_jax.numerics import (
     product_multipliers,
     segment_maps,
     simulate_hybrid,
-    solve_fixed_point,
     time_errors,
 )
 

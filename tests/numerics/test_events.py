@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.numerics.events import integrate_phase
-from vrw_jax.numerics.minima import MonitoredFunctions
+from vrw_jax.hybrid.minima import MonitoredFunctions
+from vrw_jax.hybrid.phase_integration import integrate_phase
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
 

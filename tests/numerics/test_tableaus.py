@@ -9,7 +9,7 @@ import diffrax
 import numpy as np
 import pytest
 
-from vrw_jax.numerics import load_explicit_tableau, tableaus
+from vrw_jax.integrator import load_explicit_tableau, tableaus
 from vrw_jax.numerics.options import SOLVER_NAMES
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from vrw_jax import figures as plots
-from vrw_jax.app import cli
+from vrw_jax.cli import commands as cli
 from vrw_jax.paper import facts
 from vrw_jax.paper import reproduction as reproduce
 from vrw_jax.paper.facts.base import Evidence

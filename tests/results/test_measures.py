@@ -2,9 +2,9 @@
 
 import pytest
 
-from vrw_jax.models.ladder import SELECTION_MARGINS, describe_reason
-from vrw_jax.results import MARGIN_MEASURES, STEP_MEASURES, describe_violation
-from vrw_jax.wording import format_html_table, format_markdown_table, format_mathtext, format_text
+from vrw_jax.measures import MARGIN_MEASURES, STEP_MEASURES, describe_violation
+from vrw_jax.printing import format_html_table, format_markdown_table, format_mathtext, format_text
+from vrw_jax.selection.ladder import SELECTION_MARGINS, describe_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 

@@ -8,8 +8,15 @@ from jax.experimental.compilation_cache import compilation_cache
 from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
-from vrw_jax.runtime import cached_lane_function, cached_lane_program, compile_exported, store
-from vrw_jax.simd import code
+from vrw_jax.runtime import (
+    cached_lane_function,
+    cached_lane_program,
+    compile_exported,
+)
+from vrw_jax.runtime import (
+    disk_cache as store,
+)
+from vrw_jax.simd import code_cache as code
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.runtime.programs import cached_trace
+from vrw_jax.runtime.cached_programs import cached_trace
 from vrw_jax.runtime.start import fusion_emitter_options
 
 

@@ -30,11 +30,11 @@ from vrw_jax.cycles import finder
 from vrw_jax.scans import dask, planning
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import store as scan_store
+from vrw_jax.scans.collocation_engine import WHEELS_PER_BATCH, CollocationEngine
 from vrw_jax.scans.dask import connect_workers
-from vrw_jax.scans.evaluate import WHEELS_PER_BATCH, CollocationEngine
-from vrw_jax.scans.offer import ALWAYS_INCLUDED
+from vrw_jax.scans.execution import ScanProgress
+from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED
 from vrw_jax.scans.planning import ChunkResult, ScanPlan, plan_scan
-from vrw_jax.scans.running import ScanProgress
 from vrw_jax.scans.store import choose_chunk_shape, find_first_difference, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
@@ -510,7 +510,7 @@ import os, sys
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
-from vrw_jax.scans.evaluate import LANES
+from vrw_jax.scans.collocation_engine import LANES
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning

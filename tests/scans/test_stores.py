@@ -21,7 +21,8 @@ from support.scanning import (
 
 import vrw_jax as vrw
 from vrw_jax.scans import design as designs
-from vrw_jax.scans import planning, soundness
+from vrw_jax.scans import integrity as soundness
+from vrw_jax.scans import planning
 from vrw_jax.scans import store as scan_store
 from vrw_jax.scans.planning import plan_scan
 from vrw_jax.scans.store import open_scan

@@ -13,7 +13,8 @@ from jax import lax
 from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
-from vrw_jax.simd import code, kernel
+from vrw_jax.simd import code_cache as code
+from vrw_jax.simd import kernel
 
 LANES, X = [np.arange(4.0)], np.arange(4.0)
 

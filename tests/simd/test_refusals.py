@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 from vrw_jax import simd
-from vrw_jax.simd.arrays import LANE_AXIS_SENTINEL
+from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL
 
 KEYS = itertools.count()
 X = np.random.default_rng(0).normal(size=(2, 9))

@@ -2,7 +2,9 @@
 
 import jax
 
-from vrw_jax.simd import code, ffi, program
+from vrw_jax.simd import code_cache as code
+from vrw_jax.simd import ffi_primitive as ffi
+from vrw_jax.simd import program
 
 _REGISTERED = ffi.LOADED_BY_NAME  # XLA never lets go, and takes one code of a name: it is the same
 

@@ -15,9 +15,10 @@ from textwrap import dedent
 from typing import NamedTuple
 
 PACKAGE_LAYERS = (
-    ("simd",), ("wording",), ("runtime",), ("numerics",), ("wheel",), ("results",),
-    ("models",), ("walks",), ("batches", "cycles"), ("gaits",), ("answers",),
-    ("branches", "tuning", "scans"), ("figures", "web"), ("paper",), ("app",),
+    ("simd",), ("validation",), ("printing",), ("runtime",), ("numerics",), ("integrator",),
+    ("hybrid",), ("collocation",), ("wheel",), ("measures",), ("models",), ("contact",),
+    ("selection",), ("simulation",), ("batches",), ("continuation",), ("cycles",), ("tolerance",),
+    ("branches", "tuning", "scans"), ("figures", "web"), ("paper",), ("cli",),
 )  # fmt: skip
 """Rooms in the order in which they may know each other; those of one row do not."""
 

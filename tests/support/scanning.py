@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from vrw_jax.results.measures import MARGIN_MEASURES
+from vrw_jax.measures.table import MARGIN_MEASURES
 from vrw_jax.scans import design as designs
-from vrw_jax.scans import running
+from vrw_jax.scans import execution as running
 from vrw_jax.scans.design import SampleColumns
 from vrw_jax.scans.planning import ChunkResult, ScanPlan, plan_scan
 from vrw_jax.wheel.outcomes import Outcome

@@ -9,11 +9,12 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.cycles import make_finder
-from vrw_jax.cycles.premises import MARGIN_NAMES, default_margins
-from vrw_jax.results.measures import MARGIN_MEASURES
-from vrw_jax.tuning.climbing import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneStatus
+from vrw_jax.cycles.margin_defaults import MARGIN_NAMES, default_margins
+from vrw_jax.measures.table import MARGIN_MEASURES
+from vrw_jax.tuning.maximization import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneStatus
 from vrw_jax.tuning.objective import max_breach, parse_margins, scale_slacks, signed_bound
-from vrw_jax.tuning.problem import TuneProblem, TuneResult, make_tune_problem, tune
+from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
+from vrw_jax.tuning.tune_result import TuneResult
 
 PARAMETER_BOX = {
     "damping": (20.0, 215.0),

@@ -5,9 +5,9 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.figures.branch import basin_figure
-from vrw_jax.walks.attractors import WalkEnds, find_distinct_orbits
-from vrw_jax.walks.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_shares
+from vrw_jax.figures.branch_figures import basin_figure
+from vrw_jax.simulation.attractors import WalkEnds, find_distinct_orbits
+from vrw_jax.simulation.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_shares
 
 OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 

@@ -8,7 +8,7 @@ from support import truth
 
 import vrw_jax as vrw
 from vrw_jax.models.viscoelastic import make_diffrax_phase
-from vrw_jax.numerics.derivatives import enable_all_ad_modes
+from vrw_jax.numerics.autodiff import enable_all_ad_modes
 from vrw_jax.wheel import make_phases, transitions
 
 PARAMS = vrw.WheelParams()

@@ -7,7 +7,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.batches import batch
+from vrw_jax.batches import batch_steps as batch
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, wheel_from_parameters
 
 N = 96

@@ -12,7 +12,7 @@ import xarray as xr
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.models.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
+from vrw_jax.selection.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
 
 pytestmark = pytest.mark.slow
 

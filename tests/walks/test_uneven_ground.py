@@ -6,8 +6,8 @@ import pytest
 from oracle import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.models.unilateral.mechanics import find_slots, slot_friction
-from vrw_jax.models.unilateral.section import pack_section_state, unpack_section_state
+from vrw_jax.contact.mechanics import find_slots, slot_friction
+from vrw_jax.contact.section import pack_section_state, unpack_section_state
 
 START = (0.1, 1.6, -0.1)
 SLOPES, FRICTIONS = (0.3, 0.33, 0.27, 0.31), (0.7, 0.5, 0.9, 0.6)

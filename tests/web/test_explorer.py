@@ -12,7 +12,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vrw_jax as vrw
-from vrw_jax.app.cli import app
+from vrw_jax.cli.commands import app
 from vrw_jax.web import make_page_address
 
 

@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.batches import fixed_work
-from vrw_jax.cycles import sequence
-from vrw_jax.models import lane_step
+from vrw_jax.batches import collocation_step as fixed_work
+from vrw_jax.collocation import PhaseMesh, PhasePoint
+from vrw_jax.cycles import phase_sequence as sequence
+from vrw_jax.hybrid import integrate_phase
+from vrw_jax.integrator import integrate_batch_phase, load_explicit_tableau
+from vrw_jax.models import batch_step as lane_step
 from vrw_jax.models.viscoelastic import make_diffrax_phase
-from vrw_jax.numerics import (
-    PhaseMesh,
-    PhasePoint,
-    integrate_batch_phase,
-    integrate_phase,
-    load_explicit_tableau,
-)
 from vrw_jax.wheel import (
     PAPER_PHASES,
     Outcome,

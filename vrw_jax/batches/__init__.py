@@ -1,4 +1,5 @@
 """Gait steps of many wheels at once, with a choice of engines."""
 
-from vrw_jax.batches.batch import step_batch
-from vrw_jax.batches.walked import StepBatchResult
+from vrw_jax.batches import batch_steps, collocation_step, programs
+from vrw_jax.batches.batch_steps import step_batch
+from vrw_jax.batches.walk_batch import StepBatchResult

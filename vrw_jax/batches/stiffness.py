@@ -4,7 +4,8 @@ import functools
 
 import numpy as np
 
-from vrw_jax.numerics import StepOptions, load_explicit_tableau, real_stability_limit
+from vrw_jax.integrator import load_explicit_tableau, real_stability_limit
+from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES
 
 NAMED_SOLVER_INDEX, STABLE_SOLVER_INDEX, IMPLICIT_SOLVER_INDEX = range(3)

@@ -1,6 +1,10 @@
 """Branches of gaits along one parameter, with their special points."""
 
-from vrw_jax.branches.bordering import continue_special_point
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map
-from vrw_jax.branches.mapping import SPECIAL_POINT_MEASURES, UnexplainedChange, map_special_points
+from vrw_jax.branches.special_point_curves import continue_special_point
+from vrw_jax.branches.special_point_map import (
+    SPECIAL_POINT_MEASURES,
+    UnexplainedChange,
+    map_special_points,
+)

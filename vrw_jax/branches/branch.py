@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.numerics import floquet
-from vrw_jax.results import MEASURES
+from vrw_jax.continuation import floquet
+from vrw_jax.measures import MEASURES
+from vrw_jax.printing import format_html_table
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import format_html_table
 
 MAX_PRINTED_POINTS = 20
 """Largest number of special points in the printed form of a branch."""

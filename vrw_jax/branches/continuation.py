@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
-from vrw_jax.branches.followed import BranchWheel
-from vrw_jax.branches.run import (
+from vrw_jax.branches.branch_location import (
     ADMISSIBLE_COLUMN,
     READ_BATCH_SIZE,
     AbstractContinuation,
@@ -27,7 +26,14 @@ from vrw_jax.branches.run import (
     QuantityTable,
     continue_and_locate,
 )
-from vrw_jax.branches.starts import START_FUNCTIONS, BranchRequest, start_from_walks
+from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest, start_from_walks
+from vrw_jax.branches.continuation_problems import BranchWheel
+from vrw_jax.continuation import (
+    ArclengthOptions,
+    ContinuationPoint,
+    FixedPointProblem,
+    floquet_multipliers,
+)
 from vrw_jax.cycles import (
     STATE_AGREEMENT_TOLERANCE,
     AbstractCycle,
@@ -37,16 +43,7 @@ from vrw_jax.cycles import (
     make_finder,
     resolve_model,
 )
-from vrw_jax.models import AbstractWheel, refuse_ladder
-from vrw_jax.numerics import (
-    ArclengthOptions,
-    ContinuationPoint,
-    FixedPointProblem,
-    StepOptions,
-    floquet_multipliers,
-    take_rows,
-)
-from vrw_jax.results import (
+from vrw_jax.measures import (
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     STEP_MEASURES,
@@ -56,10 +53,12 @@ from vrw_jax.results import (
     measure_attrs,
     provenance,
 )
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import ModelLike, check_model, check_options, check_single_wheel
-from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams
-from vrw_jax.wording import (
+from vrw_jax.selection import refuse_ladder
+from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.validation import (
     check_callable,
     check_int,
     check_known_name,
@@ -69,6 +68,7 @@ from vrw_jax.wording import (
     check_reals,
     check_type,
 )
+from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams
 
 INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")

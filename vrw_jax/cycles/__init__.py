@@ -1,6 +1,13 @@
 """Limit cycles: finders, checks and derivatives for each model."""
 
-from vrw_jax.cycles.attracting import (
+from vrw_jax.cycles import (
+    collocation_search,
+    finder,
+    gait_surface,
+    phase_sequence,
+    unilateral_finder,
+)
+from vrw_jax.cycles.attracting_gaits import (
     START_DISTANCE,
     compute_fallback_starts,
     compute_walk_starts,
@@ -8,9 +15,13 @@ from vrw_jax.cycles.attracting import (
     find_slow_gaits,
     find_slowest_indices,
 )
-from vrw_jax.cycles.by_collocation import CollocationFinder
-from vrw_jax.cycles.by_walking import ReturnMapCycle
-from vrw_jax.cycles.collocated import LimitCycle, transfer_to_mesh
+from vrw_jax.cycles.collocation_finder import CollocationFinder
+from vrw_jax.cycles.collocation_search import (
+    CollocationState,
+    CollocationSystem,
+    collocation_correction_norm,
+    init_search_flags,
+)
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_multipliers
 from vrw_jax.cycles.derivatives import compile_batched
 from vrw_jax.cycles.finder import (
@@ -23,7 +34,7 @@ from vrw_jax.cycles.finder import (
     evaluate_on_gaits,
     is_same_branch,
 )
-from vrw_jax.cycles.finding import (
+from vrw_jax.cycles.finder_selection import (
     Guess,
     check_guess,
     make_finder,
@@ -31,13 +42,17 @@ from vrw_jax.cycles.finding import (
     resolve_model,
     resolve_model_with_reason,
 )
-from vrw_jax.cycles.on_ground import PeriodMap, solve_linear_systems
-from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.cycles.premises import default_margins, gait_takeoff_acceleration
-from vrw_jax.cycles.search import (
-    CollocationState,
-    CollocationSystem,
-    collocation_correction_norm,
-    init_search_flags,
+from vrw_jax.cycles.gait_search import (
+    GAIT_BATCH_SIZES,
+    GaitChoice,
+    limit_cycle,
+    limit_cycles,
+    parse_gait_choice,
+    retry_from_walks,
 )
+from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_to_mesh
+from vrw_jax.cycles.margin_defaults import default_margins, gait_takeoff_acceleration
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.cycles.sensitivity import sensitivities
+from vrw_jax.cycles.unilateral_finder import PeriodMap, solve_linear_systems

@@ -11,15 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vrw_jax.numerics import floquet
+from vrw_jax.continuation import floquet
+from vrw_jax.printing import AbstractPrintable, TextRow, format_numbers, format_outcome_counts
+from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import (
-    AbstractPrintable,
-    TextRow,
-    check_choice,
-    format_numbers,
-    format_outcome_counts,
-)
 
 
 class AbstractCycle(AbstractPrintable):

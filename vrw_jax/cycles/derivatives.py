@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.cycles.search import (
+from vrw_jax.cycles.collocation_search import (
     CollocationState,
     CollocationSystem,
     Parameters,
@@ -24,7 +24,7 @@ from vrw_jax.cycles.search import (
     search_lanes,
     state_tangents,
 )
-from vrw_jax.models import scales
+from vrw_jax.models import unit_scaling as scales
 from vrw_jax.numerics import (
     BatchFunction,
     ExecutionWrapper,

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.wording import check_int, check_positive, format_value
+from vrw_jax.validation import check_int, check_positive, format_value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finding import Guess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, resolve_model
 from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions
-from vrw_jax.results import MEASURES
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import ModelLike
+from vrw_jax.simulation import ModelLike
+from vrw_jax.validation import check_names, check_not_traced, suggest_name
 from vrw_jax.wheel import Outcome, WheelParams
-from vrw_jax.wording import check_names, check_not_traced, suggest_name
 
 
 def sensitivities(

@@ -1,7 +1,8 @@
 """Figures of labelled results; the only package that imports matplotlib."""
 
-from vrw_jax.figures.branch import basin_figure, branch_figure
-from vrw_jax.figures.scan import map_figure, scan_figures
+from vrw_jax.figures import branch_figures, style
+from vrw_jax.figures.branch_figures import basin_figure, branch_figure
+from vrw_jax.figures.scan_figures import map_figure, scan_figures
 from vrw_jax.figures.style import (
     DARK_GRAY,
     LEG_1_COLOR,
@@ -11,8 +12,8 @@ from vrw_jax.figures.style import (
     figure_style,
     save,
 )
-from vrw_jax.figures.tuning import tuning_figure
-from vrw_jax.figures.walk import (
+from vrw_jax.figures.tuning_figures import tuning_figure
+from vrw_jax.figures.walk_figures import (
     foot_height,
     gait_panels,
     indicators,

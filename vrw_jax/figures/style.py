@@ -19,9 +19,10 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from vrw_jax.results import MEASURES
+from vrw_jax.measures import MEASURES
+from vrw_jax.printing import format_mathtext
+from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
-from vrw_jax.wording import check_type, format_mathtext
 
 BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 AMBER, YELLOW = "#E69F00", "#F0E442"

@@ -1,21 +1,15 @@
 """The models of the wheel, one per file, with one interface."""
 
-from vrw_jax.models import scales
-from vrw_jax.models.interface import AbstractWheel, StepGround
-from vrw_jax.models.ladder import (
-    SELECTION_ATTRS,
-    SELECTION_MARGINS,
-    UNILATERAL_MODEL,
-    VISCOELASTIC_MODEL,
-    LadderStep,
-    LadderWheel,
-    ModelChoice,
-    find_selection_reason,
-    refuse_ladder,
+from vrw_jax.models import batch_step, unit_scaling
+from vrw_jax.models.batch_step import (
+    N_STEP_INPUTS,
+    can_use_lanes,
+    gait_step,
+    jacobian_columns,
+    split_jacobian,
 )
-from vrw_jax.models.lane_step import N_STEP_INPUTS, gait_step, jacobian_columns
+from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.scales import scaled_jacobian_columns
 from vrw_jax.models.section_states import (
     PAPER_START,
     AnySectionState,
@@ -24,6 +18,7 @@ from vrw_jax.models.section_states import (
     replace_invalid,
 )
 from vrw_jax.models.step_results import (
+    AbstractContactStep,
     AbstractStep,
     AdvanceResult,
     DoubleSupportIndicators,
@@ -32,21 +27,5 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.models.unilateral.contacts import CONTACT_STICK
-from vrw_jax.models.unilateral.ledger import UnilateralStep, min_dip_depth
-from vrw_jax.models.unilateral.mechanics import (
-    foot_heights,
-    foot_positions,
-    kinetic_energy,
-    leg_directions,
-    potential_energy,
-)
-from vrw_jax.models.unilateral.motion import PackedState, unpack_state
-from vrw_jax.models.unilateral.queues import (
-    embed_section_states,
-    step_batch_with_jacobian,
-    walk_batch,
-)
-from vrw_jax.models.unilateral.section import LOCKED_CODE_OFFSET
-from vrw_jax.models.unilateral.wheel import UnilateralTrajectory, UnilateralWheel
+from vrw_jax.models.unit_scaling import scaled_jacobian_columns
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

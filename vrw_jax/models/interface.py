@@ -10,16 +10,9 @@ from jaxtyping import Array, Float
 from vrw_jax.models.section_states import SectionState
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.numerics import Elementwise, StepOptions
-from vrw_jax.wheel import (
-    FRICTION_NAME,
-    PARAMETER_NAMES,
-    WheelParams,
-    wheel_from_parameters,
-)
-from vrw_jax.wording import (
-    format_quantity,
-    is_traced,
-)
+from vrw_jax.printing import format_quantity
+from vrw_jax.validation import is_traced
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams, wheel_from_parameters
 
 StepGround = tuple[Array, Array, Array, Array]
 """Slope and friction of a landing, friction of the earlier footholds, and the tilt by which the

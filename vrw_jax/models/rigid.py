@@ -19,6 +19,7 @@ from vrw_jax.models.step_results import (
     Trajectory,
 )
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
+from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Motion,
@@ -30,7 +31,6 @@ from vrw_jax.wheel import (
     require_known_friction,
     transitions,
 )
-from vrw_jax.wording import check_bool
 
 N_GRID_ANGLES = 33
 """Number of angles in each zoom on the minimum of a force, chosen because forces are smooth over

@@ -8,10 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vrw_jax.wheel import (
-    MAX_SI_VALUE,
-    WheelParams,
-)
+from vrw_jax.wheel import MAX_SI_VALUE, WheelParams
 
 SectionState = Float[Array, "3"]
 """(theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad, rad/s,

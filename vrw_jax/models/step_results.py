@@ -9,17 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.section_states import AnySectionState
-from vrw_jax.results import MARGIN_MEASURES, MEASURES
-from vrw_jax.wheel import (
-    Outcome,
-)
-from vrw_jax.wording import (
-    AbstractPrintable,
-    TextRow,
-    format_outcome_counts,
-    format_quantity,
-)
+from vrw_jax.printing import AbstractPrintable, TextRow, format_outcome_counts, format_quantity
+from vrw_jax.wheel import Outcome
 
 MeasureValue = Float[Array, "..."]
 """One number of a step; in a batch, one number per element."""

@@ -11,14 +11,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.lane_step import (
+from vrw_jax.hybrid import (
+    MonitoredFunctions,
+    StateVector,
+    VectorField,
+    integrate_phase,
+    sample_phase,
+)
+from vrw_jax.models.batch_step import (
     build_step_function,
     build_step_jacobian,
     build_step_sampler,
     can_use_lanes,
 )
-from vrw_jax.models.paper_step import (
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseSequenceResult,
     make_advance_result,
@@ -28,17 +35,8 @@ from vrw_jax.models.paper_step import (
 )
 from vrw_jax.models.section_states import PAPER_START, SectionState
 from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
-from vrw_jax.numerics import (
-    ForwardFunction,
-    MonitoredFunctions,
-    StateVector,
-    StepOptions,
-    Vector,
-    VectorField,
-    enable_all_ad_modes,
-    integrate_phase,
-    sample_phase,
-)
+from vrw_jax.numerics import ForwardFunction, StepOptions, Vector, enable_all_ad_modes
+from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
@@ -47,7 +45,6 @@ from vrw_jax.wheel import (
     WheelParams,
     require_known_friction,
 )
-from vrw_jax.wording import check_bool
 
 
 class DiffraxPhase(NamedTuple):

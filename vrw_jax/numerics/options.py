@@ -10,15 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics.types import RealInput, Scalar
-from vrw_jax.wording import (
-    AbstractPrintable,
-    TextRow,
-    check_choice,
-    check_int,
-    check_positive,
-    check_reals,
-    format_quantity,
-)
+from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
+from vrw_jax.validation import check_choice, check_int, check_positive, check_reals
 
 SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",

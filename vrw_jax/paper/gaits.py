@@ -16,9 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.models import SectionState, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions
-from vrw_jax.results import (
+from vrw_jax.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
     locked_leg_coordinate,
@@ -26,8 +24,10 @@ from vrw_jax.results import (
     measure_attrs,
     provenance,
 )
+from vrw_jax.models import SectionState, ViscoelasticWheel
+from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.walks import step, walk
+from vrw_jax.simulation import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
 N_WALK_STEPS = 30

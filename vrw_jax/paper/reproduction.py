@@ -21,7 +21,7 @@ from vrw_jax.paper.gaits import (
     walk_along_parameter,
     walk_into_gait,
 )
-from vrw_jax.walks import paper_start, simulate
+from vrw_jax.simulation import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
 ReproductionProgress = Callable[[float, str], None]

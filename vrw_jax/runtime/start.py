@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from vrw_jax.wording import check_type
+from vrw_jax.validation import check_type
 
 
 def start_jax(cache: str | Path | None = None) -> None:

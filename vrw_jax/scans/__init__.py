@@ -1,6 +1,6 @@
 """Scans: the steady gait of every sample of a design, as one labelled dataset."""
 
-from vrw_jax.scans import design
+from vrw_jax.scans import dask, design, execution, forecast, integrity, planning, store
 from vrw_jax.scans.design import (
     MAX_LISTED_SAMPLES,
     SALTELLI_KIND,
@@ -11,18 +11,22 @@ from vrw_jax.scans.design import (
     sobol,
     uniform,
 )
-from vrw_jax.scans.forecast import forecast_scan, format_seconds
-from vrw_jax.scans.indices import sobol_indices
-from vrw_jax.scans.offer import CATALOGS, DIFFERENTIABLE_MEASURES, TOLERANCE_CATALOG, check_measures
-from vrw_jax.scans.running import (
-    ScanPlan,
+from vrw_jax.scans.execution import (
     ScanProgress,
     find_store,
     open_or_create_store,
-    plan_scan,
     resolve_executor,
     run_scan,
     scan,
 )
-from vrw_jax.scans.soundness import read_manifest
+from vrw_jax.scans.forecast import forecast_scan, format_seconds
+from vrw_jax.scans.integrity import read_manifest
+from vrw_jax.scans.measure_catalog import (
+    CATALOGS,
+    DIFFERENTIABLE_MEASURES,
+    TOLERANCE_CATALOG,
+    check_measures,
+)
+from vrw_jax.scans.planning import ScanPlan, plan_scan
+from vrw_jax.scans.sensitivity_indices import sobol_indices
 from vrw_jax.scans.store import open_scan

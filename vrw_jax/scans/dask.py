@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vrw_jax.runtime import start_jax
+from vrw_jax.scans.collocation_engine import count_cores
 from vrw_jax.scans.design import SampleColumns
-from vrw_jax.scans.evaluate import count_cores
-from vrw_jax.scans.ground import make_engine
+from vrw_jax.scans.engines import make_engine
 from vrw_jax.scans.planning import (
     ChunkExecutor,
     ChunkResult,

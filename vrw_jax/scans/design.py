@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
-from vrw_jax.wording import (
+from vrw_jax.printing import format_quantity
+from vrw_jax.validation import (
     check_int,
     check_known_name,
     check_not_traced,
     check_range,
     check_type,
-    format_quantity,
     format_value,
 )
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 SampleColumns = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""

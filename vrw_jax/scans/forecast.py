@@ -9,11 +9,11 @@ from time import perf_counter
 
 import numpy as np
 
+from vrw_jax.scans.collocation_engine import count_cores
 from vrw_jax.scans.design import AbstractDesign, SampleColumns
-from vrw_jax.scans.evaluate import count_cores
-from vrw_jax.scans.offer import select_catalog
+from vrw_jax.scans.execution import find_store
+from vrw_jax.scans.measure_catalog import select_catalog
 from vrw_jax.scans.planning import ScanPlan
-from vrw_jax.scans.running import find_store
 
 STARTUP_SECONDS = 5.0
 """Time in seconds until the first sample if the compiled code is cached; see docs/scans.md."""

@@ -13,14 +13,15 @@ import numpy as np
 
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
+from vrw_jax.measures import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
 from vrw_jax.models import AbstractWheel, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.results import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
 from vrw_jax.runtime import source_digest
+from vrw_jax.scans.collocation_engine import EvaluationRequest
 from vrw_jax.scans.design import AbstractDesign, SampleColumns
-from vrw_jax.scans.evaluate import EvaluationRequest
-from vrw_jax.scans.ground import make_engine
-from vrw_jax.scans.offer import (
+from vrw_jax.scans.engines import make_engine
+from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
+from vrw_jax.scans.measure_catalog import (
     canonicalize_name,
     check_measures,
     error_variable_name,
@@ -28,7 +29,6 @@ from vrw_jax.scans.offer import (
     select_catalog,
 )
 from vrw_jax.scans.store import (
-    MANIFEST_ATTRIBUTE,
     PROVENANCE_ATTRIBUTE,
     REQUESTED_ATTRIBUTE,
     ResultLayout,
@@ -36,9 +36,9 @@ from vrw_jax.scans.store import (
     choose_chunk_shape,
     find_first_difference,
 )
-from vrw_jax.walks import ModelLike, check_model, check_options
+from vrw_jax.simulation import ModelLike, check_model, check_options
+from vrw_jax.validation import check_int, check_names, check_positive, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
-from vrw_jax.wording import check_int, check_names, check_positive, check_type
 
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples, chosen because it takes over a day and some hundred GB."""

@@ -22,12 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vrw_jax.models import VISCOELASTIC_MODEL
-from vrw_jax.results import MEASURES
+from vrw_jax.measures import MEASURES
 from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.offer import canonicalize_name
-from vrw_jax.scans.soundness import (
+from vrw_jax.scans.integrity import (
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,
     DIGEST_SIZE_BYTES,
@@ -38,7 +36,9 @@ from vrw_jax.scans.soundness import (
     read_manifest,
     store_lock,
 )
-from vrw_jax.wording import check_type
+from vrw_jax.scans.measure_catalog import canonicalize_name
+from vrw_jax.selection import VISCOELASTIC_MODEL
+from vrw_jax.validation import check_type
 
 if TYPE_CHECKING:
     import zarr

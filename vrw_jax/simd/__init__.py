@@ -1,8 +1,10 @@
 """Compilation of JAX traces to machine code with LLVM, for a few lanes per vector."""
 
-from vrw_jax.simd.arrays import MAX_UNROLLED
-from vrw_jax.simd.code import targets_machine_code
-from vrw_jax.simd.ffi import MACHINE_CODE_PRIMITIVE
+from vrw_jax.simd import code_cache, ffi_primitive, kernel, machine, program
+from vrw_jax.simd.array_emitter import MAX_UNROLLED
+from vrw_jax.simd.code_cache import targets_machine_code
+from vrw_jax.simd.ffi_primitive import MACHINE_CODE_PRIMITIVE
+from vrw_jax.simd.lowering import noinline
 from vrw_jax.simd.machine import describe_processor
 from vrw_jax.simd.program import (
     compile_lane_function,
@@ -12,4 +14,3 @@ from vrw_jax.simd.program import (
     is_available,
 )
 from vrw_jax.simd.rules import list_primitives
-from vrw_jax.simd.trace import noinline

@@ -10,7 +10,7 @@ from typing import Any
 import llvmlite.ir as ir
 import numpy as np
 
-from vrw_jax.simd.numbers import I32, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.value_emitter import I32, NUMBER_TYPES, Value, ValueEmitter
 
 FUSED_FLAGS = ("contract",)
 """Flags that let products and sums be rounded once instead of twice; nothing else may be

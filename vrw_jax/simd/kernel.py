@@ -6,7 +6,7 @@ from typing import Any
 import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd.arrays import (
+from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     MAX_REGISTERS,
     MAX_UNROLLED,
@@ -14,11 +14,11 @@ from vrw_jax.simd.arrays import (
     has_lanes,
     lane_axis_error,
 )
-from vrw_jax.simd.fields import ArrayValue, EntryIndex, LazyArray
-from vrw_jax.simd.handler import add_handler
-from vrw_jax.simd.numbers import I1, I8, I64, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.ffi_handler import add_handler
+from vrw_jax.simd.lazy_arrays import ArrayValue, EntryIndex, LazyArray
+from vrw_jax.simd.lowering import JaxprLowering
 from vrw_jax.simd.rules import PRIMITIVE_RULES
-from vrw_jax.simd.trace import JaxprLowering
+from vrw_jax.simd.value_emitter import I1, I8, I64, NUMBER_TYPES, Value, ValueEmitter
 
 KERNEL_NAME = "lanes"
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import llvmlite.ir as ir
 
-from vrw_jax.simd.arrays import (
+from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     MAX_REGISTERS,
     MAX_REGISTERS_INNER,
@@ -14,9 +14,15 @@ from vrw_jax.simd.arrays import (
     shape_without_lanes,
     split_arrays,
 )
-from vrw_jax.simd.fields import ArrayValue, MemoryArray, PendingUpdate, TransposedView, as_shared
-from vrw_jax.simd.numbers import I64, Value
-from vrw_jax.simd.trace import JAXPR_PARAMETERS, JaxprLowering
+from vrw_jax.simd.lazy_arrays import (
+    ArrayValue,
+    MemoryArray,
+    PendingUpdate,
+    TransposedView,
+    as_shared,
+)
+from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering
+from vrw_jax.simd.value_emitter import I64, Value
 
 
 def emit_while(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:

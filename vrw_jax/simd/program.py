@@ -17,15 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.simd.arrays import LANE_AXIS_SENTINEL, MAX_UNROLLED
-from vrw_jax.simd.code import (
+from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL, MAX_UNROLLED
+from vrw_jax.simd.code_cache import (
     CodeStore,
     MachineCode,
     get_machine_code,
     load_machine_code,
     trace_for_machine_code,
 )
-from vrw_jax.simd.ffi import LOADED_BY_NAME, MACHINE_CODE_PRIMITIVE, register_code
+from vrw_jax.simd.ffi_primitive import LOADED_BY_NAME, MACHINE_CODE_PRIMITIVE, register_code
 from vrw_jax.simd.kernel import KERNEL_NAME, write_module
 from vrw_jax.simd.machine import LoadedCode, compile_wasm, has_512_bit_vectors
 

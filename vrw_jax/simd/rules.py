@@ -4,17 +4,19 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from vrw_jax.simd import loops, movement, sums
+from vrw_jax.simd import data_movement as movement
+from vrw_jax.simd import loops
+from vrw_jax.simd import reductions as sums
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
-from vrw_jax.simd.arrays import (
+from vrw_jax.simd.array_emitter import (
     PrimitiveCall,
     has_lanes,
     lane_axis_error,
     lane_mixing_error,
     number_type,
 )
-from vrw_jax.simd.fields import ArrayValue, LazyArray
-from vrw_jax.simd.trace import JAXPR_PARAMETERS, JaxprLowering, PrimitiveRule, call_rule
+from vrw_jax.simd.lazy_arrays import ArrayValue, LazyArray
+from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering, PrimitiveRule, call_rule
 
 
 def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:

@@ -8,15 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles import (
-    AbstractCycle,
-    AbstractGaitFinder,
-    Gait,
-    default_margins,
-)
+from vrw_jax.cycles import AbstractCycle, AbstractGaitFinder, Gait, default_margins
 from vrw_jax.models import AbstractStep
+from vrw_jax.validation import check_known_name, check_names, check_range, check_real, check_reals
 from vrw_jax.wheel import WheelParams
-from vrw_jax.wording import check_known_name, check_names, check_range, check_real, check_reals
 
 MeasureFunction = Callable[[AbstractCycle, AbstractStep], Array]
 MarginSpec = Mapping[str, float | tuple[float, float]] | Sequence[str]

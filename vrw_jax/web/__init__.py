@@ -1,3 +1,4 @@
 """The wheel in a browser: a page that computes by itself, and the page as a widget."""
 
+from vrw_jax.web import explorer
 from vrw_jax.web.explorer import explore, make_page_address

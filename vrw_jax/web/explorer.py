@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
+from vrw_jax.validation import check_choice, check_int, check_not_traced, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
-from vrw_jax.wording import check_choice, check_int, check_not_traced, check_type
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -1,6 +1,6 @@
 """Wheel parameters, geometry, dynamics, phases, transitions and outcomes."""
 
-from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel import dynamics, geometry, transitions
 from vrw_jax.wheel.dynamics import damping_power, mass_matrix, momentum
 from vrw_jax.wheel.geometry import (
     Motion,

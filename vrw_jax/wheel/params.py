@@ -11,14 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from vrw_jax.numerics import Elementwise, RealInput, Scalar, sine_cosine
-from vrw_jax.wording import (
-    AbstractPrintable,
-    TextRow,
-    check_int,
-    check_reals,
-    format_quantity,
-    format_value,
-)
+from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
+from vrw_jax.validation import check_int, check_reals, format_value
 
 
 class ParameterDomain(NamedTuple):

@@ -26,14 +26,8 @@ from experiments.atlas.chenciner_point import Point, chenciner_point
 from experiments.atlas.gaits import ReturnMap, gaits
 from experiments.atlas.hybrid import JAX, METHODS, GuardEdge, Part, make_row
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import (
-    Guard,
-    Mode,
-    product_multipliers,
-    segment_maps,
-    simulate_hybrid,
-    solve_fixed_point,
-)
+from vrw_jax.continuation import solve_fixed_point
+from vrw_jax.hybrid import Guard, Mode, product_multipliers, segment_maps, simulate_hybrid
 
 K1, K2, K3, K4, K5, K6, K9 = 0.1631021, 1250.0, 0.046875, 20.0, 1.104, 0.001, 0.1175
 K7, K8 = 1.5163129, 0.83200664

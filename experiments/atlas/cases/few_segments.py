@@ -22,13 +22,8 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import (
-    END_WEIGHTS,
-    GAUSS_NODES,
-    INTEGRATION_MATRIX,
-    product_multipliers,
-    segment_maps,
-)
+from vrw_jax.collocation import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX
+from vrw_jax.hybrid import product_multipliers, segment_maps
 
 Q = 0.97
 TRUTH = math.exp(-2.0 * math.pi)

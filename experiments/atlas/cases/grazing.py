@@ -28,7 +28,7 @@ from experiments.atlas.hybrid import (
     run_library,
 )
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import simulate_hybrid
+from vrw_jax.hybrid import simulate_hybrid
 
 RESTITUTION_COEFFICIENT = 0.8
 

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import product_multipliers, segment_maps
+from vrw_jax.hybrid import product_multipliers, segment_maps
 
 SMALL_MULTIPLIER = math.exp(-48.0 * math.pi)
 PERIOD = 2.0 * math.pi

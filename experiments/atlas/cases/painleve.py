@@ -22,7 +22,8 @@ from scipy.optimize import fsolve, nnls
 
 from experiments.atlas.others import make_rows
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import LCPStatus, enumerate_lcp_solutions, solve_fixed_point
+from vrw_jax.continuation import solve_fixed_point
+from vrw_jax.hybrid import LCPStatus, enumerate_lcp_solutions
 
 G, FRICTION = 9.81, 1.6
 STATES = {"one answer": (0.4, 0.0, 1), "two answers": (1.1, 5.0, 2), "no answer": (1.1, 0.0, 0)}

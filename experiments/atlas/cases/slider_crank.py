@@ -28,7 +28,7 @@ from experiments.atlas.hybrid import (
 )
 from experiments.atlas.others import make_rows
 from experiments.atlas.told import Case, Row, compute_error, time_second_call
-from vrw_jax.numerics import LCPStatus, enumerate_lcp_solutions
+from vrw_jax.hybrid import LCPStatus, enumerate_lcp_solutions
 
 CRANK, ROD, HALF, HEIGHT, PLAY = 0.153, 0.306, 0.05, 0.025, 0.001  # m; of the slider: halves
 CRANK_MASS, ROD_MASS, SLIDER_MASS = 0.038, 0.038, 0.076  # kg

@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.hybrid import METHODS, GuardEdge, MethodRun, Part, make_row, modes
 from experiments.atlas.told import Case, Row, compute_error
-from vrw_jax.numerics import simulate_hybrid
+from vrw_jax.hybrid import simulate_hybrid
 
 BELT, STATIC, KINETIC = 0.2, 1.0, 0.5
 DROP = STATIC - KINETIC

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vrw_jax.results import PHASE_NAMES
+from vrw_jax.measures import PHASE_NAMES
 from vrw_jax.wheel import WheelParams
 
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from vrw_jax.measures import PHASE_NAMES
 from vrw_jax.paper.facts import printed
 from vrw_jax.paper.facts.base import (
     REFERENCE_CODE_LABEL,
@@ -18,7 +19,6 @@ from vrw_jax.paper.facts.base import (
     split_by_phase,
 )
 from vrw_jax.paper.gaits import SETTLED_TOLERANCE
-from vrw_jax.results import PHASE_NAMES
 from vrw_jax.wheel import Outcome
 
 

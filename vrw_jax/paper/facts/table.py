@@ -15,7 +15,7 @@ from vrw_jax.paper.facts.claims import (
     TYPICAL_GAIT_CLAIMS,
 )
 from vrw_jax.paper.facts.misprints import MISPRINT_CLAIMS
-from vrw_jax.wording import format_markdown_table
+from vrw_jax.printing import format_markdown_table
 
 INTRODUCTION = (
     "“independent code” is a solver in the paper's own five constrained coordinates: where the "

@@ -1,0 +1,472 @@
+"""Gait steps of batches of wheels: one function for several engines.
+
+On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU it is an
+XLA program for very many lanes, and a few stragglers are run again in smaller batches. In both
+cases every lane runs the same code, and no data pass between lanes. The result of a batch element
+is bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
+side.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.batches.collocation_step import collocation_gait_step
+from vrw_jax.batches.contact_step import CONTACT_STEP_INPUTS, step_batch_with_contact
+from vrw_jax.batches.programs import run_compiled
+from vrw_jax.batches.stiffness import (
+    IMPLICIT_SOLVER,
+    IMPLICIT_SOLVER_INDEX,
+    NAMED_SOLVER_INDEX,
+    STABLE_SOLVER,
+    STABLE_SOLVER_INDEX,
+    TSIT5_TOLERANCE_FACTOR,
+    select_solver,
+)
+from vrw_jax.batches.uneven_ground import walk_uneven_ground
+from vrw_jax.batches.walk_batch import START_NAME, StepBatchResult, WalkBatch, lane_index
+from vrw_jax.integrator import load_explicit_tableau
+from vrw_jax.models import (
+    N_STEP_INPUTS,
+    AbstractWheel,
+    AdvanceResult,
+    gait_step,
+    jacobian_columns,
+    scaled_jacobian_columns,
+)
+from vrw_jax.numerics import StepOptions, map_in_batches
+from vrw_jax.simulation import check_model, check_options, check_section_state
+from vrw_jax.validation import (
+    check_choice,
+    check_int,
+    check_not_traced,
+    check_numpy_reals,
+    check_type,
+)
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    wheel_from_parameters,
+)
+
+BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
+BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
+
+PAPER_STEP_INPUTS = (START_NAME, *PARAMETER_NAMES)
+"""Inputs with respect to which a step of the paper's model can be differentiated."""
+
+DIFFRAX_BATCH_SIZE = 256
+"""Number of batch elements that the diffrax engine takes at a time."""
+
+
+def step_batch(
+    params: WheelParams,
+    states: Array | np.ndarray,
+    n_steps: int = 1,
+    *,
+    model: AbstractWheel | None = None,
+    options: StepOptions | None = None,
+    engine: BatchEngine = "auto",
+    durations: Array | np.ndarray | None = None,
+    derivatives: Sequence[str] = (),
+) -> StepBatchResult:
+    """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
+    requested.
+
+    Engine "lanes" is the fast one, for the viscoelastic wheel and explicit solvers. "diffrax" maps
+    `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if it is possible;
+    `StepBatchResult.engine` gives the selected one. Both have the errors of `options`, which apply
+    to each solver step. The results of the two differ by some ten times the tolerance.
+
+    "auto" also selects another solver than the named one if the airborne leg is so stiff that
+    another is cheaper; `StepBatchResult.solver_index` gives the selected one. It is Tsit5 if
+    stability limits the steps. At the default options this is the case from c/m = 1,900 1/s; at a
+    tolerance of 1e-6, from 300 1/s. It is Kvaerno5 by "diffrax" if explicit solvers need too many
+    steps (from 4e5, or from 1.4e5) or Tsit5 failed.
+
+    "collocation" is faster still near a known gait. `durations` are those of DLS, SLS-I and SLS-II
+    to some per cent, as of a limit cycle or a neighbor's step. Later steps use those of the
+    previous step. Its error is fixed, about 1e-8 for 99 elements in 100, independent of `options`.
+    Each element is checked, and an element that fails the check is stepped by the lane engine.
+    `is_collocated` marks the elements that passed.
+
+    Derivatives go through all steps and their events. They are zero for an element whose walk
+    failed, and are not available by collocation. With unilateral contact (`UnilateralWheel`, with
+    friction a scalar or one value per element) the only engine is "lanes". It is "diffrax" if slope
+    or friction differ from step to step, with shape (elements, n_steps) as in `walk`. This function
+    cannot be used inside `jax.jit`; it compiles itself, once.
+
+    Args:
+        params: the wheels; fields are scalars or of shape (elements,).
+        states: section states, shape (elements, 3), rad, rad/s, m/s, or full states with contact.
+        n_steps: largest number of steps.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: numerical choices of the steps.
+        engine: "auto", "lanes", "diffrax" or "collocation", as above.
+        durations: of the phases, shape (elements, 3), s, for "collocation".
+        derivatives: "section_state" and names of parameters; with unilateral contact "friction"
+            too.
+
+    Returns:
+        A `StepBatchResult`, for the last step of each element.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> params = vrw.WheelParams(damping=np.array([120.0, 150.0, 180.0]))
+        >>> result = vrw.step_batch(params, np.tile(vrw.paper_start(), (3, 1)), 10)
+        >>> result.durations.shape, result.n_stepped.tolist(), result.engine
+        ((3, 3), [10, 10, 10], 'lanes')
+    """
+    check_not_traced(
+        "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
+    )
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    checked_model, options = check_model(model, allows_arrays=True), check_options(options)
+    check_choice("engine", engine, BATCH_ENGINE_NAMES)
+    n_steps = check_int("n_steps", n_steps)
+    checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
+    columns = _check_columns(params, checked_states, checked_model, options, n_steps)
+    checked_states = checked_states.astype(columns[0].dtype, copy=False)
+    has_contact_kernel = checked_model.batch_kernel == "legs"
+    arguments = checked_model, columns, checked_states, n_steps, options, engine, params.n_legs
+    if any(
+        np.ndim(column) == 2 for column in (*columns, getattr(checked_model, FRICTION_NAME, 0.0))
+    ):
+        return walk_uneven_ground(*arguments, derivatives)
+    derivative_names = _check_derivatives(
+        derivatives, CONTACT_STEP_INPUTS if has_contact_kernel else PAPER_STEP_INPUTS, engine
+    )
+    return (
+        step_batch_with_contact(*arguments, derivative_names)
+        if has_contact_kernel
+        else _step_paper_model(*arguments, durations, derivative_names)
+    )
+
+
+def _check_derivatives(
+    derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
+) -> list[str]:
+    """Return the names of the inputs to differentiate by.
+
+    Raises: ValueError: a name is unknown, or the engine has no derivatives.
+    """
+    names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
+    for name in names:
+        if name not in known_names:
+            raise ValueError(
+                f"derivatives name {name!r}, but a step moves with one of {', '.join(known_names)}."
+            )
+    if names and engine == "collocation":
+        raise ValueError(
+            "derivatives are not available by collocation in batches: take "
+            "engine='lanes', or jax.jacfwd of vrw.return_map."
+        )
+    return names
+
+
+def _check_columns(
+    params: WheelParams,
+    states: np.ndarray,
+    model: AbstractWheel,
+    options: StepOptions,
+    n_steps: int,
+) -> list[np.ndarray]:
+    """Return the parameters, one value for all or one per element, with slopes of each step too.
+
+    Raises: ValueError: the shapes of states or parameters do not fit.
+    """
+    sizes = [3]
+    if states.ndim != 2 or states.shape[1] != 3:
+        sizes = sorted({3, model.section_size(params)})
+    if states.ndim != 2 or states.shape[1] not in sizes:
+        raise ValueError(
+            f"states have shape {states.shape}, but they are section states, shape (lanes, "
+            f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
+        )
+    n_states, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
+    parameter_dtype = np.result_type(*(column.dtype for column in columns))
+    StepOptions.check_tolerances(
+        options, parameter_dtype
+    )  # equinox takes 0.1 ms for a bound method
+    friction = getattr(model, FRICTION_NAME, np.zeros(()))
+    for name, column in zip((*PARAMETER_NAMES, FRICTION_NAME), (*columns, friction), strict=True):
+        varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(column) == 2
+        if np.shape(column) not in ((), (n_states,), *[(n_states, n_steps)] * varies_by_step):
+            raise ValueError(
+                f"{name} has shape {np.shape(column)}, but there are {n_states} states"
+                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for each"
+                f"{' and each of its steps' * varies_by_step}."
+            )
+    dtype = np.promote_types(parameter_dtype, states.dtype)
+    return [np.asarray(column, dtype) for column in columns]
+
+
+def _step_paper_model(
+    model: Any,
+    parameter_columns: list[np.ndarray],
+    states: np.ndarray,
+    n_steps: int,
+    options: StepOptions,
+    engine: str,
+    n_legs: int,
+    durations: Any,
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    order = sort_by_work(parameter_columns, states)
+    wheels = np.empty((len(parameter_columns), len(states)), states.dtype)
+    for row, column in zip(wheels, parameter_columns, strict=True):
+        row[:] = column[order] if column.ndim else column
+    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES)
+    settings = n_legs, walks.input_indices
+    engines = {NAMED_SOLVER_INDEX: _select_engine(engine, model, options, *settings)}
+    solver_index = np.full(len(states), NAMED_SOLVER_INDEX, np.int32)
+    solver_names: tuple[str, ...] = (options.solver,)
+    engine_name = engines[NAMED_SOLVER_INDEX].name
+    if engine == "auto" and engine_name == "lanes":
+        solver_names, solver_index = (
+            (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
+            select_solver(
+                wheels, options.with_derivative_tolerances() if derivative_names else options
+            ),
+        )
+    if np.any(solver_index != NAMED_SOLVER_INDEX):
+        with_solver = lambda solver_index: dataclasses.replace(options, solver=solver_index)
+        stable_options = with_solver(STABLE_SOLVER).with_tightened_tolerances(
+            TSIT5_TOLERANCE_FACTOR
+        )
+        engines[STABLE_SOLVER_INDEX] = _select_engine("lanes", model, stable_options, *settings)
+        engines[IMPLICIT_SOLVER_INDEX] = _select_engine(
+            "diffrax", model, with_solver(IMPLICIT_SOLVER), *settings
+        )
+    if engine == "collocation":
+        engine_name = engine
+        walks.durations[:] = _check_durations(durations, states, wheels.dtype).T.take(order, -1)
+    for _ in range(n_steps):
+        active = walks.active_lanes()
+        if engine == "collocation" and len(active):
+            index = lane_index(active, walks)
+            arguments = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
+            walks.record_step(
+                active,
+                *_step_by_collocation(engines[NAMED_SOLVER_INDEX], model, n_legs, *arguments),
+            )
+            continue
+        for engine_index, selected_engine in engines.items():
+            lane_indices = active[solver_index[active] == engine_index]
+            if len(lane_indices) > 0:
+                index = lane_index(lane_indices, walks)
+                result = selected_engine.take_step(wheels[:, index], walks.section_state[:, index])
+                if engine_index == STABLE_SOLVER_INDEX:
+                    # A phase may last longer than `select_solver` assumes; the next is implicit.
+                    has_failed = result[2] == Outcome.SOLVER_FAILED
+                    solver_index[lane_indices[has_failed]] = IMPLICIT_SOLVER_INDEX
+                    lane_indices, result = (
+                        lane_indices[~has_failed],
+                        tuple(part[..., ~has_failed] for part in result),
+                    )
+                walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
+    return walks.to_result(order, solver_index, engine_name, solver_names)
+
+
+def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
+    """Return an order of the batch in which wheels of similar work are side by side.
+
+    A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There
+    stability limits the solver's steps by m/c, and Leg 2 extends at the rate k (Ls - L)/c from its
+    length at release. The exponents are rounded from a fit to the solver's steps of wheels near
+    their gaits and away from them (`python -m experiments.speed.lanes_that_wait`).
+    """
+    values_by_name = dict(zip(PARAMETER_NAMES, columns, strict=True))
+    single_precision = lambda name: np.asarray(values_by_name[name], np.float32)
+    with np.errstate(all="ignore"):
+        theta, dtheta = states.T[:2].astype(np.float32)
+        length, mass = single_precision("locked_length"), single_precision("leg_mass")
+        work = np.log(single_precision("damping") / mass) - 0.25 * np.log(
+            single_precision("stiffness") / mass
+        )
+        work = work + 0.8 * np.log(dtheta) + 0.65 * np.log(length / single_precision("gravity"))
+        work = work + theta - 7.0 * single_precision("natural_length") / length
+    return np.argsort(work)
+
+
+def _check_durations(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    if durations is None or np.shape(durations) != states.shape:
+        shape = None if durations is None else np.shape(durations)
+        raise ValueError(
+            f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
+            "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
+        )
+    return check_numpy_reals("durations", durations).astype(dtype, copy=False)
+
+
+class _BatchEngine(NamedTuple):
+    """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
+
+    name: str
+    take_step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+
+
+def _select_engine(
+    engine: str, model: Any, options: StepOptions, n_legs: int, input_indices: tuple[int, ...]
+) -> _BatchEngine:
+    has_lane_kernel = (
+        model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
+    )
+    if engine in ("lanes", "collocation") and not has_lane_kernel:
+        raise ValueError(
+            f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
+            "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
+        )
+    if engine == "diffrax" or not has_lane_kernel:
+        take_diffrax_step = functools.partial(
+            _step_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
+        )
+        return _BatchEngine("diffrax", take_diffrax_step)
+    take_lane_step = functools.partial(
+        _step_by_lanes, model.stop_at_lift_off, options, n_legs, input_indices
+    )
+    return _BatchEngine("lanes", take_lane_step)
+
+
+def _step_by_lanes(
+    stop_at_lift_off: bool,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    wheels: np.ndarray,
+    states: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Take one gait step by the lane engine."""
+    option_leaves, structure = jax.tree.flatten(options)
+    uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
+    assert tableau is not None  # checked by `_select_engine`
+
+    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        current_options = jax.tree.unflatten(structure, uniform)
+        current_options = (
+            current_options.with_derivative_tolerances() if input_indices else current_options
+        )
+
+        def step_outputs(*lanes: Array) -> tuple:
+            params, x = wheel_from_parameters(lanes[:n_parameters], n_legs), lanes[n_parameters:]
+            result = gait_step(
+                params, x, current_options, tableau, stop_at_lift_off, straggler_count
+            )
+            diagnostics = result.is_unfinished, result.outcome, result.solver_steps
+            return jnp.stack([*result.section_state, *result.durations]), diagnostics
+
+        if not input_indices:
+            values, diagnostics = step_outputs(*lanes)
+            return (*diagnostics, values)
+        jacobian_of_step = (
+            scaled_jacobian_columns if len(input_indices) == N_STEP_INPUTS else jacobian_columns
+        )
+        jacobian, values, diagnostics = jacobian_of_step(step_outputs, lanes, input_indices)
+        return (*diagnostics, values, jacobian)
+
+    settings = ("gait step", n_legs, stop_at_lift_off, structure, input_indices)
+    max_group_size = (N_STEP_INPUTS,) if input_indices else ()
+    results = run_compiled(step, uniform, [*wheels, *states], settings, *max_group_size)
+    _, outcome, n_solver_steps, values, *jacobian = results
+    return values[:3], values[3:], outcome, n_solver_steps, *jacobian
+
+
+def _step_by_collocation(
+    lane_engine: _BatchEngine,
+    model: Any,
+    n_legs: int,
+    wheels: np.ndarray,
+    states: np.ndarray,
+    durations: np.ndarray,
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Take one step by collocation, and by the lane engine for lanes that fail the check; return
+    which passed."""
+    stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
+
+    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        params, states_and_durations = (
+            wheel_from_parameters(lanes[:n_parameters], n_legs),
+            tuple(lanes[n_parameters:]),
+        )
+        result = collocation_gait_step(
+            params, states_and_durations[:3], states_and_durations[3:], stop_at_lift_off
+        )
+        is_unfinished = jnp.zeros_like(result.is_trusted)
+        return (
+            is_unfinished,
+            result.is_trusted,
+            jnp.stack([*result.section_state, *result.durations]),
+        )
+
+    settings = ("gait step by collocation", n_legs, stop_at_lift_off)
+    _, is_trusted, values = run_compiled(step, [], [*wheels, *states, *durations], settings)
+    outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
+    result = values[:3], values[3:], outcome, n_solver_steps
+    untrusted = np.flatnonzero(~is_trusted)
+    if len(untrusted) > 0:
+        for all_values, new_values in zip(
+            result, lane_engine.take_step(wheels[:, untrusted], states[:, untrusted]), strict=True
+        ):
+            all_values[..., untrusted] = new_values
+    return result, is_trusted
+
+
+def _step_by_diffrax(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    wheels: np.ndarray,
+    states: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Take one step by the model's own step under `jax.vmap`, DIFFRAX_BATCH_SIZE elements at a
+    time."""
+    options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
+    rows = np.concatenate([wheels, states]).T
+    step_rows = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
+    return jax.tree.map(
+        lambda x: np.array(x).T, map_in_batches(step_rows, (DIFFRAX_BATCH_SIZE,), rows)
+    )
+
+
+@eqx.filter_jit
+def _vmapped_step(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    rows: Array,
+) -> tuple[Array, ...]:
+    n_parameters = len(PARAMETER_NAMES)
+
+    def step_one(inputs: Array) -> tuple[Array, ...]:
+        def step_from_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
+            all_inputs = inputs.at[np.array(input_indices, int)].set(varied_inputs)
+            result = model.advance(
+                wheel_from_parameters(all_inputs[:n_parameters], n_legs),
+                all_inputs[n_parameters:],
+                options,
+            )
+            return jnp.concatenate([result.section_state, result.durations]), result
+
+        varied_inputs = inputs[np.array(input_indices, int)]
+        if not input_indices:
+            _, result = step_from_inputs(varied_inputs)
+            return result.section_state, result.durations, result.outcome, result.solver_steps
+        jacobian, result = jax.jacfwd(step_from_inputs, has_aux=True)(varied_inputs)
+        values = result.section_state, result.durations, result.outcome, result.solver_steps
+        return *values, jacobian
+
+    return jax.vmap(step_one)(rows)

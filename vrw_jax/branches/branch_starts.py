@@ -1,0 +1,157 @@
+"""Starts of branches by model: gaits to continue, and their wheels."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.branches.branch_location import CycleFactory
+from vrw_jax.branches.continuation_problems import (
+    AbstractGaitProblem,
+    BranchWheel,
+    CollocationProblem,
+    GroundProblem,
+    ReturnMapProblem,
+)
+from vrw_jax.continuation import ContinuationPoint
+from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycles, make_finder, transfer_to_mesh
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import StepOptions
+from vrw_jax.simulation import walk_toward_gait
+from vrw_jax.wheel import WheelParams
+
+
+class BranchRequest(NamedTuple):
+    """Request for branches of a batch of wheels."""
+
+    params: WheelParams  # one leading axis
+    model: AbstractWheel
+    parameter_name: str  # of the parameter
+    parameter_values: Array  # at the starts of the branches
+    period_n: int
+    cycle_options: CycleOptions | None
+    step_options: StepOptions
+
+
+class BranchStart(NamedTuple):
+    """Data that a continuation needs to start."""
+
+    problem: AbstractGaitProblem
+    wheels: BranchWheel
+    unknowns: Any
+    outcomes: np.ndarray  # of the first gaits
+    make_cycle: CycleFactory
+    cycle: Any = None  # the gaits themselves
+    finer_options: CycleOptions | None = None  # options with a finer mesh, None without a mesh
+
+
+def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
+    """Return starts from limit cycles by collocation, given or found."""
+    params, name, period_n = request.params, request.parameter_name, request.period_n
+    options = CycleOptions.tight() if request.cycle_options is None else request.cycle_options
+    # The start does not need the mesh or the accuracy of the branch.
+    start_cycle = cycle
+    if start_cycle is None:
+        start_cycle = limit_cycles(params, period_n=period_n, model=request.model)
+    if not isinstance(start_cycle, LimitCycle):
+        raise TypeError(
+            f"cycle is a {type(start_cycle).__name__}, but the paper's branch starts from a "
+            "LimitCycle: give vrw.limit_cycle(params)."
+        )
+    finder: Any = make_finder(
+        request.model, params.n_legs, period_n=period_n, cycle_options=options
+    )
+    system = finder.system
+
+    def make_cycle(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
+        def find_cycle_at_point() -> LimitCycle:
+            guess = jax.tree.map(lambda x: x[wheel_index], start_cycle)
+            collocation_state = guess.collocation_state._replace(
+                solution=jax.tree.map(jnp.asarray, point.z)
+            )
+            guess = dataclasses.replace(guess, collocation_state=collocation_state, system=system)
+            wheel = jax.tree.map(lambda x: x[wheel_index], params)
+            _, wheel = request.model.with_parameter(wheel, name, jnp.asarray(point.p))
+            return finder.find_cycle(wheel, guess)
+
+        return find_cycle_at_point
+
+    return BranchStart(
+        CollocationProblem(system=system, parameter_name=name, additional_quantities=None),
+        BranchWheel(params, start_cycle.collocation_state.phase_active),
+        jax.vmap(lambda solution: transfer_to_mesh(start_cycle.system, system, solution))(
+            start_cycle.collocation_state.solution
+        ),
+        np.asarray(start_cycle.outcome),
+        make_cycle,
+        start_cycle,
+        options.refine_mesh(),
+    )
+
+
+def start_from_walks(request: BranchRequest, cycle: Any) -> BranchStart:
+    """Return starts from fixed points of the model's step, given or at the ends of walks."""
+    params, model, options = request.params, request.model, request.step_options
+
+    def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
+        model_at_p, wheel = model.with_parameter(params, request.parameter_name, p)
+        walk = walk_toward_gait(model_at_p, wheel, options)
+        return walk.outcome, walk.steps.section_state[-1]
+
+    if cycle is None:
+        outcomes, section_states = jax.vmap(walk_to_gait)(params, request.parameter_values)
+    else:
+        outcomes, section_states = cycle.outcome, cycle.section_state
+    problem = ReturnMapProblem(
+        model=model,
+        options=options,
+        parameter_name=request.parameter_name,
+        period_n=request.period_n,
+        n_coordinates=model.n_continuous(params),
+    )
+    phase_active = jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    return BranchStart(
+        problem,
+        BranchWheel(params, phase_active),
+        section_states,
+        np.asarray(outcomes),
+        lambda wheel_index, point: None,
+    )
+
+
+def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchStart:
+    """Return starts from gaits with unilateral contact, given or the slowest attracting one."""
+    params, options = request.params, request.step_options
+    model: Any = request.model
+    finder: Any = make_finder(model, params.n_legs, step_options=options, period_n=request.period_n)
+    if not finder.is_multistable:  # no batched engine: use the step
+        return start_from_walks(request, cycle)
+    wheels = BranchWheel(
+        params, jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    )
+    problem = GroundProblem(
+        model=model,
+        options=options,
+        parameter_name=request.parameter_name,
+        period_n=request.period_n,
+        n_legs=params.n_legs,
+    )
+    values = problem.parameter_values(wheels, request.parameter_values)
+    if cycle is None:
+        cycle = finder.find_cycles_near(values, finder.initial_guesses(values))
+
+    outcomes = np.asarray(cycle.outcome)
+    return BranchStart(
+        problem, wheels, cycle.section_state, outcomes, lambda wheel_index, point: None
+    )
+
+
+START_FUNCTIONS: dict[str, Callable[[BranchRequest, Any], BranchStart]] = {
+    "viscoelastic": start_from_collocation,
+    "unilateral": start_from_unilateral_gaits,
+}
+"""Start functions by name of the model; all other models use `start_from_walks`."""

@@ -1,0 +1,416 @@
+"""Continuation problems of the wheel's gaits, and the measures of their points.
+
+`CollocationProblem` is the fast one: the collocation system of the paper's sequence of phases, with
+one linearized pass per Newton iteration. `GroundProblem` uses batched steps with unilateral
+contact. `ReturnMapProblem` works for every model: it iterates the model's step and differentiates
+it in forward mode.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
+from vrw_jax.contact import UnilateralWheel
+from vrw_jax.continuation import (
+    AbstractContinuationProblem,
+    ContinuationPoint,
+    NewtonStep,
+    SectionVector,
+    Unknowns,
+    arclength,
+)
+from vrw_jax.cycles import (
+    CollocationState,
+    CollocationSystem,
+    PeriodMap,
+    collocation_correction_norm,
+    compile_batched,
+    gait_takeoff_acceleration,
+    init_search_flags,
+    solve_linear_systems,
+)
+from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.models import AbstractStep, AbstractWheel, AnySectionState
+from vrw_jax.numerics import Scalar, StepOptions, unbatch
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    stack_parameters,
+    wheel_from_parameters,
+)
+
+
+class BranchWheel(NamedTuple):
+    """Wheel whose gaits are continued, at any value of the continued parameter."""
+
+    params: WheelParams
+    phase_active: Float[Array, "n n_phases"]  # 1 if a phase of the cycle takes place, else 0
+
+
+class AbstractGaitProblem(AbstractContinuationProblem):
+    """Continuation problem of gaits of `n_steps` steps along the float parameter `name`."""
+
+    parameter_name: eqx.AbstractVar[str]
+
+    @property
+    @abc.abstractmethod
+    def n_steps(self) -> int:
+        """Return the number of steps after which the gait repeats."""
+
+    @abc.abstractmethod
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        """Return the section state before the first landing, and quantities that are defined beyond
+        a special point."""
+
+    def measure_points(
+        self,
+        model: AbstractWheel,
+        options: StepOptions,
+        wheels: BranchWheel,
+        points: ContinuationPoint,
+    ) -> dict[str, Array]:
+        """Return all measures of the gaits at many points from event-driven steps, with those of
+        `read_state`."""
+        return _measure_points(self, model, options, wheels, points)
+
+
+@eqx.filter_jit
+def _measure_points(
+    problem: AbstractGaitProblem,
+    model: AbstractWheel,
+    options: StepOptions,
+    wheels: BranchWheel,
+    points: ContinuationPoint,
+) -> dict[str, Array]:
+    def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
+        section_state, continued_quantities = problem.read_state(wheel, z, p)
+        model_at_point, params = model.with_parameter(wheel.params, problem.parameter_name, p)
+        measures = measure_gait(model_at_point, params, section_state, options, problem.n_steps)
+        return measures | continued_quantities | {"section_state": section_state}
+
+    return jax.vmap(measure_point)(wheels, points.z, points.p)
+
+
+class CollocationProblem(AbstractGaitProblem):
+    """Continuation problem of limit cycles by collocation. z is a `CollocationSolution` without the
+    axis over lanes.
+
+    Beyond an indicator's zero the formal solution continues; the event-driven step rejects it as a
+    gait.
+    """
+
+    system: CollocationSystem = eqx.field(static=True)
+    parameter_name: str = eqx.field(static=True)
+    additional_quantities: Callable | None = eqx.field(
+        static=True
+    )  # of the first step's passages and z
+
+    @property
+    def n_steps(self) -> int:
+        return self.system.period_n
+
+    def _parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
+        return stack_parameters(
+            eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
+        )
+
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+        linearize = linearize_with_quantities(
+            self.system, (PARAMETER_NAMES.index(self.parameter_name),)
+        )
+        correction, tangents, monodromy, *_ = linearize(
+            self._parameters_at(wheel, p), wheel.phase_active, z
+        )
+        return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
+
+    def _mesh_error(self, z: CollocationSolution) -> Array:
+        solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
+        return estimate_mesh_error(self.system.sequence, self.system.meshes, solution_with_lane)[0]
+
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z.section_state
+
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+        return unbatch(collocation_correction_norm)(z, correction)
+
+    def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
+        """Return whether the durations are positive. The event-driven step checks everything
+        else."""
+        return jnp.all((z.durations > 0.0) | (wheel.phase_active < 0.5))
+
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        """Return the section state, and quantities that continue beyond a special point.
+
+        These are the shortest durations over the steps, and `takeoff_acceleration`, the rear foot's
+        acceleration at take-off, m/s^2, least over the steps.
+        """
+        parameters = self._parameters_at(wheel, p)
+        s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
+        _, steps = self.system.evaluate_passages(parameters, z)
+        takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
+        end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
+        continued_quantities = {
+            "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
+            "duration_sls1": min_durations[1],
+            "duration_sls2": min_durations[2],
+            "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
+            "mesh_error": self._mesh_error(z),
+        }
+        if self.additional_quantities is not None:
+            continued_quantities |= self.additional_quantities(s, steps[0], z)
+        return jnp.stack([end.q[0], *end.v]), continued_quantities
+
+
+QuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
+"""Function of the system, parameters, `phase_active` and solution that returns quantities of
+collocated gaits over lanes."""
+
+
+def linearize_with_quantities(
+    system: CollocationSystem,
+    parameter_indices: tuple[int, ...],
+    quantities_of: QuantityFunction | None = None,
+) -> Any:
+    """Return a function for correction, tangents of the parameters and monodromy of one wheel's
+    trial.
+
+    With `quantities_of` it also returns those quantities at the trial, and their derivatives along
+    the correction and along each tangent. Its arguments are (parameters, phase_active, solution);
+    `jax.vmap` maps it over lanes.
+    """
+
+    def linearize_trial(parameters: Array, phase_active: Array, z: CollocationSolution) -> tuple:
+        collocation_state = CollocationState(
+            z, phase_active, *init_search_flags(system, z.section_state)
+        )
+        linearized_pass = system.linearize_at(parameters, collocation_state, parameter_indices)
+        newton_data = (
+            linearized_pass.correction,
+            linearized_pass.tangents,
+            linearized_pass.monodromy,
+        )
+        if quantities_of is None:
+            return newton_data
+        identity_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(parameter_indices)]
+        parameter_tangents = np.concatenate([np.zeros_like(identity_rows[:1]), identity_rows])[
+            :, :, None
+        ]
+        prepend = lambda a, b: jnp.concatenate([a[None], b])
+        tangents = jax.tree.map(prepend, linearized_pass.correction, linearized_pass.tangents)
+        directions = (
+            jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
+            tangents,
+        )
+        evaluate = lambda parameters, z: quantities_of(system, parameters, phase_active, z)
+        tangent_along = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
+        return *newton_data, evaluate(parameters, z), lax.map(tangent_along, directions)
+
+    make_output_template = lambda parameters, happens, z: (
+        z,
+        z,
+        *(parameters,) * (1 if quantities_of is None else 3),
+    )
+    cache_key = (
+        "followed",
+        system,
+        parameter_indices,
+        quantities_of.__name__ if quantities_of else "",
+    )
+    return unbatch(compile_batched(linearize_trial, make_output_template, cache_key, batch_size=0))
+
+
+class ReturnMapProblem(AbstractGaitProblem):
+    """Continuation problem of fixed points of `period_n` steps of any model; z is the section
+    state.
+
+    The codes at its end (`AbstractWheel.n_continuous`) are those of the image of the last
+    iteration. Newton's method ends only if they agree.
+    """
+
+    model: AbstractWheel
+    options: StepOptions
+    parameter_name: str = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+    n_coordinates: int = eqx.field(static=True)
+
+    @property
+    def n_steps(self) -> int:
+        return self.period_n
+
+    def _image(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
+        model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+        for _ in range(self.period_n):
+            advance = model.advance(params, z, self.options)
+            z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
+        return z
+
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+        return_map = lambda z, p: self._image(wheel, z, p)
+        return arclength.fixed_point_newton_step(return_map, z, p, self.n_coordinates)
+
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z[: self.n_coordinates]
+
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        return interpolate_states(left, right, fraction, self.n_coordinates)
+
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        """Return the section state. The step's measures contain all other quantities."""
+        return z, {}
+
+
+class GroundProblem(AbstractGaitProblem):
+    """Continuation problem with unilateral contact, by batched steps; z as in
+    `ReturnMapProblem`."""
+
+    model: UnilateralWheel
+    options: StepOptions
+    parameter_name: str = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+    n_legs: int = eqx.field(static=True)
+
+    is_traceable: ClassVar[bool] = False
+
+    @property
+    def n_steps(self) -> int:
+        return self.period_n
+
+    @property
+    def n_coordinates(self) -> int:
+        return self.model.n_continuous(WheelParams(n_legs=self.n_legs))
+
+    def parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
+        """Return the model's parameter values of many wheels with the continued parameter at p."""
+
+        def values_of_wheel(wheel: BranchWheel, p: Array) -> Array:
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+            return model.parameter_values(params)
+
+        return jax.vmap(values_of_wheel)(wheels, p)
+
+    def _period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
+        values = np.asarray(self.parameter_values(wheels, p))
+        return PeriodMap(self.model, self.n_legs, self.period_n, values)
+
+    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Array) -> NewtonStep:
+        """Return the Newton steps of many wheels."""
+        section_states, n_coordinates = np.asarray(z), self.n_coordinates
+        is_own_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
+        period = self._period_map(wheel, p).evaluate_period(
+            self.options, section_states, is_own_parameter
+        )
+        nan_if_invalid = np.where(period.is_valid, 0.0, np.nan)[:, None]
+        defect, return_jacobian = (
+            period.end_state - section_states + nan_if_invalid,
+            period.return_jacobian[:, :n_coordinates, :n_coordinates],
+        )
+        right_sides = np.concatenate(
+            [
+                defect[:, :n_coordinates, None],
+                period.value_jacobian[:, :n_coordinates, is_own_parameter],
+            ],
+            -1,
+        )
+        solutions, codes = (
+            solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides),
+            defect[:, n_coordinates:],
+        )
+        correction = np.concatenate([solutions[..., 0], codes], 1)
+        tangent = np.concatenate([solutions[..., 1], 0.0 * codes], 1)
+        return NewtonStep(correction, tangent, jnp.asarray(return_jacobian))
+
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z[: self.n_coordinates]
+
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        return interpolate_states(left, right, fraction, self.n_coordinates)
+
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        return z, {}
+
+    def measure_points(
+        self,
+        model: AbstractWheel,
+        options: StepOptions,
+        wheels: BranchWheel,
+        points: ContinuationPoint,
+    ) -> dict[str, Array]:
+        period = self._period_map(wheels, points.p).evaluate_period(
+            options, np.asarray(points.z), False, False
+        )
+        return _measure_periods(period.steps, points.z) | {"section_state": jnp.asarray(points.z)}
+
+
+@jax.jit
+@jax.vmap
+def _measure_periods(steps: AbstractStep, x: AnySectionState) -> dict[str, Array]:
+    return combine_step_measures(
+        steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x
+    )
+
+
+def interpolate_states(left: Array, right: Array, fraction: Scalar, n_coordinates: int) -> Array:
+    """Interpolate section states. The codes are those of the nearer one."""
+    codes = jnp.where(fraction < 0.5, left, right)[n_coordinates:]
+    return jnp.concatenate([(left + fraction * (right - left))[:n_coordinates], codes])
+
+
+def measure_gait(
+    model: AbstractWheel,
+    params: WheelParams,
+    section_state: AnySectionState,
+    options: StepOptions,
+    period_n: int,
+) -> dict[str, Array]:
+    """Return all measures of one period of a gait that passes the section at x, with `closure`.
+
+    Indicators and margins are minima over the steps, durations and energies are sums. Section and
+    post-impact state are those of the last and first step. `outcome` is that of the first step that
+    failed. `closure` is the distance of the section state from x after the period.
+    """
+
+    def measure_next_step(x: AnySectionState, _: None) -> tuple[AnySectionState, dict[str, Array]]:
+        result = model.take_step(params, x, options)
+        return result.section_state, result.measures()
+
+    end_state, step_measures = lax.scan(measure_next_step, section_state, None, length=period_n)
+    return combine_step_measures(end_state, step_measures, section_state)
+
+
+def combine_step_measures(
+    end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
+) -> dict[str, Array]:
+    """Return `measure_gait` from the measures of each step and the final section state."""
+    measures = {}
+    for name, values in step_measures.items():
+        if name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or name.startswith("lambda_"):
+            measures[name] = jnp.min(values, 0)
+        elif name.endswith("_touchdown"):
+            measures[name] = values[-1]
+        elif name.endswith("_post_impact"):
+            measures[name] = values[0]
+        elif name == "outcome":
+            measures[name] = values[jnp.argmax(values != Outcome.STEPPED)]
+        else:
+            measures[name] = jnp.sum(values, 0)
+    period = jnp.where(measures["period"] > 0.0, measures["period"], 1.0)
+    measures["dls_fraction"] = measures["duration_dls"] / period
+    measures["speed"] = measures["step_length"] / period
+    return measures | {"closure": jnp.max(jnp.abs(end_state - section_state))}

@@ -1,0 +1,481 @@
+"""Continuation of special points as curves in two parameters, several side by side, each once.
+
+A special point is solved for together with the gait, so that a point of a curve is as accurate as
+the gait. Where a curve meets another special point, a new curve starts.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.branch_location import (
+    BRANCH_POINT_KIND,
+    AbstractContinuation,
+    BranchData,
+    QuantityTable,
+    continue_and_locate,
+)
+from vrw_jax.branches.continuation import (
+    BRANCH_ENDING_QUANTITIES,
+    MAX_BRANCH_REFINEMENTS,
+    GaitContinuation,
+    continue_branches,
+)
+from vrw_jax.branches.continuation_problems import BranchWheel
+from vrw_jax.branches.gait_test_functions import (
+    CONTINUED_QUANTITIES,
+    DISCONTINUOUS_QUANTITIES,
+    DLS_VANISHES,
+    FORCE_FALL_NAME,
+    LINEAR_SUBSTITUTES,
+    GaitTestFunction,
+    TestFunctionArgs,
+    locate_jump_onset,
+    quantity_group_of,
+    test_quantity_of,
+)
+from vrw_jax.collocation import CollocationSolution
+from vrw_jax.continuation import (
+    BIFURCATION_NAMES,
+    ArclengthOptions,
+    ContinuationPoint,
+    TestFunctionCurve,
+    TestFunctionPoint,
+)
+from vrw_jax.cycles import CollocationSystem, transfer_to_mesh
+from vrw_jax.measures import MARGIN_MEASURES, measure_attrs, provenance
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
+
+EDGE_NAME = "edge of the box"
+"""Name of the column that is zero where the second parameter leaves its range."""
+
+DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
+"""Default options of curves. The first step is short because some curves are short."""
+
+CURVES_PER_BATCH = 8
+"""Number of curves in a batch, so that one shape is compiled."""
+
+SAME_CURVE_DISTANCE = 2e-3
+"""Largest distance of a point on a curve from that curve, with lengths as along the curve."""
+
+OVERRUN_DISTANCE = 3e-3
+"""Distance from a point of codimension two at which the continuation of the other curve starts."""
+
+CODIM2_TOLERANCE = 1e-9
+"""Newton's last step to a point of codimension two, relative to the values of the parameters."""
+
+NEGLIGIBLE_DURATION, DURATION_GUESS = 1e-4, 0.1
+"""Duration of double support that counts as zero despite ill-conditioning, and a first guess of a
+nonzero duration, s."""
+
+
+@dataclass(frozen=True)
+class CurveContinuation(AbstractContinuation):
+    """Continuation of special points, evaluated as gaits are, except for the special point
+    itself."""
+
+    problem: TestFunctionCurve
+    second_parameter: str  # of the two parameters
+    special_point_names: tuple[str, ...]  # one for each wheel
+    gait_continuation: GaitContinuation  # along the first parameter
+
+    ending_quantities: ClassVar[tuple[str, ...]] = (
+        *BRANCH_ENDING_QUANTITIES,
+        EDGE_NAME,
+        FORCE_FALL_NAME,
+    )
+    linear_substitutes: ClassVar[Mapping[str, str]] = LINEAR_SUBSTITUTES
+
+    def evaluate_points(self, wheels: TestFunctionArgs, points: ContinuationPoint) -> QuantityTable:
+        z, fraction = points.z
+        (lower, upper), fraction = self.problem.bounds, np.asarray(fraction)
+        second_values = lower + (upper - lower) * fraction
+        get_second_parameter = lambda params: getattr(params, self.second_parameter)
+        gait_wheels = wheels.gait._replace(
+            params=eqx.tree_at(get_second_parameter, wheels.gait.params, second_values)
+        )
+        table = self.gait_continuation.evaluate_points(gait_wheels, points._replace(z=z))
+        # Without double support the rear foot's force must not be positive.
+        rear_force_sign = np.where(wheels.gait.phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
+        curve_quantities = {
+            "lambda_4_plus": rear_force_sign * table["lambda_4_plus"],
+            "second": second_values,
+        }
+        return table | curve_quantities | {EDGE_NAME: np.minimum(fraction, 1.0 - fraction)}
+
+    def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
+        """Mask quantities that vanish along the whole curve, which have no isolated zeros on it."""
+        names_of_points = np.array(self.special_point_names)[wheel_indices]
+        is_discontinuous, is_dls_vanishing = (
+            np.isin(names_of_points, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHES)),
+            names_of_points == DLS_VANISHES,
+        )
+        step_names = {name for name in table if name.partition("[")[0] in MARGIN_MEASURES} - set(
+            CONTINUED_QUANTITIES
+        )
+        masks = {name: names_of_points == name for name in {*self.special_point_names} & {*table}}
+        masks |= {
+            substitute: names_of_points == name for name, substitute in LINEAR_SUBSTITUTES.items()
+        }
+        masks |= {name: is_discontinuous | masks.get(name, False) for name in step_names}
+        rear_force_mask = masks.get("lambda_4_plus", False) | is_dls_vanishing
+        masks |= {"lambda_4_plus": rear_force_mask, FORCE_FALL_NAME: ~is_dls_vanishing}
+        table = table | {
+            name: np.where(mask if table[name].ndim == 1 else mask[:, None], np.nan, table[name])
+            for name, mask in masks.items()
+        }
+        outcomes = np.where(is_discontinuous, Outcome.STEPPED, table["outcome"])
+        return table | {
+            "outcome": outcomes,
+            "closure": np.where(is_discontinuous, 0.0, table["closure"]),
+        }
+
+    def is_admissible(self, table: QuantityTable) -> np.ndarray:
+        is_positive = np.all([~(table[name] <= 0.0) for name in self.ending_quantities], axis=0)
+        return is_positive & self.gait_continuation.is_admissible(table)
+
+    def is_margin(self, name: str) -> bool:
+        return self.gait_continuation.is_margin(name)
+
+    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
+        return self.gait_continuation.is_mesh_limited(table, ends)
+
+    def name_end(self, table: QuantityTable, row_index: int) -> str:
+        return self.gait_continuation.name_end(table, row_index)
+
+
+class CurveSeed(NamedTuple):
+    """Point on or near a curve of special points, from which it is continued."""
+
+    name: str
+    parameter_values: tuple[float, float]  # the two parameters
+    system: CollocationSystem
+    gait: BranchWheel
+    z: CollocationSolution
+
+
+class TracedCurve(NamedTuple):
+    """Traced curve, with the special points met on it."""
+
+    curve: SpecialPointCurve
+    path: np.ndarray  # section state and both parameters' fractions, (point, coordinate)
+    new_seeds: tuple[CurveSeed, ...]
+
+
+class CurveTracer(NamedTuple):
+    """Tracer of curves of special points within two parameter ranges."""
+
+    parameters: tuple[str, str]
+    parameter_ranges: np.ndarray  # (parameter, end)
+    model: ViscoelasticWheel
+    options: ArclengthOptions
+    step_options: StepOptions
+
+    def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
+        for name, value in values.items():
+            params = self.model.with_parameter(params, name, jnp.asarray(value))[1]
+        return params
+
+    def parameter_fractions(self, values: np.ndarray) -> np.ndarray:
+        """Return both parameters, on the last axis, as fractions of their ranges."""
+        return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
+
+    def find_seeds(self, axis: int, params: WheelParams) -> list[CurveSeed]:
+        """Return seeds at special points on the branches of these wheels along one of the
+        parameters."""
+        name, seeds = self.parameters[axis], []
+        lower, upper = self.parameter_ranges[axis]
+        for branch in continue_branches(params, name, (lower, upper), model=self.model):
+            for special_point in branch.special_points:
+                if can_continue(special_point.name):
+                    seeds.append(self._make_seed(special_point))
+        return seeds
+
+    def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
+        start = special_point.cycle
+        params = wheel_from_parameters(start.parameters, start.system.n_legs)
+        first, second = (float(getattr(params, name)) for name in self.parameters)
+        gait, z = (
+            BranchWheel(params, start.collocation_state.phase_active),
+            start.collocation_state.solution,
+        )
+        name = special_point_name(special_point.name, gait, z)
+        return CurveSeed(name, (first, second), start.system, gait, z)
+
+    def trace_curves(
+        self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
+    ) -> list[TracedCurve]:
+        """Return the curves through all seeds that are on none of the known curves."""
+        new_curves: list[TracedCurve] = []
+        new_seeds = [
+            seed
+            for seed in seeds
+            if not any(self._is_on_curve(seed, curve) for curve in known_curves)
+        ]
+        groups = {quantity_group_of(seed.name, seed.system.n_legs) for seed in new_seeds}
+        for group in sorted(groups):
+            remaining = [
+                s for s in new_seeds if quantity_group_of(s.name, s.system.n_legs) == group
+            ]
+            while remaining:
+                batch_seeds: list[CurveSeed] = []
+                for seed in remaining:  # each name once: others may be on its curve
+                    if (
+                        seed.name not in {s.name for s in batch_seeds}
+                        and len(batch_seeds) < CURVES_PER_BATCH
+                    ):
+                        batch_seeds.append(seed)
+                accepted: list[TracedCurve] = []
+                for curve in self._trace_batch(group, batch_seeds):  # a curve may be known already
+                    if not any(
+                        self.is_same_curve(curve, other_curve)
+                        for other_curve in (*known_curves, *new_curves, *accepted)
+                    ):
+                        accepted.append(curve)
+                new_curves += accepted
+                remaining = [
+                    seed for seed in remaining
+                    if not any(seed is s for s in batch_seeds) and not any(self._is_on_curve(seed, t) for t in accepted)
+                ]  # fmt: skip
+        return new_curves
+
+    def _is_on_curve(self, seed: CurveSeed, curve: TracedCurve) -> bool:
+        seed_point = np.append(
+            seed.z.section_state, self.parameter_fractions(np.array(seed.parameter_values))
+        )
+        same_name = seed.name == curve.curve.name
+        return same_name and bool(
+            distance_to_path(seed_point[None], curve.path)[0] < SAME_CURVE_DISTANCE
+        )
+
+    @staticmethod
+    def is_same_curve(curve: TracedCurve, other_curve: TracedCurve) -> bool:
+        same_name = curve.curve.name == other_curve.curve.name
+        return same_name and bool(
+            np.max(distance_to_path(curve.path, other_curve.path)) < SAME_CURVE_DISTANCE
+        )
+
+    def _trace_batch(self, group: tuple[str, ...], seeds: list[CurveSeed]) -> list[TracedCurve]:
+        """Return a curve through each seed that has one, on a sufficiently fine mesh."""
+        curves: list[TracedCurve] = []
+        for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
+            is_finest = refinement == MAX_BRANCH_REFINEMENTS
+            branches = self._continue_batch(group, seeds, is_finest)
+            mesh_limited = []
+            for seed, (branch, system) in zip(seeds, branches, strict=True):
+                if branch is not None and branch.is_mesh_limited and not is_finest:
+                    options = system.options.refine_mesh()
+                    mesh_limited.append(self._transfer_seed(seed, system._replace(options=options)))
+                elif branch is not None:
+                    curves.append(self._label_traced(seed._replace(system=system), branch))
+            if not mesh_limited:
+                break
+            seeds = mesh_limited
+        return curves
+
+    @staticmethod
+    def _transfer_seed(seed: CurveSeed, system: CollocationSystem) -> CurveSeed:
+        if seed.system == system:
+            return seed
+        return seed._replace(system=system, z=transfer_to_mesh(seed.system, system, seed.z))
+
+    def _continue_batch(
+        self, group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
+    ) -> list[tuple[BranchData | None, CollocationSystem]]:
+        system = max(
+            (seed.system for seed in seeds),
+            key=lambda first_values: first_values.options.mesh_intervals,
+        )
+        seeds = [self._transfer_seed(seed, system) for seed in seeds]
+        padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % CURVES_PER_BATCH)]
+        test_function = GaitTestFunction(
+            system, self.parameters, group, self.model, self.step_options
+        )
+        stack_trees = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
+        quantity_names = [
+            test_quantity_of(seed.name, bool(seed.gait.phase_active[0, 0] > 0.5))
+            for seed in padded_seeds
+        ]
+        quantity_indices = [jnp.asarray(group.index(name)) for name in quantity_names]
+        wheels = stack_trees(
+            *(
+                TestFunctionArgs(one_seed.gait, quantity_index)
+                for one_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
+            )
+        )
+        lower, upper = map(float, self.parameter_ranges[1])
+        fraction_of = lambda seed: jnp.asarray((seed.at[1] - lower) / (upper - lower))
+        z = stack_trees(*(TestFunctionPoint(seed.z, fraction_of(seed)) for seed in padded_seeds))
+        continuation_options = self.model, self.step_options, system.n_legs
+        gait_continuation = GaitContinuation(
+            test_function.gait_problem,
+            self.options,
+            wheels.gait,
+            self.parameter_ranges[0],
+            *continuation_options,
+        )
+        special_point_names = tuple(seed.name for seed in padded_seeds)
+        continuation = CurveContinuation(
+            TestFunctionCurve(test_function, (lower, upper)),
+            self.options,
+            wheels,
+            self.parameter_ranges[0],
+            self.parameters[1],
+            special_point_names,
+            gait_continuation,
+        )
+        first_values, is_requested = (
+            jnp.asarray([one_seed.parameter_values[0] for one_seed in padded_seeds]),
+            np.arange(len(padded_seeds)) < len(seeds),
+        )
+        branches = continue_and_locate(
+            continuation,
+            z,
+            first_values,
+            is_requested,
+            lambda wheel_index, point: lambda: point,
+            is_finest,
+        )
+        return [(branch, system) for branch in branches[: len(seeds)]]
+
+    def _label_traced(self, seed: CurveSeed, branch: BranchData) -> TracedCurve:
+        values = np.stack([branch.points.p, branch.table["second"]], -1)
+        path = np.column_stack([branch.points.z.z.section_state, self.parameter_fractions(values)])
+        codim2_points, new_seeds, ends = [], [], branch.ends
+        for special_point in branch.special_points:
+            if special_point.name == EDGE_NAME:
+                continue
+            point_beside = special_point.cycle
+            meeting_values = (
+                special_point.value,
+                float(
+                    self.parameter_ranges[1, 0]
+                    + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
+                ),
+            )
+            name = special_point_name(special_point.name, seed.gait, point_beside.z.z)
+            if {name, seed.name} == {"lambda_4_plus", DLS_VANISHES}:
+                meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
+                new_seeds.append(
+                    self._seed_beyond_meeting(
+                        name, seed, path, values, branch.points.z.z, meeting_values
+                    )
+                )
+                replaced_text = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
+                ends = ends[0].replace(*replaced_text), ends[1].replace(*replaced_text)
+            elif can_continue(name):
+                seed_values = float(point_beside.p), meeting_values[1]
+                new_seeds.append(
+                    CurveSeed(name, seed_values, seed.system, seed.gait, point_beside.z.z)
+                )
+            codim2_points.append(Codim2Point(name, meeting_values, special_point.ends_branch))
+        curve = self._label_curve(seed, branch._replace(ends=ends), tuple(codim2_points))
+        return TracedCurve(curve, path, tuple(new_seeds))
+
+    def _locate_jump_onset(
+        self, seed: CurveSeed, z: CollocationSolution, start_values: Any
+    ) -> tuple[float, float]:
+        test_function = GaitTestFunction(
+            seed.system, self.parameters, CONTINUED_QUANTITIES, self.model, self.step_options
+        )
+        located, last_change = locate_jump_onset(
+            test_function, seed.gait, jax.device_put(z), jnp.asarray(start_values)
+        )
+        first, second = located if last_change < CODIM2_TOLERANCE else start_values
+        return float(first), float(second)
+
+    def _seed_beyond_meeting(
+        self,
+        name: str,
+        seed: CurveSeed,
+        path: np.ndarray,
+        values: np.ndarray,
+        z: CollocationSolution,
+        meeting_values: Any,
+    ) -> CurveSeed:
+        """Return a seed beyond a point where the rear foot's force, zero along the curve, starts to
+        rise or fall.
+
+        Both curves cross there and continue in the same direction.
+        """
+        direction = (
+            1
+            if abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
+            else -1
+        )
+        path, values, z = (
+            path[::direction],
+            values[::direction],
+            jax.tree.map(lambda x: x[::direction], z),
+        )
+        distances = np.linalg.norm(path - path[0], axis=1)
+        point_index = int(np.argmax(distances >= min(OVERRUN_DISTANCE, distances[-1])))
+        extrapolate = lambda x: (
+            x[0] + OVERRUN_DISTANCE / distances[point_index] * (x[0] - x[point_index])
+        )
+        z, (first, second) = (
+            jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z),
+            extrapolate(values),
+        )
+        dls_duration = 0.0 if name == DLS_VANISHES else DURATION_GUESS
+        z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
+        return CurveSeed(name, (first, second), seed.system, seed.gait, z)
+
+    def _label_curve(
+        self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
+    ) -> SpecialPointCurve:
+        radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
+        table = branch.table | {"spectral_radius": radius}
+        column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
+        data: dict[str, Any] = {n: ("point", table[n], measure_attrs(n)) for n in column_names}
+        data["mesh_error"] = ("point", table["mesh_error"])
+        data["section_state"] = (("point", "component"), table["section_state"])
+        values = np.asarray(branch.points.p), table["second"]
+        labels = {
+            parameter: ("point", value, measure_attrs(parameter))
+            for parameter, value in zip(self.parameters, values, strict=True)
+        }
+        origin = provenance(seed.gait.params, self.model, self.step_options)
+        title = {"title": f"Border {seed.name} over {' and '.join(self.parameters)}"}
+        dataset = xr.Dataset(data, labels, title | origin)
+        return SpecialPointCurve(seed.name, self.parameters, dataset, codim2_points, branch.ends)
+
+
+def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Return the distances of points from a polyline, both along the first axis."""
+    segment_starts, chord = path[:-1], np.diff(path, axis=0)
+    squared = np.maximum(np.sum(chord**2, 1), 1e-300)
+    offsets = points[:, None] - segment_starts
+    fractions = np.clip(np.sum(offsets * chord, 2) / squared, 0.0, 1.0)
+    distances = np.linalg.norm(offsets - fractions[..., None] * chord, axis=2)
+    return np.min(distances, axis=1, initial=np.inf)
+
+
+def special_point_name(name: str, gait: BranchWheel, z: CollocationSolution) -> str:
+    """Return the name of a special point of a curve or branch, given the gait there."""
+    if name == BRANCH_POINT_KIND:  # a curve of folds may not turn there
+        return "fold"
+    if (
+        name not in ("lambda_4_plus", DLS_VANISHES, FORCE_FALL_NAME)
+        or gait.phase_active[0, 0] < 0.5
+    ):
+        return name
+    dls_vanishes = name != FORCE_FALL_NAME and z.durations[0, 0] < NEGLIGIBLE_DURATION
+    return DLS_VANISHES if dls_vanishes else "lambda_4_plus"
+
+
+def can_continue(name: str) -> bool:
+    """Return whether a special point's quantity is one of `GaitTestFunction`."""
+    return (
+        name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHES)
+        or name.partition("[")[0] in MARGIN_MEASURES
+    )

@@ -1,0 +1,331 @@
+"""Test functions of collocated gaits over two parameters, whose zeros are special points.
+
+Trial, tangents, quantities and their derivatives come from one call of machine code. Margins that
+need an event-driven step come from steps.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.branches.continuation import INDICATOR_NAMES, GaitContinuation
+from vrw_jax.branches.continuation_problems import (
+    BranchWheel,
+    CollocationProblem,
+    linearize_with_quantities,
+    measure_gait,
+)
+from vrw_jax.collocation import CollocationSolution, PhasePassage
+from vrw_jax.continuation import (
+    BIFURCATION_NAMES,
+    AbstractTestFunction,
+    SectionVector,
+    TestFunctionNewtonStep,
+    offset_bifurcation_margins,
+)
+from vrw_jax.cycles import (
+    CollocationState,
+    CollocationSystem,
+    collocation_correction_norm,
+    gait_takeoff_acceleration,
+    init_search_flags,
+)
+from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import Scalar, StepOptions, unbatch
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    PhaseInstant,
+    Symbols,
+    make_phases,
+    stack_parameters,
+    transitions,
+    wheel_from_parameters,
+)
+
+LINEAR_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_substitutes
+DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
+"""Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
+
+DLS_VANISHES = "duration_dls"
+"""Special point where the duration of double support reaches zero: the rear foot's force vanishes
+there and falls. If it vanishes and rises, at the zero of `lambda_4_plus`, the step jumps."""
+
+FORCE_FALL_NAME, MEAN_FORCE_FALL_NAME = (
+    "fall of the rear foot's force at first",
+    "its mean fall in double support",
+)
+"""Names of two rates, N/s. The first is positive on `DLS_VANISHES`, which ends at its zero. The
+second vanishes on the curve of `lambda_4_plus`, and not on `DLS_VANISHES`, which solves the same
+equations too."""
+
+CONTINUED_QUANTITIES = (
+    *DISCONTINUOUS_QUANTITIES,
+    *LINEAR_SUBSTITUTES.values(),
+    FORCE_FALL_NAME,
+    MEAN_FORCE_FALL_NAME,
+)
+"""Quantities of the collocated gait itself, which continue beyond the special point."""
+
+
+def test_quantity_of(name: str, has_double_support: bool) -> str:
+    """Return the quantity whose zero is the special point; `has_double_support` refers to the
+    gaits."""
+    if name == "lambda_4_plus" and has_double_support:
+        return MEAN_FORCE_FALL_NAME
+    return "lambda_4_plus" if name == DLS_VANISHES else LINEAR_SUBSTITUTES.get(name, name)
+
+
+def quantity_group_of(name: str, n_legs: int) -> tuple[str, ...]:
+    """Return the quantities that are evaluated together with the one that vanishes at a special
+    point."""
+    leg_suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
+    step_quantities = [
+        n + leg
+        for n, margin in MARGIN_MEASURES.items()
+        for leg in (leg_suffixes if margin.dimension else [""])
+    ]
+    quantity_groups = (
+        BIFURCATION_NAMES,
+        CONTINUED_QUANTITIES,
+        tuple(name for name in step_quantities if name not in CONTINUED_QUANTITIES),
+    )
+    return next(group for group in quantity_groups if test_quantity_of(name, True) in group)
+
+
+class TestFunctionArgs(NamedTuple):
+    """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
+
+    gait: BranchWheel
+    quantity_index: Array
+
+
+class GaitTestFunction(AbstractTestFunction):
+    """One of `quantities` of collocated gaits as a test function over two parameters."""
+
+    system: CollocationSystem = eqx.field(static=True)
+    parameter_names: tuple[str, str] = eqx.field(static=True)
+    quantities: tuple[str, ...] = eqx.field(static=True)  # of one quantity group
+    model: ViscoelasticWheel
+    step_options: StepOptions
+
+    def linearize(
+        self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array
+    ) -> TestFunctionNewtonStep:
+        gait = wheel.gait
+        parameter_indices = tuple(PARAMETER_NAMES.index(name) for name in self.parameter_names)
+        linearize = linearize_with_quantities(
+            self.system, parameter_indices, QUANTITY_FUNCTIONS.get(self.quantities)
+        )
+        arguments = stack_parameters(self.with_parameters(gait, p).params), gait.phase_active, z
+        correction, tangents, monodromy, *quantity_data = linearize(*arguments)
+        first_tangent, second_tangent = (
+            jax.tree.map(lambda x, i=i: x[i], tangents) for i in range(2)
+        )
+        if quantity_data:
+            value, parameter_gradient = quantity_data
+            if self.quantities == BIFURCATION_NAMES:
+                apply_margin_jacobian = lambda d: jax.jvp(
+                    offset_bifurcation_margins, (value,), (d,)
+                )
+                value, parameter_gradient = jax.vmap(apply_margin_jacobian, out_axes=(None, 0))(
+                    parameter_gradient
+                )
+            value, parameter_gradient = value + parameter_gradient[0], parameter_gradient[1:]
+        else:
+            value, parameter_gradient = self._differentiate_steps(
+                gait, z, p, correction, (first_tangent, second_tangent)
+            )
+        value, parameter_gradient = (
+            value[wheel.quantity_index],
+            parameter_gradient[:, wheel.quantity_index],
+        )
+        return TestFunctionNewtonStep(
+            correction, (first_tangent, second_tangent), monodromy, value, parameter_gradient
+        )
+
+    def _differentiate_steps(
+        self,
+        gait: BranchWheel,
+        z: CollocationSolution,
+        p: Array,
+        correction: CollocationSolution,
+        tangents: tuple,
+    ) -> tuple[Array, Array]:
+        """Return the step's quantities of the corrected gait, and their derivatives with respect to
+        both parameters.
+
+        Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
+        than derivatives of the step, and use the same machine code. Next to a fold the tangents
+        grow without bound and become parallel, and so do the corrections. The differences are
+        therefore taken along an orthonormal basis, from the point of the tangents' plane that is
+        nearest to the trial.
+        """
+        scaled_tangents = jnp.stack(
+            [p[i] * self.section_state(column) for i, column in enumerate(tangents)]
+        )
+        basis, triangular_factor = jnp.linalg.qr(
+            jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
+        )
+        basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
+        correction_coordinates = basis[:-2].T @ self.section_state(correction)
+
+        def measure_at_offset(offset: Array) -> Array:
+            parameter_change = basis_coefficients @ (offset - correction_coordinates)
+            displace = lambda x, dx, first_tangent, second_tangent: (
+                x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+            )
+            return self.measure_step(
+                gait, jax.tree.map(displace, z, correction, *tangents), p + parameter_change
+            )
+
+        offsets = RELATIVE_DIFFERENCE * jnp.eye(3, 2, -1, p.dtype)
+        values = jax.vmap(measure_at_offset)(offsets)
+        gradient = (values[1:] - values[0]) / RELATIVE_DIFFERENCE
+        return values[0] + correction_coordinates @ gradient, triangular_factor.T @ gradient / p[
+            :, None
+        ]
+
+    def with_parameters(self, gait: BranchWheel, p: Array) -> BranchWheel:
+        """Return the wheel with both parameters at p."""
+        params = gait.params
+        for name, value in zip(self.parameter_names, p, strict=True):
+            params = self.model.with_parameter(params, name, value)[1]
+        return gait._replace(params=params)
+
+    @property
+    def gait_problem(self) -> CollocationProblem:
+        """Return the continuation problem of the gaits along the first parameter alone."""
+        return CollocationProblem(
+            system=self.system,
+            parameter_name=self.parameter_names[0],
+            additional_quantities=_continued_by_name,
+        )
+
+    def measure_step(self, gait: BranchWheel, z: CollocationSolution, p: Array) -> Array:
+        """Return those quantities that come from the step, in order."""
+        params = self.with_parameters(gait, p).params
+        section_state = self.gait_problem.read_state(gait._replace(params=params), z, p[0])[0]
+        measures = measure_gait(self.model, params, section_state, self.step_options, 1)
+        measures_and_legs = [
+            (measures[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities
+        ]
+        return jnp.stack(
+            [measure[int(leg[:-1]) - 3] if leg else measure for measure, leg in measures_and_legs]
+        )
+
+    def section_state(self, z: CollocationSolution) -> SectionVector:
+        return z.section_state
+
+    def correction_norm(self, z: CollocationSolution, correction: CollocationSolution) -> Scalar:
+        return unbatch(collocation_correction_norm)(z, correction)
+
+    def is_admissible(self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array) -> Array:
+        return jnp.all((z.durations > -DURATION_ROUNDOFF) | (wheel.gait.phase_active < 0.5))
+
+
+@eqx.filter_jit
+def locate_jump_onset(
+    test_function: GaitTestFunction, gait: BranchWheel, z: CollocationSolution, p: Array
+) -> tuple[Array, Array]:
+    """Return both parameters where `DLS_VANISHES` meets the curve of `lambda_4_plus`, and the last
+    relative change.
+
+    The start is a gait and parameters nearby. The equations of both curves are singular where
+    double support has zero duration. The equations of the same gait without double support are
+    regular, and the rear foot's force and its rate vanish there together.
+    """
+    gait = gait._replace(phase_active=gait.phase_active.at[0, 0].set(0.0))
+    z = z._replace(durations=z.durations.at[0, 0].set(0.0))
+    quantity_indices = [
+        jnp.asarray(CONTINUED_QUANTITIES.index(name)) for name in ("lambda_4_plus", FORCE_FALL_NAME)
+    ]
+
+    def newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
+        z, p = solution_and_parameters
+        force, force_fall = (
+            test_function.linearize(TestFunctionArgs(gait, place), z, p)
+            for place in quantity_indices
+        )
+        gradients = jnp.stack([force.parameter_gradient, force_fall.parameter_gradient])
+        parameter_change = -jnp.linalg.solve(gradients, jnp.stack([force.value, force_fall.value]))
+        displace = lambda x, dx, first_tangent, second_tangent: (
+            x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+        )
+        return (
+            jax.tree.map(displace, z, force.correction, *force.tangents),
+            p + parameter_change,
+        ), parameter_change / p
+
+    (_, p), relative_changes = lax.scan(newton_step, (z, p), None, length=N_POINT_ITERATIONS)
+    return p, jnp.max(jnp.abs(relative_changes[-1]))
+
+
+def _continued_quantities(
+    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+) -> Array:
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    (passages,) = system.evaluate_passages(parameters, z)[1]
+    return jnp.stack(list(_continued_by_name(s, passages, z).values()))
+
+
+def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dict[str, Array]:
+    dls, sls1, sls2 = passages
+    landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
+    fore, rear = transitions.landing_forces(s, landing)
+    dls_duration, *other_durations = z.durations[0]
+    forces = landing.rear_impulse.normal, fore.normal, rear.normal
+    values = (
+        *forces,
+        *other_durations,
+        gait_takeoff_acceleration(s, sls1),
+        *_force_falls(s, dls, dls_duration),
+    )
+    return dict(zip(CONTINUED_QUANTITIES, values, strict=True))
+
+
+def _force_falls(s: Symbols, dls: PhasePassage, dls_duration: Array) -> tuple[Array, Array]:
+    phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
+
+    def instant_at(theta: Array, dtheta: Array) -> PhaseInstant:
+        return PhaseInstant(phase, phase.motion_at((theta,), (dtheta,)), None)
+
+    force_at = lambda *at: phase.end_guard(instant_at(*at))
+    start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
+    rates = start_state[1], instant_at(*start_state).acceleration.ddtheta
+    first_force, force_rate = jax.jvp(force_at, start_state, rates)
+    mean_fall = (first_force - force_at(*end_state)) / jnp.where(
+        dls_duration == 0.0, 1.0, dls_duration
+    )
+    return -force_rate, mean_fall
+
+
+def _trial_monodromy(
+    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+) -> Array:
+    collocation_state = CollocationState(
+        z, phase_active, *init_search_flags(system, z.section_state)
+    )
+    return system.linearize_at(parameters, collocation_state).monodromy
+
+
+N_POINT_ITERATIONS = 8
+"""Number of Newton iterations for one point."""
+
+DURATION_ROUNDOFF = 1e-9
+"""Round-off of a duration that is zero along a whole curve, s."""
+
+RELATIVE_DIFFERENCE = 1e-6
+"""Finite difference of section and relative parameters, for derivatives of quantities of the
+step."""
+
+QUANTITY_FUNCTIONS = {
+    CONTINUED_QUANTITIES: _continued_quantities,
+    BIFURCATION_NAMES: _trial_monodromy,
+}
+"""Functions for the quantities of a test function that need no event-driven step."""

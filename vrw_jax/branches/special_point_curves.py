@@ -1,0 +1,145 @@
+"""Continuation of special points of gaits as curves in two parameters."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrw_jax.branches.branch import SpecialPointCurve
+from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, CurveTracer
+from vrw_jax.continuation import ArclengthOptions
+from vrw_jax.cycles import LimitCycle
+from vrw_jax.numerics import StepOptions
+from vrw_jax.validation import check_known_name, check_names, check_range, check_type
+from vrw_jax.wheel import PARAMETER_DOMAINS, wheel_from_parameters
+
+ParameterBounds = Mapping[str, tuple[float, float]]
+
+DEFAULT_BOUNDS: ParameterBounds = {
+    "damping": (1.0, 250.0),
+    "stiffness": (200.0, 1200.0),
+    "natural_length": (1.001, 1.06),
+    "slope": (0.05, 0.5),
+}
+"""Default bounds of the parameters for the continuation, for a wheel with legs of 1 m."""
+
+
+def continue_special_point(
+    name: str,
+    parameters: tuple[str, str],
+    cycle: LimitCycle,
+    *,
+    bounds: ParameterBounds | None = None,
+    options: ArclengthOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> SpecialPointCurve:
+    """Return the curve of the special point `name` over two parameters, starting nearest to a gait
+    of one step.
+
+    `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
+    "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point is
+    searched for along the first parameter from the gait, then along the second. It is continued
+    within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_BOUNDS`, through
+    turning points. The curve ends when it closes or leaves the bounds, or when the gaits end. Each
+    point is accurate to 1e-9. `codim2_points` are the points where other special points occur. On
+    the curve of an indicator these are other indicators and bifurcations, on other curves margins
+    too.
+
+    Args:
+        name: of the special point.
+        parameters: names of the two parameters.
+        cycle: the gait near which the search starts.
+        bounds: of the parameters, by name.
+        options: `ArclengthOptions` of the curve.
+        step_options: of the steps that evaluate margins.
+
+    Returns:
+        A `SpecialPointCurve`.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, or a special point that does not occur on the
+            branches.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+        >>> curve = vrw.continue_special_point("clearance_sls1", ("damping", "stiffness"), cycle)
+        >>> [point.name for point in curve.codim2_points[-3:-1]]
+        ['fold', 'hit_planted_impulse']
+    """
+    (curve,) = continue_special_points(
+        (name,), parameters, cycle, bounds=bounds, options=options, step_options=step_options
+    )
+    return curve
+
+
+def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
+    """Return the two parameters and their ranges.
+
+    Raises: TypeError, ValueError: the parameters or bounds are invalid.
+    """
+    check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
+    all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
+    parameter_pair = check_names("parameters", parameters)
+    for name in all_bounds:
+        check_known_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+    for name in parameter_pair:
+        check_known_name(name, tuple(all_bounds), "parameter with bounds")
+    if len(parameter_pair) != 2 or len(set(parameter_pair)) != 2:
+        raise ValueError(
+            f"parameters are {parameter_pair}, but a curve needs two different ones: write "
+            "('damping', 'slope')."
+        )
+    ranges = {name: check_range(f"bounds[{name!r}]", ends) for name, ends in all_bounds.items()}
+    return (parameter_pair[0], parameter_pair[1]), np.array(
+        [ranges[name] for name in parameter_pair], float
+    )
+
+
+def continue_special_points(
+    names: tuple[str, ...],
+    parameters: tuple[str, str],
+    cycle: LimitCycle,
+    *,
+    bounds: ParameterBounds | None = None,
+    options: ArclengthOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> tuple[SpecialPointCurve, ...]:
+    """Return `continue_special_point` of several special points."""
+    parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
+    first, second = parameters
+    check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
+    if cycle.period_n != 1:
+        raise ValueError(
+            f"the gait has {cycle.period_n} steps: a curve of special points takes one step."
+        )
+    options = DEFAULT_CURVE_OPTIONS if options is None else options
+    step_options = StepOptions.tight() if step_options is None else step_options
+    check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
+    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
+    tracer = CurveTracer(parameters, parameter_ranges, cycle.model, options, step_options)
+    params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
+    seeds_by_name: dict[str, CurveSeed] = {}
+    for axis, parameter in enumerate(parameters):
+        if set(names) - set(seeds_by_name):
+            seeds = tracer.find_seeds(axis, jax.tree.map(lambda x: x[None], params))
+            start_value = float(getattr(params, parameter))
+            order = np.argsort([-abs(seed.parameter_values[axis] - start_value) for seed in seeds])
+            seeds_by_name = {seeds[i].name: seeds[i] for i in order} | seeds_by_name
+    missing_names = sorted(set(names) - set(seeds_by_name))
+    if missing_names:
+        raise ValueError(
+            f"no special point {missing_names[0]!r} on branches along {first} and {second} within their "
+            f"bounds, but {', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
+            "bounds."
+        )
+    curves_by_name = {
+        traced.curve.name: traced.curve
+        for traced in tracer.trace_curves([seeds_by_name[n] for n in names], ())
+    }
+    lost_names = sorted(set(names) - set(curves_by_name))
+    if lost_names:
+        raise ValueError(
+            f"special point {lost_names[0]} at {seeds_by_name[lost_names[0]].parameter_values[0]:.9g} can't be followed from there."
+        )
+    return tuple(curves_by_name[name] for name in names)

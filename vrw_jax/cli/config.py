@@ -1,0 +1,493 @@
+"""Configs: TOML files that define a wheel, samples and measures.
+
+An error in a file is reported in one sentence: what was given, what is allowed and what to do.
+"""
+
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vrw_jax.contact import UnilateralWheel
+from vrw_jax.hybrid import make_solver
+from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
+from vrw_jax.numerics import StepOptions
+from vrw_jax.scans import CATALOGS, MAX_LISTED_SAMPLES, TOLERANCE_CATALOG, check_measures
+from vrw_jax.scans import design as designs
+from vrw_jax.selection import LadderWheel
+from vrw_jax.validation import check_known_name, check_range, suggest_name
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, WheelParams
+
+RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
+DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
+TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
+MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
+    "viscoelastic": ViscoelasticWheel,
+    "unilateral": UnilateralWheel,
+    "rigid": RigidWheel,
+    "auto": LadderWheel,
+}
+"""Model classes by the name in a config."""
+_OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
+_AXIS_KEYS = ("from", "to", "count")
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """Table `[scan]`: measures of a scan, and number of samples that are written at a time.
+
+    - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
+    - `chunk`: number of samples that are written at a time; 4,096 by default;
+    - `tol`: permitted error of each measure with unilateral contact (`rung = "unilateral"`), in its
+      unit. Each sample uses the simplest model that permits it.
+    """
+
+    measures: tuple[str, ...] | None = None
+    chunk: int | None = None
+    tol: float | None = None
+
+
+@dataclass(frozen=True)
+class GaitConfig:
+    """Table `[gait]`: length and start of a walk.
+
+    - `steps`: number of steps;
+    - `start`: section state before the first touchdown, [rad, rad/s, m/s]; by default that of the
+      model.
+    """
+
+    steps: int = 30
+    start: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class TuneConfig:
+    """Table `[tune]`: objective, bounds and constraints of a tuning run.
+
+    - `objective`: a measure, or weights of several, { dls_fraction = 1.0, speed = 0.1 };
+    - `bounds`: table [tune.bounds] of the free parameters, such as damping = [20.0, 215.0];
+    - `constraints`: table [tune.constraints] of the least values of measures; by default every
+      margin that the model can satisfy;
+    - `evaluations`: largest number of evaluated gaits.
+    """
+
+    objective: str | Mapping[str, float] = "dls_fraction"
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    constraints: Mapping[str, float] | None = None
+    evaluations: int = 200
+
+
+@dataclass(frozen=True)
+class BranchConfig:
+    """Table `[branch]`: parameter and range of a branch of gaits.
+
+    - `parameter`: name of the parameter;
+    - `bounds`: range of the parameter, [lower, upper];
+    - `period`: number of steps until the gait repeats;
+    - `max_ds`: largest distance between points, as a share of the range; 0.02 by default.
+    """
+
+    parameter: str
+    bounds: tuple[float, float]
+    period: int = 1
+    max_ds: float | None = None
+
+
+@dataclass(frozen=True)
+class Config:
+    """A config as checked values, with the text that it was read from."""
+
+    wheel_values: Mapping[str, float | int] = field(default_factory=dict)
+    model_name: str = "viscoelastic"
+    model_settings: Mapping[str, float | int | str | bool] = field(default_factory=dict)
+    option_values: Mapping[str, float | int | str | bool] = field(default_factory=dict)
+    scan: ScanConfig = ScanConfig()
+    gait: GaitConfig = GaitConfig()
+    tune: TuneConfig | None = None
+    branch: BranchConfig | None = None
+    design: designs.AbstractDesign | None = None
+    source_text: str = ""
+    file_name: str = ""
+
+    def make_wheel(self, changes: Mapping[str, float | int] | None = None) -> WheelParams:
+        """Return the wheel: Table 1 with the values of the config, and then with `changes`."""
+        values: dict[str, Any] = {**self.wheel_values, **(changes or {})}
+        return WheelParams(**values)
+
+    def make_model(self) -> AbstractWheel:
+        """Return the model with its settings."""
+        return MODEL_CLASSES[self.model_name](**self.model_settings)
+
+    def make_options(self) -> StepOptions:
+        """Return the numerical options of the steps."""
+        options: dict[str, Any] = {**self.option_values}
+        return StepOptions(**options)
+
+
+def load_config(path: str | Path) -> Config:
+    """Read and check a config file; raise if it is invalid."""
+    path = Path(path)
+    if not path.exists():
+        suggestion = suggest_name(
+            path.name, (neighbor.name for neighbor in path.parent.glob("*.toml"))
+        )
+        raise ValueError(
+            f"there is no config file {path}{suggestion}: give the path of a TOML file, "
+            "such as configs/quickstart.toml, which `vrw init` writes."
+        )
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, but a config is a TOML file: give its path.")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"{path} can't be read ({error}): give a readable text file in UTF-8."
+        ) from error
+    return parse_config(text, path.name)
+
+
+def parse_config(text: str, file_name: str = "config") -> Config:
+    """Parse and check the text of a config; `name` begins every message about an error."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"{file_name}: this is not valid TOML ({error}): mend that line."
+        ) from error
+    try:
+        return _make_config(tables, text, file_name)
+    except ValueError as error:
+        raise ValueError(f"{file_name}: {error}") from error
+
+
+def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Config:
+    """Return the config of the tables of a file; raise if a table is invalid."""
+    _require_known_keys(tables, TABLE_NAMES, "the file", "tables")
+    for key, table in tables.items():
+        if not isinstance(table, dict):
+            requirement = f"a table: write [{key}] on a line of its own and its settings below"
+            raise _make_error(f"[{key}]", table, requirement)
+    design_kinds = [kind for kind in DESIGN_KINDS if kind in tables]
+    if len(design_kinds) > 1:
+        raise ValueError(
+            f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one design: keep one."
+        )
+    model_name, model = _parse_model(_get_table(tables, "model"))
+    names = MODEL_CLASSES[model_name].parameter_names
+    design = (
+        _parse_design(design_kinds[0], _get_table(tables, design_kinds[0]), names)
+        if design_kinds
+        else None
+    )
+    wheel = _parse_wheel(_get_table(tables, "wheel"))
+    fixed_and_swept = [key for key in wheel if design is not None and key in design.names]
+    if fixed_and_swept:
+        raise ValueError(
+            f"{fixed_and_swept[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can only be one: "
+            "drop one of the two."
+        )
+    config = Config(
+        wheel_values=wheel,
+        model_name=model_name,
+        model_settings=model,
+        option_values=_parse_options(_get_table(tables, "options")),
+        scan=_parse_scan(_get_table(tables, "scan"), MODEL_CLASSES[model_name].model_name),
+        gait=_parse_gait(_get_table(tables, "gait")),
+        tune=_parse_tune(_get_table(tables, "tune")) if "tune" in tables else None,
+        branch=_parse_branch(_get_table(tables, "branch"), names) if "branch" in tables else None,
+        design=design,
+        source_text=text,
+        file_name=file_name,
+    )
+    config.make_wheel()
+    config.make_model()
+    options = config.make_options()
+    options.check_tolerances(np.dtype(float))
+    make_solver(options.solver, options)
+    return config
+
+
+def _get_table(tables: Mapping[str, object], key: str) -> dict[str, object]:
+    """Return a table of the file, empty if it is missing."""
+    table = tables.get(key, {})
+    assert isinstance(table, dict)
+    return table
+
+
+def parse_assignment(text: str) -> tuple[str, float | int]:
+    """Return a parameter and its value from `name=value` of the command line."""
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals:
+        raise ValueError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
+    try:
+        number = int(value) if name == "n_legs" else float(value)
+    except ValueError:
+        number = value  # type: ignore[assignment]  # the check below reports the error
+    return name, _parse_wheel({name: number})[name]
+
+
+def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
+    """Return the parameters of `[wheel]`."""
+    _require_known_keys(table, (*PARAMETER_NAMES, "n_legs"), "[wheel]", "parameters")
+    values: dict[str, float | int] = {}
+    for name, value in table.items():
+        if name == "n_legs":
+            values[name] = _parse_int(value, name, 5)
+        else:
+            values[name] = _parse_parameter(name, value)
+    return values
+
+
+def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
+    """Return the name and the settings of the model of `[model]`."""
+    model_name = table.get("rung", Config.model_name)
+    check_known_name(model_name, tuple(MODEL_CLASSES), "rung")
+    assert isinstance(model_name, str)
+    settings = MODEL_CLASSES[model_name].__dataclass_fields__
+    _require_known_keys(table, ("rung", *settings), f"[model] of the rung {model_name}", "settings")
+    model_settings = {name: value for name, value in table.items() if name != "rung"}
+    return model_name, _parse_like_defaults(
+        model_settings, {name: settings[name].default_measures for name in settings}
+    )
+
+
+def _parse_options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]:
+    """Return the options of `[options]`."""
+    _require_known_keys(table, _OPTION_KEYS, "[options]", "options")
+    defaults = StepOptions()
+    return _parse_like_defaults(table, {key: getattr(defaults, key) for key in _OPTION_KEYS})
+
+
+def _parse_like_defaults(
+    table: Mapping[str, object], defaults: Mapping[str, object]
+) -> dict[str, float | int | str | bool]:
+    """Return settings of the types of their defaults: flags, names, whole or positive numbers."""
+    values: dict[str, float | int | str | bool] = {}
+    for key, value in table.items():
+        default = defaults[key]
+        if isinstance(default, bool):
+            if not isinstance(value, bool):
+                raise _make_error(key, value, "true or false")
+            values[key] = value
+        elif isinstance(default, str):
+            if not isinstance(value, str):
+                raise _make_error(key, value, f'a name, "{default}"')
+            values[key] = value
+        elif isinstance(default, int):
+            values[key] = _parse_int(value, key, 1)
+        elif key == FRICTION_NAME and value == math.inf:
+            values[key] = math.inf  # feet do not slip
+        else:
+            values[key] = _parse_number(value, key, must_be_positive=True)
+    return values
+
+
+def _parse_scan(table: Mapping[str, object], model_name: str) -> ScanConfig:
+    """Return the settings of `[scan]`; raise if the model does not have a measure."""
+    _require_known_keys(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
+    measures = table.get("measures")
+    if measures is not None:
+        if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
+            requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
+            raise _make_error("measures", measures, requirement)
+        catalog = (
+            CATALOGS.get(model_name, CATALOGS["viscoelastic"])
+            if "tol" not in table
+            else TOLERANCE_CATALOG
+        )
+        check_measures(measures, catalog)
+        measures = tuple(measures)
+    chunk = table.get("chunk")
+    tol = table.get("tol")
+    return ScanConfig(
+        measures,
+        None if chunk is None else _parse_int(chunk, "chunk", 1),
+        None if tol is None else _parse_number(tol, "tol", must_be_positive=True),
+    )
+
+
+def _parse_gait(table: Mapping[str, object]) -> GaitConfig:
+    """Return the settings of `[gait]`."""
+    _require_known_keys(table, GaitConfig.__dataclass_fields__, "[gait]", "settings")
+    steps = _parse_int(table.get("steps", GaitConfig.steps), "steps", 1)
+    start = table.get("start")
+    if start is None:
+        return GaitConfig(steps)
+    if not (isinstance(start, list) and len(start) == 3):
+        requirement = (
+            "the section state before touchdown, three numbers: angle in rad, angular rate in "
+        )
+        raise _make_error("start", start, requirement + "rad/s, rate of Leg 1 in m/s")
+    theta, dtheta, dL1 = (_parse_number(value, "start") for value in start)
+    return GaitConfig(steps, (theta, dtheta, dL1))
+
+
+def _parse_tune(table: Mapping[str, object]) -> TuneConfig:
+    """Return the settings of `[tune]` and its tables."""
+    _require_known_keys(table, TuneConfig.__dataclass_fields__, "[tune]", "settings")
+    objective = table.get("objective", TuneConfig.objective)
+    if isinstance(objective, dict):
+        objective = {name: _parse_number(value, name) for name, value in objective.items()}
+    elif not isinstance(objective, str):
+        requirement = (
+            'a measure or weights of several: write objective = "dls_fraction" or objective = '
+        )
+        raise _make_error(
+            "objective", objective, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
+        )
+    bounds = table.get("bounds")
+    if not isinstance(bounds, dict) or not bounds:
+        raise ValueError(
+            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with lines "
+            "such as damping = [20.0, 215.0]."
+        )
+    _require_known_keys(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+    constraints = table.get("constraints")
+    if constraints is not None:
+        if not isinstance(constraints, dict):
+            requirement = "a table: write [tune.constraints] and below it lines such as "
+            raise _make_error("constraints", constraints, requirement + "clearance_sls1 = 0.001")
+        constraints = {name: _parse_number(value, name) for name, value in constraints.items()}
+    return TuneConfig(
+        objective=objective,
+        bounds={name: _parse_range(name, value) for name, value in bounds.items()},
+        constraints=constraints,
+        evaluations=_parse_int(table.get("evaluations", TuneConfig.evaluations), "evaluations", 1),
+    )
+
+
+def _parse_branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
+    """Return the settings of `[branch]` along one of the parameters `names`."""
+    _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
+    parameter = table.get("parameter")
+    check_known_name(parameter, names, "parameter that a branch of this rung runs along")
+    assert isinstance(parameter, str)
+    if "bounds" not in table:
+        raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+    bounds = check_range(
+        "bounds", _parse_range("bounds of " + parameter, table["bounds"], parameter)
+    )
+    max_ds = table.get("largest_step")
+    if max_ds is not None and _parse_number(max_ds, "largest_step", must_be_positive=True) > 1.0:
+        raise ValueError(
+            f"largest_step is {max_ds:g}, but it is a share of the range: give 0.02, say."
+        )
+    return BranchConfig(
+        parameter=parameter,
+        bounds=bounds,
+        period=_parse_int(table.get("period", BranchConfig.period), "period", 1),
+        max_ds=None
+        if max_ds is None
+        else _parse_number(max_ds, "largest_step", must_be_positive=True),
+    )
+
+
+def _parse_design(
+    kind: str, table: Mapping[str, object], names: tuple[str, ...]
+) -> designs.AbstractDesign:
+    """Return the design of a table that sweeps some of the parameters `names`."""
+    design_keys = ("n", "seed") if kind in RANDOM_DESIGNS else ()
+    if FRICTION_NAME in table and FRICTION_NAME not in names:
+        raise ValueError(
+            f"[{kind}] sweeps friction, which does not affect this model: write [model] "
+            'and below it rung = "unilateral" or rung = "auto".'
+        )
+    _require_known_keys(table, (*design_keys, *names), f"[{kind}]", "settings")
+    swept = {name: value for name, value in table.items() if name not in design_keys}
+    if design_keys:
+        if "n" not in table:
+            raise ValueError(f"[{kind}] has no number of samples: write n = 4096, say.")
+        n, seed = _parse_int(table["n"], "n", 1), _parse_int(table.get("seed", 0), "seed", 0)
+        ranges = {name: _parse_range(name, value) for name, value in swept.items()}
+        return RANDOM_DESIGNS[kind](ranges, n, seed)
+    if kind == "grid":
+        return designs.grid(**{name: _parse_axis(name, value) for name, value in swept.items()})
+    return designs.samples({name: _parse_list(name, value) for name, value in swept.items()})
+
+
+def _parse_axis(name: str, value: object) -> np.ndarray:
+    """Return the values of a grid's axis, given as a list or as from, to and count."""
+    if not isinstance(value, dict):
+        return _parse_list(name, value, " or { from = ..., to = ..., count = ... }")
+    _require_known_keys(value, _AXIS_KEYS, f"the axis of {name}", "keys")
+    missing = [key for key in _AXIS_KEYS if key not in value]
+    if missing:
+        raise ValueError(
+            f"the axis of {name} has no '{missing[0]}': "
+            f"write {name} = {{ from = ..., to = ..., count = ... }}."
+        )
+    lower, upper = (_parse_parameter(name, value[key]) for key in ("from", "to"))
+    count = _parse_int(value["count"], f"count of {name}", 1)
+    if count > MAX_LISTED_SAMPLES:
+        raise ValueError(
+            f"the axis of {name} has {count:,} values, but {MAX_LISTED_SAMPLES:,} is the most: give fewer."
+        )
+    return np.linspace(lower, upper, count)
+
+
+def _parse_list(name: str, value: object, alternative: str = "") -> np.ndarray:
+    """Return a list of values in the domain of the parameter `name`."""
+    if not isinstance(value, list):
+        raise _make_error(name, value, f"a list of numbers{alternative}")
+    return np.asarray([_parse_parameter(name, item) for item in value])
+
+
+def _parse_range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
+    """Return two values in the domain of `parameter`, by default `name` itself."""
+    if not (isinstance(value, list) and len(value) == 2):
+        raise _make_error(name, value, f"a range of two numbers: write {name} = [lower, upper]")
+    lower, upper = (_parse_parameter(parameter or name, item) for item in value)
+    return lower, upper
+
+
+def _parse_parameter(name: str, value: object) -> float:
+    """Return a value as a number; raise if it is not in the domain of the parameter."""
+    number = _parse_number(value, name, must_be_positive=name == FRICTION_NAME)
+    if name != FRICTION_NAME:
+        PARAMETER_DOMAINS[name].require_inside(name, number)
+    return number
+
+
+def _parse_number(value: object, name: str, must_be_positive: bool = False) -> float:
+    """Return a value as a finite number; raise if it is not one."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise _make_error(name, value, "a finite number")
+    if must_be_positive and not value > 0:
+        raise ValueError(f"{name} is {value:g}, but it must be positive.")
+    return float(value)
+
+
+def _parse_int(value: object, name: str, minimum: int) -> int:
+    """Return a value as a whole number of at least `minimum`; raise if it is not one."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
+        raise _make_error(name, value, f"a whole number of at least {minimum}")
+    return value
+
+
+def _require_known_keys(
+    table: Mapping[str, object], allowed_keys: Iterable[str], location: str, key_kind: str
+) -> None:
+    """Raise if a table has a key that is not allowed."""
+    allowed_keys = tuple(allowed_keys)
+    for key in table:
+        if key not in allowed_keys:
+            raise ValueError(
+                f"{location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "
+                f"its {key_kind} are {', '.join(allowed_keys)}."
+            )
+
+
+def _make_error(name: str, value: object, requirement: str) -> ValueError:
+    """Return the error about a value that does not satisfy a requirement."""
+    return ValueError(f"{name} is {_format_value(value)}, but it must be {requirement}.")
+
+
+def _format_value(value: object) -> str:
+    """Return a value as it is written in TOML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)

@@ -1,0 +1,256 @@
+"""Output of commands: tables, progress, and one sentence for a user's mistake."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from jax.typing import ArrayLike
+    from rich.progress import Progress as Bar
+
+    from vrw_jax.cycles import LimitCycle, ReturnMapCycle
+    from vrw_jax.models import AbstractStep, StepResult
+    from vrw_jax.paper import Fact
+    from vrw_jax.scans import ScanProgress
+    from vrw_jax.wheel import WheelParams
+
+USER_ERROR_EXIT_CODE, INTERRUPTED_EXIT_CODE = 2, 130
+"""Exit codes of a user's mistake and of a Ctrl-C."""
+
+stdout_console, stderr_console = Console(), Console(stderr=True)
+"""Consoles of stdout and stderr."""
+
+
+@contextlib.contextmanager
+def report_errors(interruption_message: str = "stopped; nothing was written.") -> Iterator[None]:
+    """Report an error in one sentence on stderr with exit code 2, and a Ctrl-C with 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print_error(interruption_message)
+        raise typer.Exit(INTERRUPTED_EXIT_CODE) from None
+    except MemoryError as error:
+        print_error(
+            "this asks for more memory than there is: give smaller designs, or fewer at once."
+        )
+        raise typer.Exit(USER_ERROR_EXIT_CODE) from error
+    except (ValueError, OSError) as error:
+        print_error(str(error) if isinstance(error, ValueError) else _format_system_error(error))
+        raise typer.Exit(USER_ERROR_EXIT_CODE) from error
+
+
+def print_error(sentence: str) -> None:
+    """Print a sentence about an error on stderr."""
+    stderr_console.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
+
+
+def _format_system_error(error: OSError) -> str:
+    """Return the sentence about an error of the system."""
+    location = f"{error.filename}: " if error.filename else ""
+    return f"{location}{str(error.strerror or error).rstrip('.')}."
+
+
+def print_written_paths(paths: Iterable[Path]) -> None:
+    """Print the paths of files that were written."""
+    for path in paths:
+        stdout_console.print(f"written: {path}", highlight=False, soft_wrap=True)
+
+
+def print_table(
+    title: str | None,
+    rows: Iterable[Sequence[str]],
+    headings: Sequence[str] = (),
+    right_aligned: Sequence[str] = (),
+) -> None:
+    """Print a table; columns in `right` are right-aligned, and without headings names are bold.
+
+    Texts are printed literally, except that a column with the heading "" may contain color markup.
+    """
+    table = Table(title=title, title_justify="left", show_header=bool(headings), box=None)
+    for heading in headings or ("name", "text"):
+        table.add_column(heading, justify="right" if heading in right_aligned else "left")
+    for row in rows:
+        cells = [
+            text if heading == "" else escape(text)
+            for heading, text in zip(headings or ("name", "text"), row, strict=True)
+        ]
+        table.add_row(*(cells if headings else (f"[bold]{cells[0]}[/]", *cells[1:])))
+    stdout_console.print(table)
+
+
+def print_facts(facts: "list[Fact]", folder: Path) -> None:
+    """Print the table of facts and how many hold."""
+    verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
+    print_table(
+        None,
+        ((f.claim, f.source, f.published_value, f.computed, verdict[f.holds]) for f in facts),
+        ("fact", "where", "published", "found", ""),
+    )
+    from vrw_jax.paper import summarize_facts
+
+    stdout_console.print(f"{summarize_facts(facts)}; see the figures and {folder / 'facts.md'}.")
+
+
+def make_progress_bar(task: str) -> "Bar":
+    """Return a progress bar on stderr; that of a scan counts samples and shows a note."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *((MofNCompleteColumn(),) if task == "scan" else ()),
+        TextColumn("{task.fields[note]}") if task == "scan" else TimeElapsedColumn(),
+    )
+    return Bar(*columns, console=stderr_console)
+
+
+def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"], None]:
+    """Return the callback that shows rate, share without a gait and time left.
+
+    The rate is measured from the second chunk on, because the first one includes compilation.
+    """
+    import time
+
+    from vrw_jax.scans import format_seconds
+
+    first_report: list[tuple[float, int]] = []
+
+    def report(progress: "ScanProgress") -> None:
+        """Update the bar."""
+        time_now, n_done = time.monotonic(), progress.n_done
+        note = ""
+        if n_done:
+            first_report.append((time_now, n_done))
+            first_time, n_before = first_report[0]
+            note = f"{100 * progress.n_failed / n_done:.0f} % without a gait"
+            if time_now > first_time:
+                rate = (n_done - n_before) / (time_now - first_time)
+                seconds_left = (progress.n_samples - n_done) / rate
+                note = f"{rate:,.0f} per s, {note}, {format_seconds(seconds_left)} left"
+        update(
+            task,
+            total=progress.n_samples,
+            completed=n_done,
+            description="scanning" if n_done else "compiling",
+            note=note,
+        )
+
+    return report
+
+
+def print_outcomes(scan: "xr.Dataset") -> None:
+    """Print the number of samples of a scan by outcome."""
+    import numpy as np
+
+    from vrw_jax.wheel import Outcome
+
+    codes, counts = np.unique(scan.outcome.values, return_counts=True)
+    ends = [Outcome(int(code)) for code in codes]
+    print_table(
+        "Outcomes",
+        (
+            (f"{count:,}", f"{100 * count / counts.sum():.1f} %", end.name, end.meaning)
+            for count, end in zip(counts, ends, strict=True)
+        ),
+        ("samples", "share", "outcome", "meaning"),
+        ("samples", "share"),
+    )
+
+
+def print_gait(
+    params: "WheelParams",
+    result: Any,  # the step of any model
+    start: "ArrayLike | tuple[float, ...]",
+    n_walked: int,
+    cycle: "LimitCycle | ReturnMapCycle",
+) -> None:
+    """Print a wheel, the last step of its walk, from the state `start`, and its limit cycle."""
+    import numpy as np
+
+    from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
+
+    parameter_texts = [
+        f"{name} {float(getattr(params, name)):g} {d.unit}" for name, d in PARAMETER_DOMAINS.items()
+    ]
+    stdout_console.print(
+        "[bold]Wheel[/]  " + ", ".join(parameter_texts) + f", {params.n_legs} legs"
+    )
+    outcome = Outcome(int(result.outcome))
+    if outcome == Outcome.STEPPED:
+        change = float(np.abs(np.asarray(result.section_state) - np.asarray(start)).max())
+        stdout_console.print(
+            f"Walked {n_walked} steps; the last changed the section state by {change:.1e}."
+        )
+        _print_step(result)
+    else:
+        stdout_console.print(
+            f"[bold]Step {n_walked + 1} ended as {outcome.name}:[/] {outcome.meaning}"
+        )
+    _print_cycle(cycle)
+    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():  # the paper's model
+        _print_margins(result)
+
+
+def _print_step(result: "AbstractStep") -> None:
+    """Print the measures of a step."""
+    from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+
+    values = result.measures()
+    rows = (
+        (measure.long_name, measure.symbol, f"{float(values[name]):.5g}", measure.display_unit)
+        for name, measure in MEASURES.items()
+        if name in values and name not in ("outcome", "solver_steps", *MARGIN_MEASURES)
+    )
+    print_table("Last step", rows, ("quantity", "symbol", "value", "unit"), ("value",))
+
+
+def _print_cycle(cycle: "LimitCycle | ReturnMapCycle") -> None:
+    """Print stability, period, speed and DLS fraction of a limit cycle."""
+    import numpy as np
+
+    from vrw_jax.cycles import format_multipliers
+    from vrw_jax.wheel import Outcome
+
+    if not bool(cycle.found):
+        end = Outcome(int(cycle.outcome))
+        stdout_console.print(f"[bold]Limit cycle[/]  {end.name}: {end.meaning}")
+        return
+    radius, multipliers = format_multipliers(np.asarray(cycle.monodromy_value))
+    verdict = "stable" if radius < 1.0 else "unstable"
+    stdout_console.print(
+        f"[bold]Limit cycle[/]  {verdict}: multipliers {multipliers}; period "
+        f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
+        f"DLS {100 * float(cycle.dls_fraction):.2f} %."
+    )
+
+
+def _print_margins(result: "StepResult") -> None:
+    """Print the margins of a step."""
+    import numpy as np
+
+    from vrw_jax.measures import MARGIN_MEASURES
+
+    rows = []
+    for name, measure in MARGIN_MEASURES.items():
+        values = np.atleast_1d(np.asarray(getattr(result.margins, name)))
+        least_margin, label = float(values.min()), measure.long_name
+        mark = "[green]holds[/]" if least_margin >= 0.0 else "[bold red]broken[/]"
+        if measure.dimension and least_margin < 0.0:
+            legs = [str(leg + 3) for leg in np.flatnonzero(values < 0.0)]
+            label += f" (broken at legs {', '.join(legs)})"
+        rows.append((mark, label, measure.symbol, f"{least_margin:.4g}", measure.display_unit))
+    headings = ("", "margin of", "symbol", "least", "unit")
+    print_table("Premises of the paper's rung", rows, headings, ("least",))
+    n, n_broken = len(rows), sum("broken[" in mark for mark, *_ in rows)
+    stdout_console.print(
+        f"{n - n_broken} of {n} premises hold, {n_broken} are broken. The rung walks on regardless: "
+        "it measures what it does not model."
+    )

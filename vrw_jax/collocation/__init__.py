@@ -1,0 +1,27 @@
+"""Gauss collocation of phases whose durations are unknowns."""
+
+from vrw_jax.collocation.gauss import (
+    DOUBLE_END_WEIGHTS,
+    DOUBLE_INTEGRATION_MATRIX,
+    END_WEIGHTS,
+    GAUSS_NODES,
+    INTEGRATION_MATRIX,
+    N_GAUSS_NODES,
+    PhaseMesh,
+    differentiation_matrix,
+    integration_weights,
+    lagrange_weights,
+    mesh_transfer_matrix,
+)
+from vrw_jax.collocation.phase_collocation import (
+    CollocationPhase,
+    CollocationSolution,
+    CycleLinearization,
+    PhaseConstants,
+    PhasePassage,
+    PhasePoint,
+    PhaseSequence,
+    estimate_mesh_error,
+    linearize_cycle,
+    reconstruct_step,
+)

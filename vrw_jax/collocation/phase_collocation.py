@@ -1,0 +1,664 @@
+"""Collocation of a limit cycle: all phases, their durations and the section state together.
+
+Each phase is divided into mesh intervals of four Gauss nodes (order 8). The unknowns are the
+section state, the durations of the phases and the accelerations at all nodes; positions and rates
+follow from them explicitly. One pass of `linearize_cycle` goes through the intervals once and
+propagates a few tangents: the Newton correction, one tangent for each entry of the section state,
+one for each requested parameter, and one for the duration of the running phase. The node equations
+of an interval are eliminated immediately, the duration of a phase at its event, the section state
+at the closing of the cycle. The monodromy matrix and the sensitivities of all unknowns to the
+parameters are therefore tangents of the same pass.
+
+Arrays have batch elements (independent wheels) on their last axis, and no code branches.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool
+
+from vrw_jax.collocation.gauss import (
+    DOUBLE_END_WEIGHTS,
+    DOUBLE_INTEGRATION_MATRIX,
+    END_WEIGHTS,
+    GAUSS_NODES,
+    INTEGRATION_MATRIX,
+    N_GAUSS_NODES,
+    PhaseMesh,
+    lagrange_weights,
+    phase_integration_matrices,
+)
+from vrw_jax.numerics import (
+    Elementwise,
+    HoldFn,
+    LaneArray,
+    Vector,
+    apply_matrix,
+    contract_axes,
+    fusion_barrier,
+    invert_small,
+    solve_node_equations,
+    value_and_jvps,
+    value_and_partials,
+    weighted_sum,
+)
+
+PhaseConstants = tuple[Elementwise, ...]
+"""The constants of the phases' equations, one array for each."""
+
+
+class PhasePoint(NamedTuple):
+    """State within a phase: its held constants, coordinates and rates."""
+
+    held_constants: Vector
+    q: Vector
+    v: Vector
+
+
+class CollocationPhase(NamedTuple):
+    """One phase as data, whose functions are elementwise over the batch.
+
+    `residual` is the residual of the equations of motion at (constants, point, acceleration), which
+    is linear in the acceleration; this form costs far less to differentiate than the solved form.
+    `event` (zero at the end) and `guards` (positive inside) take (constants, point). `reset` maps
+    the end of the phase to the start of the next phase, and the end of the last phase to the
+    section state (in `q`).
+    """
+
+    name: str
+    n_coordinates: int
+    residual: Callable[[PhaseConstants, PhasePoint, Vector], Vector]
+    event: Callable[[PhaseConstants, PhasePoint], Elementwise]
+    reset: Callable[[PhaseConstants, PhasePoint], PhasePoint]
+    guards: Callable[[PhaseConstants, PhasePoint], Vector]
+    is_smooth: bool = True  # False: the first interval leaves a fast decaying mode unresolved
+
+
+class PhaseSequence(NamedTuple):
+    """The phases between two crossings of the section, which has `section_size` unknowns.
+
+    `start` maps the section state to the start of the first phase. `admissibility_margins` takes
+    the passages of a gait step and the flags of active phases, and returns the quantities that must
+    be positive there.
+    """
+
+    section_size: int
+    start: Callable[[PhaseConstants, Vector], PhasePoint]
+    phases: tuple[CollocationPhase, ...]
+    admissibility_margins: Callable[[PhaseConstants, "tuple[PhasePassage, ...]", Array], Vector]
+
+
+class CollocationSolution(NamedTuple):
+    """The unknowns of a cycle of n gait steps, batch last; a gait step is one run of
+    the sequence.
+    """
+
+    section_state: LaneArray  # (section_size, batch), at the start of the first gait step
+    durations: LaneArray  # (n, n_phases, batch), s
+    accelerations: tuple[
+        LaneArray, ...
+    ]  # by phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
+
+
+class CycleLinearization(NamedTuple):
+    """Results of one pass at a trial solution."""
+
+    correction: CollocationSolution  # of Newton's method
+    tangents: (
+        CollocationSolution  # leading axis: derivatives with respect to each requested parameter
+    )
+    step_ends: (
+        LaneArray  # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
+    )
+    step_end_tangents: (
+        LaneArray  # leading axis: their derivatives with respect to each parameter requested
+    )
+    monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
+
+
+class _PassContext(NamedTuple):
+    """Inputs of a whole pass, and the layout of the tangents that it propagates.
+
+    The order is: the correction; one tangent for each entry of the section state; one for each
+    parameter in `parameter_indices`; and, within a phase, one for its duration.
+    """
+
+    section_size: int
+    parameter_indices: tuple[int, ...]
+    parameters: LaneArray
+    constants_of: Callable[..., PhaseConstants]
+    constants: PhaseConstants
+    constants_tangents: tuple[
+        LaneArray, ...
+    ]  # the tangents of each, only with respect to the parameters
+    hold: HoldFn
+
+    @property
+    def n_tangents(self) -> int:
+        """Number of tangents outside of a phase."""
+        return 1 + self.section_size + len(self.parameter_indices)
+
+    @property
+    def section_slice(self) -> slice:
+        """Slice of the tangents with respect to the section state."""
+        return slice(1, 1 + self.section_size)
+
+    def value_and_tangents(self, function: Callable, point: tuple, point_tangents: tuple) -> tuple:
+        """Return the value and the tangents of `function(*point, *constants)`."""
+        if not self.parameter_indices:
+            return value_and_jvps(
+                lambda *point: function(*point, *self.constants), point, point_tangents
+            )
+        n_trailing = point_tangents[0].shape[0] - self.n_tangents
+        padding = ((self.section_slice.stop, n_trailing), *((0, 0),) * (self.parameters.ndim - 1))
+        constants_tangents = (jnp.pad(tangent, padding) for tangent in self.constants_tangents)
+        return value_and_jvps(
+            function, (*point, *self.constants), (*point_tangents, *constants_tangents)
+        )
+
+
+def _make_context(
+    section_size: int,
+    parameter_indices: tuple[int, ...],
+    parameters: LaneArray,
+    constants_of: Callable[..., PhaseConstants],
+) -> _PassContext:
+    """Return the context of a pass with the constants and their tangents."""
+    hold = fusion_barrier(parameters)
+    dtype, lanes = parameters.dtype, parameters.shape[1:]
+    units = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
+    parameter_tangents = tuple(
+        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lanes)) for x in units.T
+    )
+    if parameter_indices:
+        constants, constants_tangents = value_and_jvps(
+            constants_of, tuple(parameters), parameter_tangents
+        )
+    else:
+        constants, constants_tangents = constants_of(*parameters), ()
+    return _PassContext(
+        section_size,
+        parameter_indices,
+        parameters,
+        constants_of,
+        constants,
+        constants_tangents,
+        hold,
+    )
+
+
+def _stack_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
+    """Return the parts of a point as arrays, some of which may be empty."""
+    empty = jnp.zeros((0, *template.shape[1:]), template.dtype)
+    return tuple(jnp.stack(components) if components else empty for components in point)
+
+
+class _PassState(NamedTuple):
+    """State of the pass with its tangents (leading axis: tangents)."""
+
+    held_constants: LaneArray
+    q: LaneArray
+    v: LaneArray
+    held_tangents: LaneArray
+    q_tangents: LaneArray
+    v_tangents: LaneArray
+
+
+def _append_duration_tangent(pass_state: _PassState) -> _PassState:
+    """Append one zero tangent for the duration of the phase that begins."""
+    append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    return pass_state._replace(
+        held_tangents=append_zero(pass_state.held_tangents),
+        q_tangents=append_zero(pass_state.q_tangents),
+        v_tangents=append_zero(pass_state.v_tangents),
+    )
+
+
+class _MeshInterval(NamedTuple):
+    """One mesh interval of a phase."""
+
+    duration_fraction: Array  # of the phase's duration
+    h: LaneArray  # length, s
+    accelerations: LaneArray  # accelerations, (node, coordinate, batch)
+
+
+def _unit_tangent(n_tangents: int, index: int, dtype: Any) -> np.ndarray:
+    """Return a unit vector over the tangents, with trailing axes for multiplication."""
+    return np.eye(n_tangents, dtype=dtype)[index][:, None, None, None]
+
+
+def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Array, ...]:
+    """Return coordinates and rates at the nodes of an interval, and their tangents."""
+    fraction, h, a = interval
+    v, q_tangents, v_tangents = pass_state.v, pass_state.q_tangents, pass_state.v_tangents
+    c = GAUSS_NODES.astype(h.dtype)[:, None, None]
+    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)
+    rate_increments, position_increments = (
+        apply_matrix(INTEGRATION_MATRIX, a),
+        apply_matrix(DOUBLE_INTEGRATION_MATRIX, a),
+    )
+    Q = pass_state.q + h * (c * v + h * position_increments)
+    V = v + h * rate_increments
+    node_q_tangents = (
+        q_tangents[:, None]
+        + (h * c) * v_tangents[:, None]
+        + duration_unit * (fraction * (c * v + 2.0 * h * position_increments))
+    )
+    node_v_tangents = v_tangents[:, None] + duration_unit * (fraction * rate_increments)
+    return Q, V, node_q_tangents, node_v_tangents
+
+
+def _evaluate_end(
+    pass_state: _PassState, interval: _MeshInterval, acceleration_tangents: LaneArray
+) -> _PassState:
+    """Return the state at the end of an interval from its accelerations and their tangents."""
+    fraction, h, a = interval
+    _, q, v, _, q_tangents, v_tangents = pass_state
+    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
+    rate_increment, position_increment = (
+        weighted_sum(END_WEIGHTS, a),
+        weighted_sum(DOUBLE_END_WEIGHTS, a),
+    )
+    rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
+    position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents).swapaxes(
+        0, 1
+    )
+    q_tangents = (
+        q_tangents
+        + h * v_tangents
+        + h * h * position_increment_tangents
+        + duration_unit * (fraction * (v + 2.0 * h * position_increment))
+    )
+    v_tangents = (
+        v_tangents + h * rate_increment_tangents + duration_unit * (fraction * rate_increment)
+    )
+    q, v = q + h * v + h * h * position_increment, v + h * rate_increment
+    return pass_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
+
+
+def _linearize_residual(
+    context: _PassContext,
+    phase: CollocationPhase,
+    pass_state: _PassState,
+    Q: LaneArray,
+    V: LaneArray,
+    a: LaneArray,
+) -> tuple[Array, Array, Any]:
+    """Return the residual at the nodes and its partial derivatives.
+
+    The Jacobian is with respect to (q, v, acceleration, held constants); the derivatives with
+    respect to the parameters are separate. Axes: node, equation, argument, batch; the axis of the
+    parameters leads.
+    """
+    dim, n_held_constants = phase.n_coordinates, pass_state.held_constants.shape[0]
+
+    def evaluate_residual(*arguments: Array) -> Vector:
+        q, v, a = (arguments[i * dim : (i + 1) * dim] for i in range(3))
+        held_constants, parameters = (
+            arguments[3 * dim :][:n_held_constants],
+            arguments[3 * dim :][n_held_constants:],
+        )
+        constants = (
+            context.constants_of(*parameters) if context.parameter_indices else context.constants
+        )
+        return phase.residual(constants, PhasePoint(held_constants, q, v), a)
+
+    arguments = [x[:, i] for x in (Q, V, a) for i in range(dim)]
+    arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in pass_state.held_constants]
+    n_state_arguments = len(arguments)
+    if context.parameter_indices:
+        arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in context.parameters]
+    # The partials stay separate arrays first: each is a small kernel; stacking them is a copy.
+    value, partials = context.hold(value_and_partials(evaluate_residual, arguments))
+    partials_by_argument = list(zip(*partials, strict=True))
+    jacobian = jnp.stack(
+        [
+            jnp.stack(partials_of_argument, 1)
+            for partials_of_argument in partials_by_argument[:n_state_arguments]
+        ],
+        2,
+    )
+    parameter_partials = [
+        jnp.stack(partials_by_argument[n_state_arguments + i], 1) for i in context.parameter_indices
+    ]
+    return context.hold(
+        (jnp.stack(value, 1), jacobian, jnp.stack(parameter_partials) if parameter_partials else ())
+    )
+
+
+def _assemble_node_system(
+    context: _PassContext,
+    pass_state: _PassState,
+    h: LaneArray,
+    linearization: tuple,
+    state_tangents: LaneArray,
+) -> tuple[Array, Array]:
+    """Return matrix and right-hand sides, one per tangent, for the corrections of the
+    accelerations.
+    """
+    value, jacobian, parameter_partials = linearization
+    n_tangents, dim, dtype = state_tangents.shape[0], value.shape[1], h.dtype
+    terms = [jacobian[:, :, s] * state_tangents[:, :, s, None] for s in range(2 * dim)]
+    terms += [
+        jacobian[:, :, 3 * dim + s] * pass_state.held_tangents[:, s, None, None]
+        for s in range(pass_state.held_constants.shape[0])
+    ]
+    rhs = sum(terms, start=_unit_tangent(n_tangents, 0, dtype) * value)
+    if context.parameter_indices:
+        n_leading = context.n_tangents - len(context.parameter_indices)
+        rhs = rhs + jnp.pad(parameter_partials, ((n_leading, 1), *((0, 0),) * 3))
+    double_matrix, single_matrix = (
+        matrix.astype(dtype)[:, None, :, None, None]
+        for matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
+    )
+    jacobian_q, jacobian_v, jacobian_a = (
+        jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3)
+    )
+    same_node = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
+    system_matrix = same_node * jacobian_a + h * (
+        h * double_matrix * jacobian_q + single_matrix * jacobian_v
+    )
+    return system_matrix, -jnp.moveaxis(rhs, 0, 2)
+
+
+def _linearize_phase(
+    context: _PassContext,
+    phase: CollocationPhase,
+    mesh: PhaseMesh,
+    pass_state: _PassState,
+    duration: LaneArray,
+    accelerations: LaneArray,
+) -> tuple[_PassState, LaneArray]:
+    """Propagate the state through all intervals of a phase.
+
+    Return the state at its end and the tangents of its accelerations.
+    """
+
+    def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:
+        a, fraction = inputs
+        interval = _MeshInterval(fraction, fraction * duration, a)
+        start_state = pass_state._replace(
+            **dict(zip(INTERVAL_STATE_FIELDS, interval_state, strict=True))
+        )
+        Q, V, node_q_tangents, node_v_tangents = context.hold(
+            _evaluate_nodes(start_state, interval)
+        )
+        linearization = _linearize_residual(context, phase, start_state, Q, V, a)
+        state_tangents = jnp.concatenate(
+            [node_q_tangents, node_v_tangents], 2
+        )  # (tangent, node, argument, batch)
+        node_system = context.hold(
+            _assemble_node_system(context, start_state, interval.h, linearization, state_tangents)
+        )
+        acceleration_tangents = context.hold(
+            solve_node_equations(*node_system, context.parameters)
+        )  # (node, row, tangent, batch)
+        end_state = _evaluate_end(start_state, interval, acceleration_tangents)
+        return tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS), jnp.moveaxis(
+            acceleration_tangents, 2, 0
+        )
+
+    start_state = tuple(getattr(pass_state, name) for name in INTERVAL_STATE_FIELDS)
+    fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
+    end_state, acceleration_tangents = lax.scan(
+        linearize_interval, start_state, (accelerations, fractions)
+    )
+    return pass_state._replace(
+        **dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
+    ), acceleration_tangents
+
+
+INTERVAL_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
+"""Fields of the pass state that change within a phase."""
+
+
+def _eliminate_duration(
+    context: _PassContext,
+    phase: CollocationPhase,
+    pass_state: _PassState,
+    duration: LaneArray,
+    phase_active: Bool[Array, " lanes"],
+) -> tuple[_PassState, LaneArray, Callable[[Array], Array]]:
+    """Eliminate the duration of a phase by its event, and apply the reset.
+
+    Return the state of the next phase, the tangents of the duration, and the function that
+    eliminates the duration's tangent from other tangents. A phase that is not active has duration
+    zero.
+    """
+
+    def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
+        point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
+        return phase.event(constants, point), _stack_point(phase.reset(constants, point), q)
+
+    point, point_tangents = (
+        (pass_state.held_constants, pass_state.q, pass_state.v),
+        (pass_state.held_tangents, pass_state.q_tangents, pass_state.v_tangents),
+    )
+    (event_value, next_point), (event_tangents, next_point_tangents) = context.value_and_tangents(
+        evaluate_end, point, point_tangents
+    )
+    correction_unit, duration_unit = (
+        _unit_tangent(event_tangents.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1)
+    )
+    event_value = jnp.where(phase_active, event_value, duration)
+    event_tangents = jnp.where(phase_active, event_tangents, duration_unit)
+    duration_tangents = (
+        -(event_tangents[:-1] + correction_unit[:-1] * event_value) / event_tangents[-1]
+    )
+
+    def eliminate_duration(tangents: Array) -> Array:
+        factor = duration_tangents.reshape(
+            duration_tangents.shape[:1] + (1,) * (tangents.ndim - 2) + (-1,)
+        )
+        return tangents[:-1] + factor * tangents[-1:]
+
+    next_state = _PassState(*next_point, *(eliminate_duration(x) for x in next_point_tangents))
+    return next_state, duration_tangents, eliminate_duration
+
+
+def _linearize_step(
+    context: _PassContext,
+    sequence: PhaseSequence,
+    meshes: tuple[PhaseMesh, ...],
+    carry: tuple,
+    inputs: tuple,
+) -> tuple:
+    """Propagate the section state and its tangents through one gait step."""
+    section_state, section_tangents = carry
+    durations, accelerations, phase_active = inputs
+
+    def evaluate_start(section_state: Array, *constants: Array) -> tuple:
+        return _stack_point(sequence.start(constants, tuple(section_state)), section_state)
+
+    start_point, start_tangents = context.value_and_tangents(
+        evaluate_start, (section_state,), (section_tangents,)
+    )
+    pass_state = _PassState(*start_point, *start_tangents)
+    duration_tangents, acceleration_tangents = [], []
+    for i, phase in enumerate(sequence.phases):
+        pass_state, phase_acceleration_tangents = _linearize_phase(
+            context,
+            phase,
+            meshes[i],
+            _append_duration_tangent(pass_state),
+            durations[i],
+            accelerations[i],
+        )
+        end_state, end_tangents = (
+            jnp.concatenate(x, -2)
+            for x in ((pass_state.q, pass_state.v), (pass_state.q_tangents, pass_state.v_tangents))
+        )
+        pass_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
+            context, phase, pass_state, durations[i], phase_active[i]
+        )
+        duration_tangents.append(phase_duration_tangents)
+        # Axes: (tangent, interval, node, row, batch).
+        acceleration_tangents.append(
+            eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
+        )
+        pass_state = context.hold(pass_state)
+    # The end state and its tangents are those of the last phase.
+    outputs = (
+        end_state,
+        eliminate_duration(end_tangents),
+        jnp.stack(duration_tangents, 1),
+        tuple(acceleration_tangents),
+    )
+    return (pass_state.q, pass_state.q_tangents), outputs
+
+
+def linearize_cycle(
+    sequence: PhaseSequence,
+    meshes: tuple[PhaseMesh, ...],
+    constants_of: Callable[..., PhaseConstants],
+    parameters: LaneArray,
+    solution: CollocationSolution,
+    phase_active: Bool[Array, "n n_phases lanes"],
+    parameter_indices: tuple[int, ...] = (),
+) -> CycleLinearization:
+    """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
+
+    `phase_active` marks the phases that take place: an inactive phase has duration zero and only
+    applies its reset.
+    """
+    context = _make_context(sequence.section_size, parameter_indices, parameters, constants_of)
+    section_state, dtype, n_tangents = solution.section_state, parameters.dtype, context.n_tangents
+    section_units = np.eye(n_tangents, dtype=dtype)[:, context.section_slice, None]
+    carry = section_state, jnp.broadcast_to(section_units, (n_tangents, *section_state.shape))
+    inputs = (solution.durations, solution.accelerations, phase_active)
+    linearize_step = functools.partial(_linearize_step, context, sequence, meshes)
+    if solution.durations.shape[0] == 1:
+        (return_state, return_tangents), outputs = linearize_step(
+            carry, jax.tree.map(lambda x: x[0], inputs)
+        )
+        outputs = jax.tree.map(lambda x: x[None], outputs)
+    else:
+        (return_state, return_tangents), outputs = lax.scan(linearize_step, carry, inputs)
+
+    monodromy = jnp.swapaxes(return_tangents[context.section_slice], 0, 1)
+    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[context.section_slice.stop :]])
+    correction_unit = np.eye(n_tangents - context.section_size, dtype=dtype)[0][:, None, None]
+    rhs = drop_section_tangents(return_tangents) + correction_unit * (return_state - section_state)
+    closing_matrix = invert_small(
+        jnp.eye(context.section_size, dtype=dtype)[:, :, None] - monodromy
+    )
+    closed_section_tangents = jnp.swapaxes(
+        contract_axes(closing_matrix, jnp.swapaxes(rhs, 0, 1)), 0, 1
+    )
+
+    def close_cycle(tangents: Array) -> Array:
+        """Return (tangent, n, ...) from (n, tangent, ...), without the tangents of the section
+        state.
+        """
+        tangents = jnp.swapaxes(tangents, 0, 1)
+        shape = (-1, *(1,) * (tangents.ndim - 2), *section_state.shape[1:])
+        section_tangents = tangents[context.section_slice]
+        section_terms = [
+            closed_section_tangents[:, s].reshape(shape) * section_tangents[s]
+            for s in range(len(section_state))
+        ]
+        return drop_section_tangents(tangents) + sum(section_terms[1:], start=section_terms[0])
+
+    step_ends, *open_tangents = context.hold(outputs)
+    step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
+        close_cycle, tuple(open_tangents)
+    )
+    step_end_tangents, solution_tangents = context.hold(
+        (
+            step_end_tangents,
+            CollocationSolution(closed_section_tangents, duration_tangents, acceleration_tangents),
+        )
+    )
+    return CycleLinearization(
+        correction=jax.tree.map(lambda x: x[0], solution_tangents),
+        tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
+        step_ends=step_ends + step_end_tangents[0],
+        step_end_tangents=step_end_tangents[1:],
+        monodromy=monodromy,
+    )
+
+
+class PhasePassage(NamedTuple):
+    """Points of one phase: its start, its end and all nodes (on a leading axis)."""
+
+    start: PhasePoint
+    nodes: PhasePoint
+    end: PhasePoint
+
+
+def reconstruct_step(
+    sequence: PhaseSequence,
+    meshes: tuple[PhaseMesh, ...],
+    constants: PhaseConstants,
+    section_state: Vector,
+    durations: Array,
+    accelerations: tuple[Array, ...],
+) -> tuple[Vector, tuple[PhasePassage, ...]]:
+    """Reconstruct one gait step from known durations and accelerations.
+
+    Return the section state after the step and the passages of its phases. No equation is solved;
+    any trailing axes are allowed.
+    """
+    point = sequence.start(constants, section_state)
+    passages = []
+    for i, phase in enumerate(sequence.phases):
+        times, rate_matrix, position_matrix = (
+            weights.astype(durations.dtype) for weights in phase_integration_matrices(meshes[i])
+        )
+        a, T = accelerations[i], durations[i]
+        a = a.reshape(-1, *a.shape[2:])
+        q, v = jnp.stack(point.q), jnp.stack(point.v)
+        times = times.reshape(-1, *(1,) * q.ndim)
+        Q = q + T * (times * v + T * jnp.tensordot(position_matrix, a, 1))
+        V = v + T * jnp.tensordot(rate_matrix, a, 1)
+        nodes = PhasePoint(
+            point.held_constants, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1))
+        )
+        end = PhasePoint(point.held_constants, tuple(Q[-1]), tuple(V[-1]))
+        passages.append(PhasePassage(point, nodes, end))
+        point = phase.reset(constants, end)
+    return point.q, tuple(passages)
+
+
+def estimate_mesh_error(
+    sequence: PhaseSequence, meshes: tuple[PhaseMesh, ...], solution: CollocationSolution
+) -> LaneArray:
+    """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
+    period.
+
+    Each interval's accelerations are a separate polynomial, and at an interval boundary both differ
+    by what neither resolves. That jump times the longer interval squared is a displacement. Times
+    ERROR_PER_JUMP it bounds the error, except for some round-off, and is far above it in most
+    cases. This was found for 346 random gaits with periods to 10 s, on two meshes. Phases with
+    `is_smooth` False do not count, because their error in one interval hardly reaches the next.
+    """
+    max_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
+    for i, mesh in enumerate(meshes):
+        if mesh.n_intervals == 1 or not sequence.phases[i].is_smooth:
+            continue
+        left_limits, right_limits = (
+            jnp.tensordot(
+                jnp.asarray(lagrange_weights(location), max_jump.dtype), node_accelerations, (0, 2)
+            )
+            for location, node_accelerations in (
+                (1.0, solution.accelerations[i][:, :-1]),
+                (0.0, solution.accelerations[i][:, 1:]),
+            )
+        )
+        max_fraction = np.maximum(mesh.interval_fractions[1:], mesh.interval_fractions[:-1])
+        length = (
+            max_fraction[:, None, None].astype(max_jump.dtype)
+            * solution.durations[:, None, None, i]
+        )
+        jump = jnp.abs(left_limits - right_limits) * length * length
+        max_jump = jnp.maximum(max_jump, jnp.max(jump, axis=(0, 1, 2)))
+    return ERROR_PER_JUMP * max_jump
+
+
+ERROR_PER_JUMP = 0.05
+"""Ratio of the estimated error to the displacement of a jump at an interval boundary."""

@@ -1,0 +1,16 @@
+"""The wheel with unilateral contact: mechanics, contact laws, impacts, batched walks and their tangents."""
+
+from vrw_jax.contact import batch_walks
+from vrw_jax.contact.batch_walks import embed_section_states, step_batch_with_jacobian, walk_batch
+from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact.contact_state import PackedState, unpack_state
+from vrw_jax.contact.mechanics import (
+    foot_heights,
+    foot_positions,
+    kinetic_energy,
+    leg_directions,
+    potential_energy,
+)
+from vrw_jax.contact.section import LOCKED_CODE_OFFSET, FullState, embed_section_state
+from vrw_jax.contact.step_record import UnilateralStep, min_dip_depth
+from vrw_jax.contact.unilateral_wheel import UnilateralTrajectory, UnilateralWheel

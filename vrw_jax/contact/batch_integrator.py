@@ -1,0 +1,618 @@
+"""Batched integration between events: each lane has its own step size and contact state.
+
+Arrays have lanes on the last axis. One Runge-Kutta step serves integration and event search: a lane
+whose step crosses a guard repeats it with smaller steps until the step ends at the earliest event.
+No computation in this module combines values of different lanes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.contact.contact_state import (
+    ContactQuantities,
+    ContactState,
+    ModeDynamics,
+    accumulator_rates,
+    compute_forces,
+    contact_quantities,
+    evaluate_guards,
+    guard_scales,
+)
+from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, prevent_fusion
+from vrw_jax.hybrid import GUARD_ROUNDOFF_EPS
+from vrw_jax.integrator import ButcherTableau, find_dip, fit_guard_parabola, step_size_factor
+from vrw_jax.numerics import StepOptions, tree_where
+from vrw_jax.wheel import Outcome
+
+N_CONTACT_ROWS = 9
+"""Number of rows after the accelerations that hold the contact quantities of the guards. They are
+followed by those of legs in the air, if stoppers are one-sided, and by `N_ACCUMULATOR_ROWS` rows
+if these are requested."""
+N_ACCUMULATOR_ROWS = 3
+"""Number of accumulated rows: energy lost in dampers and by sliding, slip."""
+STATUS_RUNNING, STATUS_EVENT = -1, -2
+"""Status codes of a lane that is integrating or at an event; every other status is its
+`Outcome`."""
+MAX_WAIT_TRIES = 8
+"""Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
+PAINLEVE_TOLERANCES = 1e-8, 1e2
+"""Absolute tolerance, and factor of the relative tolerance, below which the determinant counts as
+zero at Painlevé's singularity. Forces there are a ratio of two vanishing numbers, resolved
+neither by rounding nor by integration. Chosen because with 18 tolerances one singularity was
+missed."""
+MAX_PARABOLA_ITERATIONS = 3
+"""Number of event iterations by parabolas; the later ones use secants, which converge better in
+stiff dips."""
+OWN_GUARD_AFTER_ITERATIONS = 15
+"""Number of event iterations after which a guard that starts at its own event may be the event
+found."""
+MAX_ROUNDOFF_FALL_SECONDS = 1e-3
+"""Time (s) within which a guard must fall by its own rounding to count as falling."""
+EVENT_TIME_TOLERANCE_FACTOR = 30.0
+"""Largest last correction to the time of an event, in tolerances of the step. Chosen because the
+proposal is a parabola's, whose own error is about a hundredth of the correction."""
+
+
+class IntervalPoint(NamedTuple):
+    """Coordinates (hub x, z, theta, lengths), their rates, and the rows of the dynamics at a
+    point.
+    """
+
+    q: Array  # (3 + n, lanes)
+    v: Array
+    dynamics_rows: Array  # accelerations, then contact rows: (3 + n + N_CONTACT_ROWS [+ n], lanes)
+
+
+class EventBracket(NamedTuple):
+    """Bracket of the earliest event inside a step."""
+
+    is_active: Array
+    is_crossing: Array  # (guards, lanes)
+    low: Array  # bracket of the event, s from the start of the step
+    high: Array
+    time_tolerance: Array  # s
+    n_iterations: Array
+    previous_h: Array  # previously attempted step, s
+    guard_values: Array  # guards at its end, (guards, lanes)
+
+
+class IntervalState(NamedTuple):
+    """State of all lanes between two of their events."""
+
+    point: IntervalPoint
+    contact_state: ContactState
+    guard_values: Array  # guards at the point, (guards, lanes)
+    guard_offset: Array  # value at the own event of a guard that starts there, minus rounding
+    accumulated: Array | None  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    h: Array  # of the next attempt, s
+    time: Array  # since the last event, s
+    search: EventBracket
+    status: Array  # MARCHING, EVENT or an Outcome
+    guard: Array  # that has triggered
+    n_solver_steps: Array  # attempted since the last event
+
+
+def motion_from_point(point: IntervalPoint) -> WheelMotion:
+    """Return the motion at a point."""
+    x, z, theta, L = point.q[0], point.q[1], point.q[2], point.q[3:]
+    return WheelMotion(x, z, theta, point.v[0], point.v[1], point.v[2], L, point.v[3:])
+
+
+def make_point(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
+    """Return the point of a motion, with its dynamics: the inverse of `motion_from_point`."""
+    q, v = pack_coordinates(motion)
+    return IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+
+
+def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
+    """Return the coordinates of a motion, and their rates, as two arrays."""
+    q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
+    return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
+
+
+def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
+    """Return the accelerations of all coordinates, then `ContactQuantities` without the
+    directions.
+    """
+    motion = motion_from_point(IntervalPoint(q, v, q))
+    current_forces = compute_forces(dynamics, motion)
+    quantities = contact_quantities(dynamics, current_forces)
+    contact_rows = [
+        *quantities.normal,
+        *quantities.tangential,
+        *quantities.stopper,
+        *quantities.slip_speed,
+        quantities.painleve_determinant,
+    ]
+    extra_rows = [] if quantities.airborne_stopper is None else [quantities.airborne_stopper]
+    if dynamics.accumulates:
+        accumulators = accumulator_rates(dynamics, motion, current_forces)
+        rows = accumulators.damping, accumulators.friction, accumulators.slip
+        extra_rows.append(jnp.stack(prevent_fusion(rows, opaque_one(motion))))
+    return jnp.concatenate(
+        [
+            jnp.stack(current_forces.solution.hub),
+            current_forces.solution.lengths,
+            jnp.stack(contact_rows),
+            *extra_rows,
+        ]
+    )
+
+
+def guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
+    """Return all guards in the order of `GuardLayout`, as long after the start of the contact
+    state.
+    """
+    motion = motion_from_point(point)
+    contact_rows = point.dynamics_rows[len(point.q) :]
+    n1, n2, t1, t2, s1, s2, x1, x2, painleve_determinant = contact_rows[:N_CONTACT_ROWS]
+    airborne_stopper = (
+        contact_rows[N_CONTACT_ROWS : N_CONTACT_ROWS + dynamics.s.n]
+        if dynamics.is_one_sided
+        else None
+    )
+    legs, pairs = leg_directions(dynamics.s, motion.theta), ((n1, n2), (t1, t2), (s1, s2), (x1, x2))
+    quantities = ContactQuantities(legs, *pairs, painleve_determinant, airborne_stopper)
+    has_begun = jnp.ones(point.q.shape[-1:], bool)
+    return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, has_begun))
+
+
+def guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
+    """Return the time derivatives of the guards along the motion."""
+
+    def guards_of_state(q: Array, v: Array) -> Array:
+        return guards_at_point(dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v)))
+
+    return jax.jvp(
+        guards_of_state, (point.q, point.v), (point.v, point.dynamics_rows[: len(point.q)])
+    )[1]
+
+
+def find_own_guards(dynamics: ModeDynamics) -> Array:
+    """Return which guards are at the event that has just started the contact state."""
+    contact_state = dynamics.contact_state
+    has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
+    no_guard = jnp.zeros((2, contact_state.contact.shape[-1]), bool)
+    airborne = [contact_state.locked & False] if dynamics.is_one_sided else []
+    return jnp.concatenate(
+        [
+            contact_state.has_just_lifted,
+            contact_state.has_just_unlocked,
+            no_guard,
+            no_guard,
+            no_guard,
+            has_just_slid,
+            no_guard,
+            no_guard,
+            *airborne,
+        ]
+    )
+
+
+@eqx.filter_jit  # traced once for all call sites
+def init_interval(dynamics: ModeDynamics, motion: WheelMotion, h: Array) -> IntervalState:
+    """Return the lanes at the start of a contact state.
+
+    A lane is at an event again if one of its guards falls at once.
+    """
+    point, is_own = make_point(dynamics, motion), find_own_guards(dynamics)
+    values, rates = guards_at_point(dynamics, point), guard_rates(dynamics, point)
+    # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
+    # rises from below has no event before it falls; events without duration leave several such.
+    roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_EPS * jnp.finfo(values.dtype).eps)
+    is_own = is_own | ((values <= roundoff) & (rates > -roundoff / MAX_ROUNDOFF_FALL_SECONDS))
+    has_passed = ~is_own & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
+    offset = jnp.where(is_own, values - 2.0 * roundoff, 0.0)
+    zero, zero_count = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
+    return IntervalState(
+        point=point,
+        contact_state=dynamics.contact_state,
+        guard_values=values - offset,
+        guard_offset=offset,
+        accumulated=jnp.zeros((N_ACCUMULATOR_ROWS, *zero.shape), zero.dtype)
+        if dynamics.accumulates
+        else None,
+        h=zero + h,
+        time=zero,
+        search=EventBracket(
+            zero_count > 0, jnp.zeros_like(is_own), zero, zero, zero, zero_count, zero, values
+        ),
+        status=jnp.where(jnp.any(has_passed, axis=0), STATUS_EVENT, STATUS_RUNNING).astype(
+            jnp.int32
+        ),
+        guard=_first_set(has_passed),
+        n_solver_steps=zero_count,
+    )
+
+
+def _first_set(flags: Array) -> Array:
+    """Return the index of the first row whose flag is set; 0 if none is."""
+    index = jnp.zeros(flags.shape[1:], jnp.int32)
+    for row in reversed(range(len(flags))):
+        index = jnp.where(flags[row], row, index)
+    return index
+
+
+DynamicsFn = Callable[[Array], ModeDynamics]
+"""Function of the lanes' columns: parameters and friction."""
+
+
+def integrate_interval(
+    dynamics_at: DynamicsFn,
+    columns: Array,
+    initial: IntervalState,
+    is_walking: Array,
+    options: StepOptions,
+    tableau: ButcherTableau,
+) -> IntervalState:
+    """Return the lanes integrated until none is running.
+
+    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` is at an
+    event.
+    """
+    dynamics = dynamics_at(columns)
+    scales = guard_scales(dynamics)
+
+    def try_step(state: IntervalState) -> IntervalState:
+        return integrator_step(
+            state, attempt_step(dynamics, tableau, options, state), scales, tableau, options
+        )
+
+    return run_until_done(
+        lambda state: state.status == STATUS_RUNNING, is_walking, try_step, initial
+    )
+
+
+def run_until_done(
+    is_running: Callable[[Any], Array], is_walking: Array, iterate: Callable, initial: Any
+) -> Any:
+    """Return the state after repeated `iterate`, until no lane is running.
+
+    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
+    """
+
+    def should_continue(loop_state: tuple) -> Array:
+        state, n_tries = loop_state
+        is_active = is_running(state)
+        return jnp.any(is_active) & ((n_tries < MAX_WAIT_TRIES) | ~jnp.any(is_walking & ~is_active))
+
+    zero = jnp.zeros((), jnp.int32)
+    iterate_once = lambda loop_state: (iterate(loop_state[0]), loop_state[1] + 1)
+    return lax.while_loop(should_continue, iterate_once, (initial, zero))[0]
+
+
+class AttemptedStep(NamedTuple):
+    """An attempted solver step."""
+
+    end: IntervalPoint
+    squared_error: Array  # of the error over the tolerance
+    guard_values: Array  # at the end
+    curvature: Array  # of the guards' parabolas
+    linear_term: Array
+    dip_fraction: Array  # fraction of the step to a possible guard dip below zero, else 1
+    accumulated: Array | None  # increment of `IntervalState.accumulated`
+
+
+def stage_state(
+    tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
+) -> tuple[Array, Array]:
+    """Return coordinates and rates at a stage, from the accelerations of the stages before it."""
+    a, b, node = (
+        jnp.asarray(x)[i] for x in (tableau.matrix, tableau.matrix_squared, tableau.nodes)
+    )
+    n, n_previous = len(q), len(tableau.nodes) - 1
+    first_sum = sum(a[j] * stage_rows[j, :n] for j in range(n_previous))
+    second_sum = sum(b[j] * stage_rows[j, :n] for j in range(n_previous))
+    return q + h * (node * v + h * second_sum), v + h * first_sum
+
+
+def attempt_step(
+    dynamics: ModeDynamics, tableau: ButcherTableau, options: StepOptions, state: IntervalState
+) -> AttemptedStep:
+    """Return an attempted step of every lane."""
+    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+
+    def stage(i: Array, stage_rows: Array) -> Array:
+        row = evaluate_dynamics(dynamics, *stage_state(tableau, i, point.q, point.v, stage_rows, h))
+        return lax.dynamic_update_index_in_dim(stage_rows, row, i, 0)
+
+    other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
+    stage_rows = lax.fori_loop(1, last_stage + 1, stage, stage_rows)
+    return finish_attempt(dynamics, tableau, options, state, stage_rows)
+
+
+def finish_attempt(
+    dynamics: ModeDynamics,
+    tableau: ButcherTableau,
+    options: StepOptions,
+    state: IntervalState,
+    stage_rows: Array,
+) -> AttemptedStep:
+    """Return the attempted step with these rows of the dynamics at its stages."""
+    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    n = len(point.q)
+    end = IntervalPoint(
+        *stage_state(tableau, last_stage, point.q, point.v, stage_rows, h), stage_rows[last_stage]
+    )
+    accumulated = None
+    if dynamics.accumulates:
+        accumulated = h * sum(
+            tableau.matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
+            for j in range(last_stage)
+        )
+    inner_points = {
+        i: IntervalPoint(*stage_state(tableau, i, point.q, point.v, stage_rows, h), stage_rows[i])
+        for i in tableau.guard_stages
+    }
+    points = *inner_points.values(), end
+    *inner_values, values = (
+        guards_at_point(dynamics, stage_point) - state.guard_offset for stage_point in points
+    )
+    weighted_sum = lambda weights: sum(
+        float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
+    )
+    errors = h * h * weighted_sum(tableau.b_error_position), h * weighted_sum(tableau.b_error)
+    squared_error = _squared_error(options, errors, point, points[-1], values)
+    middle_values = (
+        inner_values[tableau.guard_stages.index(tableau.middle_stage)]
+        if inner_values
+        else state.guard_values
+    )
+    parabola_terms = fit_guard_parabola(tableau, state.guard_values, middle_values, values)
+    dip_fraction = _earliest_dip_fraction(
+        tableau, [state.guard_values, *inner_values, values], _is_at_own_event(state)
+    )
+    return AttemptedStep(end, squared_error, values, *parabola_terms, dip_fraction, accumulated)
+
+
+def is_at_singularity(value_before: Array, value_after: Array, options: StepOptions) -> Array:
+    """Return whether the determinant has vanished at Painlevé's singularity, from its values at
+    both ends.
+    """
+    return (value_before * value_after <= 0.0) | (
+        jnp.abs(value_after) <= PAINLEVE_TOLERANCES[0] + PAINLEVE_TOLERANCES[1] * options.rtol
+    )
+
+
+def integrator_step(
+    state: IntervalState,
+    attempt: AttemptedStep,
+    scales: Array,
+    tableau: ButcherTableau,
+    options: StepOptions,
+) -> IntervalState:
+    """Return the lanes after one attempt: accepted, repeated with another step size, or at an
+    event.
+    """
+    point, h, search, end = state.point, state.h, state.search, attempt.end
+    is_running = state.status == STATUS_RUNNING
+    is_accurate = is_running & ~search.is_active & (attempt.squared_error <= 1.0)
+    needs_retry = (
+        is_accurate
+        & (attempt.dip_fraction < 1.0)
+        & (state.time + h * attempt.dip_fraction > state.time)
+    )
+    has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
+    is_accepted = is_accurate & ~needs_retry & ~has_crossed
+    next_search, event = _search_event(state, attempt, has_crossed, scales, options)
+    has_arrived = event.has_arrived
+    length_factor = jnp.where(
+        needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
+    )
+    next_h = jnp.where(search.is_active | has_crossed, event.next_h, h * length_factor)
+
+    time_shift = jnp.where(has_arrived, event.time_shift, 0.0)
+    end = IntervalPoint(
+        end.q + time_shift * end.v,
+        end.v + time_shift * end.dynamics_rows[: len(end.q)],
+        end.dynamics_rows,
+    )
+    is_taken = is_accepted | has_arrived
+    accumulated = state.accumulated
+    if accumulated is not None and attempt.accumulated is not None:
+        accumulated = accumulated + jnp.where(is_taken, attempt.accumulated, 0.0)
+    time = jnp.where(is_taken, state.time + h + time_shift, state.time)
+    is_late = is_accepted & (time >= options.max_phase_time)
+    is_late = is_late | (has_arrived & (time > options.max_phase_time))
+    is_stuck = (next_search.n_iterations >= options.max_event_iterations) | (
+        state.n_solver_steps + 1 >= options.max_solver_steps
+    )
+    is_stuck = is_stuck | (~search.is_active & (state.time + next_h == state.time))
+    determinant_row = len(point.q) + N_CONTACT_ROWS - 1
+    determinant_before, determinant_after = (
+        point.dynamics_rows[determinant_row],
+        end.dynamics_rows[determinant_row],
+    )
+    status = jnp.where(is_stuck, Outcome.SOLVER_FAILED, STATUS_RUNNING)
+    status = jnp.where(has_arrived, STATUS_EVENT, status)
+    status = jnp.where(is_late, Outcome.NO_TOUCHDOWN_IN_TIME, status)
+    is_singular = is_taken & is_at_singularity(determinant_before, determinant_after, options)
+    status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
+    return state._replace(
+        point=tree_where(is_taken, end, point),
+        guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
+        accumulated=accumulated,
+        h=jnp.where(is_running, next_h, h),
+        time=time,
+        search=tree_where(is_running, next_search, search),
+        status=jnp.where(is_running, status, state.status).astype(jnp.int32),
+        guard=jnp.where(has_arrived, event.guard, state.guard),
+        n_solver_steps=state.n_solver_steps + is_running,
+    )
+
+
+class _LocatedEvent(NamedTuple):
+    """Result of one iteration of the search for the earliest event inside a step."""
+
+    next_h: Array  # step size of the next attempt, s
+    time_shift: Array  # from this step size to the event's, s
+    has_arrived: Array  # whether the event is within tolerance
+    guard: Array
+
+
+def _search_event(
+    state: IntervalState,
+    attempt: AttemptedStep,
+    has_crossed: Array,
+    scales: Array,
+    options: StepOptions,
+) -> tuple[EventBracket, _LocatedEvent]:
+    """Return one more iteration of the search, from the zeros of the guards' parabolas or
+    secants.
+    """
+    h, search = state.h, state.search
+    is_below_zero = attempt.guard_values <= 0.0
+    is_crossing = jnp.where(search.is_active, search.is_crossing | is_below_zero, is_below_zero)
+    parabolas = state.guard_values, attempt.linear_term, attempt.curvature
+    root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_at_own_event(state))
+    secant_h, secant_guard = _earliest_secant(search, attempt.guard_values, h, is_crossing)
+    uses_secant = search.is_active & (search.n_iterations >= MAX_PARABOLA_ITERATIONS)
+    proposal, guard = (
+        jnp.where(uses_secant, secant_h, h * root_fraction),
+        jnp.where(uses_secant, secant_guard, guard),
+    )
+    has_passed = jnp.any(is_crossing & is_below_zero, axis=0)
+    low = jnp.where(search.is_active & ~has_passed, h, search.low)
+    high = jnp.where(search.is_active & has_passed, h, search.high)
+    low, high = jnp.where(has_crossed, 0.0, low), jnp.where(has_crossed, h, high)
+    resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
+    time_tolerance = jnp.maximum(EVENT_TIME_TOLERANCE_FACTOR * options.rtol * h, resolution)
+    time_tolerance = jnp.where(search.is_active, search.time_tolerance, time_tolerance)
+    is_in_bracket = (proposal >= low - time_tolerance) & (proposal <= high + time_tolerance)
+    # In a dip of microseconds, rounding moves proposals out of the bracket: bisect it instead.
+    bisects = ~is_in_bracket | (uses_secant & ((search.n_iterations & 3) == 3))
+    # A guard that starts at its own event falls again soon, or not at all.
+    middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
+    next_h = jnp.where(bisects, middle, proposal)
+    time_shift = next_h - h
+    # If a guard is within its rounding, no other step size is better than this one.
+    lowest_guard, lowest = _lowest_guard(attempt.guard_values / scales, is_crossing)
+    # A guard at its own event is within twice its rounding; without another event, it is the event.
+    roundoff = (
+        GUARD_ROUNDOFF_EPS
+        * jnp.where(search.n_iterations < OWN_GUARD_AFTER_ITERATIONS, 1.0, 3.0)
+        * jnp.finfo(h.dtype).eps
+    )
+    is_roundoff = search.is_active & (jnp.abs(lowest) <= roundoff)
+    time_shift, guard = (
+        jnp.where(is_roundoff, 0.0, time_shift),
+        jnp.where(is_roundoff, lowest_guard, guard),
+    )
+    is_close = search.is_active & (jnp.abs(time_shift) <= time_tolerance)
+    n_iterations = jnp.where(search.is_active, search.n_iterations + 1, 0)
+    is_active = (search.is_active | has_crossed) & ~is_close
+    next_search = EventBracket(
+        is_active, is_crossing, low, high, time_tolerance, n_iterations, h, attempt.guard_values
+    )
+    return next_search, _LocatedEvent(
+        next_h, time_shift, is_close & (state.status == STATUS_RUNNING), guard
+    )
+
+
+def _squared_error(
+    options: StepOptions,
+    errors: tuple[Array, Array],
+    point: IntervalPoint,
+    end: IntervalPoint,
+    guards: Array,
+) -> Array:
+    """Return the mean square of the error over its tolerance; infinite for a step that is not
+    finite.
+    """
+    total = 0.0 * jnp.sum(guards, axis=0)
+    for error, a, b in zip(errors, point[:2], end[:2], strict=True):
+        tolerance = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        total = total + jnp.sum(jnp.square(error / tolerance), axis=0)
+    return jnp.where(jnp.isfinite(total), total / (2 * point.q.shape[0]), jnp.inf)
+
+
+def _is_at_own_event(state: IntervalState) -> Array:
+    """Return the guards at their own event, for lanes at the start of the contact state."""
+    return (state.time == 0.0) & (state.guard_offset != 0.0)
+
+
+def _earliest_dip_fraction(tableau: ButcherTableau, values: list[Array], is_own: Array) -> Array:
+    """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
+    none.
+
+    See `numerics.find_dip`. A guard that starts at its own event is not considered.
+    """
+    has_dip, fraction = find_dip(tableau, values)
+    return jnp.min(jnp.where(has_dip & (values[0] > 0.0) & ~is_own, fraction, 1.0), axis=0)
+
+
+def _lowest_guard(values: Array, is_crossing: Array) -> tuple[Array, Array]:
+    """Return the lowest of the crossing guards, and its value; infinite if none crosses."""
+    lowest, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
+    for index in range(len(values)):
+        is_lower = is_crossing[index] & (values[index] < lowest)
+        lowest, guard = (
+            jnp.where(is_lower, values[index], lowest),
+            jnp.where(is_lower, index, guard),
+        )
+    return guard, lowest
+
+
+def _earliest_secant(
+    search: EventBracket, values: Array, h: Array, is_crossing: Array
+) -> tuple[Array, Array]:
+    """Return the earliest zero of the crossing guards' secants through the last two attempts.
+
+    It also returns the guard. The zero is infinite if no guard falls, and minus infinity if a guard
+    is below zero and no longer falls, because it fell before. The ends of attempts are as accurate
+    as the integration; the inner stage is not.
+    """
+    rate = (values - search.guard_values) / jnp.where(
+        h == search.previous_h, jnp.inf, h - search.previous_h
+    )
+    earliest, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
+    for index in range(len(values)):
+        is_falling = is_crossing[index] & (rate[index] < 0.0)
+        root_h = h - values[index] / jnp.where(is_falling, rate[index], 1.0)
+        has_fallen = is_crossing[index] & ~is_falling & (values[index] < 0.0)
+        root_h = jnp.where(has_fallen, -jnp.inf, root_h)
+        is_earlier = (is_falling | has_fallen) & (root_h < earliest)
+        earliest, guard = (
+            jnp.where(is_earlier, root_h, earliest),
+            jnp.where(is_earlier, index, guard),
+        )
+    return earliest, guard
+
+
+def _earliest_root(
+    g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_own: Array
+) -> tuple[Array, Array]:
+    """Return the earliest zero of the crossing guards' parabolas, in step lengths, and the guard.
+
+    The zero is infinite if no parabola falls ahead. A guard that starts at its own event rises: if
+    its parabola falls at once, the step is too long for parabolas. The zero is minus infinity if
+    such a parabola ends below zero.
+    """
+    discriminant = linear_term * linear_term - 4.0 * curvature * g0
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    is_falling = linear_term < 0.0
+    numerator = jnp.where(is_falling, 2.0 * g0, -linear_term - root)
+    denominator = jnp.where(is_falling, root - linear_term, 2.0 * curvature)
+    root_fraction = numerator / jnp.where(denominator == 0.0, 1.0, denominator)
+    has_root = is_crossing & (discriminant >= 0.0) & (denominator != 0.0) & (root_fraction > 0.0)
+    has_root = has_root & ~(is_own & is_falling)
+    has_fallen = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
+    root_fraction, has_root = jnp.where(has_fallen, -jnp.inf, root_fraction), has_root | has_fallen
+    earliest, guard = (
+        jnp.full_like(root_fraction[0], jnp.inf),
+        jnp.zeros(root_fraction.shape[-1:], jnp.int32),
+    )
+    for index in reversed(range(len(root_fraction))):
+        guard = jnp.where(is_crossing[index], index, guard)
+    for index in range(len(root_fraction)):
+        is_earlier = has_root[index] & (root_fraction[index] < earliest)
+        earliest = jnp.where(is_earlier, root_fraction[index], earliest)
+        guard = jnp.where(is_earlier, index, guard)
+    return earliest, guard

@@ -1,0 +1,322 @@
+"""Motion of the wheel between events, and the guards of the next event."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK, Friction, finite_friction
+from vrw_jax.contact.dynamics_jvp import (
+    ContactConfiguration,
+    ForceSolution,
+    slip_sign,
+    solve_motion,
+)
+from vrw_jax.contact.mechanics import (
+    FootVelocity,
+    LegArray,
+    LegDirections,
+    SlotPair,
+    Slots,
+    WheelMotion,
+    find_slots,
+    foot_heights,
+    foot_positions,
+    foot_velocity,
+    free_leg_motion,
+    make_posture,
+    opaque_one,
+    prevent_fusion,
+    slot_friction,
+    sum_over_legs,
+)
+from vrw_jax.numerics import Elementwise, Scalar
+from vrw_jax.wheel import Symbols
+
+PackedState = Float[Array, "dim ..."]
+"""Hub (x, z, theta) and rates, lengths, rates of lengths, then the accumulators: see
+`Accumulators`."""
+
+
+class Accumulators(NamedTuple):
+    """Integrals along the motion, besides the motion itself."""
+
+    clock: Scalar  # time since the last event, s
+    damping: Scalar  # energy lost in the dampers, J
+    friction: Scalar  # energy lost by sliding, J
+    slip: Scalar  # path length of all sliding feet, m
+
+
+def pack_state(motion: WheelMotion, accumulators: Accumulators) -> PackedState:
+    """Return everything that is integrated as one vector of 10 + 2 n entries."""
+    return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(accumulators)])
+
+
+def unpack_state(state: PackedState) -> tuple[WheelMotion, Accumulators]:
+    """Return motion and accumulators of a vector: the inverse of `pack_state`."""
+    n = (state.shape[0] - 10) // 2
+    L, dL, accumulators = state[6 : 6 + n], state[6 + n : 6 + 2 * n], state[6 + 2 * n :]
+    motion = WheelMotion(state[0], state[1], state[2], state[3], state[4], state[5], L, dL)
+    return motion, Accumulators(accumulators[0], accumulators[1], accumulators[2], accumulators[3])
+
+
+class ContactState(NamedTuple):
+    """Contact modes of the feet, stopper states of the legs, and what has just changed."""
+
+    contact: Int[Array, " n_legs"]  # mode of every foot
+    locked: Bool[Array, " n_legs"]  # legs on their stoppers
+    has_just_lifted: Bool[Array, " n_legs"]  # feet that have just left the ground
+    has_just_unlocked: Bool[Array, " n_legs"]  # legs that have just left their stoppers
+    has_just_slid: Bool[Array, " n_legs"]  # feet that have just begun to slide, from rest
+
+
+class ModeDynamics(NamedTuple):
+    """The wheel in one contact state, with everything that the motion between two events needs."""
+
+    s: Symbols
+    friction: Friction  # of the slots' feet
+    is_one_sided: bool  # airborne legs may leave their stoppers
+    contact_state: ContactState
+    slots: Slots
+    contact: Int[Array, "2"]  # of the slots
+    held: Bool[Array, "2"]  # the slots' legs on their stoppers
+    airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
+    accumulates: bool  # in batches: the accumulators are integrated as well
+    tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
+
+    def configure(self, motion: WheelMotion) -> ContactConfiguration:
+        """Return the contact configuration at this motion."""
+        slots = self.slots, self.contact, self.held, self.airborne
+        return ContactConfiguration(self.s, motion, self.friction, *slots)
+
+
+def make_mode_dynamics(
+    s: Symbols,
+    friction: Friction,
+    is_one_sided: bool,
+    contact_state: ContactState,
+    accumulates: bool = False,
+    tilt: Elementwise | None = None,
+) -> ModeDynamics:
+    """Return the dynamics of the wheel in this contact state."""
+    slots = find_slots(contact_state.contact != CONTACT_OFF)
+    contact, held = (
+        slots.gather_codes(contact_state.contact),
+        slots.gather_flags(contact_state.locked),
+    )
+    airborne = contact_state.locked & ~slots.is_filled
+    friction = slot_friction(friction, slots)
+    return ModeDynamics(
+        s, friction, is_one_sided, contact_state, slots, contact, held, airborne, accumulates, tilt
+    )
+
+
+class ContactForces(NamedTuple):
+    """Contact forces with the leg directions and foot velocities that they depend on."""
+
+    legs: LegDirections
+    free_legs: LegArray  # see `free_legs`
+    solution: ForceSolution
+    foot_velocity: FootVelocity
+
+
+def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces:
+    """Return contact and stopper forces with the resulting accelerations."""
+    unit, posture = opaque_one(motion), make_posture(dynamics.s, motion, dynamics.slots)
+    leg_acceleration = prevent_fusion(free_leg_motion(dynamics.s, motion, posture.legs), unit)
+    velocity = prevent_fusion(foot_velocity(motion, dynamics.slots, posture), unit)
+    return ContactForces(
+        posture.legs, leg_acceleration, solve_motion(dynamics.configure(motion)), velocity
+    )
+
+
+def _free_outward_acceleration(forces: ContactForces) -> LegArray:
+    """Return the acceleration of each leg's length without forces of slots and stoppers, m/s^2."""
+    sin, cos = forces.legs
+    ax, az, _ = forces.solution.hub
+    return forces.free_legs + sin * ax + cos * az
+
+
+def airborne_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> LegArray:
+    """Return the stopper force of locked legs in the air, N; 0 for the other legs."""
+    return jnp.where(dynamics.airborne, dynamics.s.m * _free_outward_acceleration(forces), 0.0)
+
+
+def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementwise:
+    """Return the minimum of `airborne_stopper_force`; infinite if no leg in the air is locked."""
+    return jnp.min(
+        jnp.where(dynamics.airborne, airborne_stopper_force(dynamics, forces), jnp.inf), axis=0
+    )
+
+
+def accumulator_rates(
+    dynamics: ModeDynamics, motion: WheelMotion, forces: ContactForces
+) -> Accumulators:
+    """Return the rates of the accumulators."""
+    direction = slip_sign(dynamics.contact)
+    speeds = [direction[i] * forces.foot_velocity.x[i] for i in range(2)]
+    friction_force = [-forces.solution.tangential[i] * direction[i] for i in range(2)]
+    return Accumulators(
+        clock=jnp.ones_like(motion.x),
+        damping=dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
+        friction=friction_force[0] * speeds[0] + friction_force[1] * speeds[1],
+        slip=speeds[0] + speeds[1],
+    )
+
+
+def vector_field(dynamics: ModeDynamics, state: PackedState) -> PackedState:
+    """Return the time derivative of the packed state."""
+    motion, _ = unpack_state(state)
+    current_forces = compute_forces(dynamics, motion)
+    rates = WheelMotion(
+        motion.vx,
+        motion.vz,
+        motion.dtheta,
+        *current_forces.solution.hub,
+        jnp.where(dynamics.contact_state.locked, 0.0, motion.dL),
+        current_forces.solution.lengths,
+    )
+    return prevent_fusion(
+        pack_state(rates, accumulator_rates(dynamics, motion, current_forces)), opaque_one(motion)
+    )
+
+
+class GuardLayout(NamedTuple):
+    """Index at which each kind of guard begins in the list of `guard_values`."""
+
+    landing: int  # heights of airborne feet, one per leg: zero at a landing
+    stopper: int  # distance to the stopper, one per leg
+    liftoff: int  # normal force, one per slot
+    slip_up: int  # friction margin before the foot slides uphill, one per slot
+    slip_down: int  # the same before it slides downhill
+    slip_stop: int  # speed of a sliding foot, one per slot
+    stopper_release: int  # stopper force of a loaded leg, one per slot
+    rolling_rate: int  # dtheta
+    collapse: int  # shortest leg minus a
+    airborne_release: int  # stopper force of airborne legs, one per leg, if one-sided
+    total: int
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs of the wheel."""
+        return self.stopper - self.landing
+
+    @property
+    def foremost_landing(self) -> int:
+        """Guard of the foremost foot, whose landing ends a step."""
+        return self.stopper - 1
+
+
+def make_guard_layout(n: int, is_one_sided: bool) -> GuardLayout:
+    """Return the guard layout of a wheel with `n` legs."""
+    sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if is_one_sided else 0)
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
+    return GuardLayout(*(int(offset) for offset in offsets))
+
+
+class ContactQuantities(NamedTuple):
+    """Quantities that determine the duration of a contact state, besides the motion itself."""
+
+    legs: LegDirections
+    normal: SlotPair
+    tangential: SlotPair
+    stopper: SlotPair
+    slip_speed: SlotPair  # of the slots' feet along the slope
+    painleve_determinant: Array  # see `contacts.ContactSolution`
+    airborne_stopper: LegArray | None  # stopper force of legs in the air, if stoppers are one-sided
+
+
+def contact_quantities(dynamics: ModeDynamics, forces: ContactForces) -> ContactQuantities:
+    """Return the quantities of the forces that `evaluate_guards` needs."""
+    solution = forces.solution
+    airborne_stopper = airborne_stopper_force(dynamics, forces) if dynamics.is_one_sided else None
+    force_pairs = solution.normal, solution.tangential, solution.stopper
+    return ContactQuantities(
+        forces.legs,
+        *force_pairs,
+        forces.foot_velocity.x,
+        solution.painleve_determinant,
+        airborne_stopper,
+    )
+
+
+def stack_friction(friction: Friction) -> Array:
+    """Return the slots' friction as one array, if it differs between slots."""
+    return jnp.stack(friction) if isinstance(friction, tuple) else friction
+
+
+def _heights_above_ground(
+    dynamics: ModeDynamics, motion: WheelMotion, legs: LegDirections
+) -> LegArray:
+    """Return the height of every foot above its ground, m; the ground ahead begins under foot 1."""
+    heights = foot_heights(motion, legs)
+    if dynamics.tilt is None:
+        return heights
+    positions = foot_positions(motion, legs)
+    foremost_height = heights[-1] * jnp.cos(dynamics.tilt) + (
+        positions[-1] - positions[0]
+    ) * jnp.sin(dynamics.tilt)
+    return heights.at[-1].set(foremost_height)
+
+
+def evaluate_guards(
+    dynamics: ModeDynamics, motion: WheelMotion, quantities: ContactQuantities, has_begun: Array
+) -> list[Array]:
+    """Return the guards in the order of `GuardLayout`.
+
+    - `has_begun`: False at the start of the contact state.
+
+    The last event leaves its own guard at zero: of a foot off the ground, a leg off its stopper, or
+    a sliding foot. That guard is not evaluated at that instant.
+    """
+    s, contact_state = dynamics.s, dynamics.contact_state
+    ones = jnp.ones_like(motion.L)
+    is_airborne = (contact_state.contact == CONTACT_OFF) & (
+        has_begun | ~contact_state.has_just_lifted
+    )
+    is_free_leg = ~contact_state.locked & (has_begun | ~contact_state.has_just_unlocked)
+    has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
+    coefficient = stack_friction(finite_friction(dynamics.friction))
+    normal, tangential = jnp.stack(quantities.normal), jnp.stack(quantities.tangential)
+    # In the limit of large friction a resting foot begins to slide where its normal force
+    # vanishes, see `events.resolve_event`; a sliding foot lifts where its friction vanishes.
+    is_limit = stack_friction(dynamics.friction) == jnp.inf
+    direction = jnp.stack(slip_sign(dynamics.contact))
+    pressure = jnp.where(is_limit & (direction != 0.0), -direction * tangential, normal)
+    has_cone = (dynamics.contact == CONTACT_STICK) & jnp.isfinite(stack_friction(dynamics.friction))
+    is_sliding = (direction != 0.0) & (has_begun | ~has_just_slid)
+    if_watched = lambda condition, value: jnp.where(condition, value, 1.0)
+    airborne_guards = (
+        []
+        if quantities.airborne_stopper is None
+        else [jnp.where(dynamics.airborne, quantities.airborne_stopper, ones)]
+    )
+    return [
+        jnp.where(is_airborne, _heights_above_ground(dynamics, motion, quantities.legs), ones),
+        jnp.where(is_free_leg, s.L0 - motion.L, ones),
+        if_watched(dynamics.contact != CONTACT_OFF, pressure),
+        if_watched(has_cone, coefficient * normal - tangential),
+        if_watched(has_cone, coefficient * normal + tangential),
+        if_watched(is_sliding, direction * jnp.stack(quantities.slip_speed)),
+        if_watched(dynamics.held, jnp.stack(quantities.stopper)),
+        motion.dtheta[None],
+        (jnp.min(motion.L, axis=0) - s.a)[None],
+        *airborne_guards,
+    ]
+
+
+def guard_scales(dynamics: ModeDynamics) -> Array:
+    """Return the scale of each guard, in the order of `GuardLayout`: m, N, m/s, rad/s."""
+    s = dynamics.s
+    weight, speed = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
+    scales = [s.L0] * 2 * s.n + [weight] * 6 + [speed] * 2 + [weight] * 2 + [speed / s.L0, s.L0]
+    return jnp.stack(scales + [weight] * s.n * dynamics.is_one_sided)
+
+
+def guard_values(dynamics: ModeDynamics, state: PackedState) -> Float[Array, " n_guards"]:
+    """Return all guards: positive inside the contact state, zero at its end, 1 if not evaluated."""
+    motion, accumulators = unpack_state(state)
+    quantities = contact_quantities(dynamics, compute_forces(dynamics, motion))
+    guard_parts = evaluate_guards(dynamics, motion, quantities, accumulators.clock > 0.0)
+    return jnp.concatenate(prevent_fusion(guard_parts, opaque_one(motion)))

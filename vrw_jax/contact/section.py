@@ -1,0 +1,138 @@
+"""Full section state of the unilateral model as one vector, and the embedding of the paper's
+state.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact.contact_state import ContactState
+from vrw_jax.contact.mechanics import WheelMotion, leg_directions
+from vrw_jax.models import PAPER_START, is_valid_start, replace_invalid
+from vrw_jax.numerics import Elementwise
+from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
+
+FullState = Float[Array, "n_full ..."]
+"""(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
+foremost foot lands, in the leg labels of the ending step: rad, rad/s, hub m/s, m, m/s.
+
+A leg's code is its foot's mode (0 in the air, 1 at rest, 2 sliding downhill, 3 uphill), plus 4 on
+its stopper. The hub's height follows from the landing foot's.
+"""
+
+LOCKED_CODE_OFFSET = 4
+"""Offset of a leg's code on its stopper."""
+
+
+def full_section_size(n: int) -> int:
+    """Return the length of a full section state of a wheel with `n` legs."""
+    return 4 + 3 * n
+
+
+def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
+    """Return the full section state of the paper's one: Leg 1 planted, all other legs on their
+    stoppers.
+    """
+    theta, dtheta, dL1 = x
+    sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
+    is_leg_1 = (jnp.arange(s.n) == 0).reshape(-1, *(1,) * theta.ndim)
+    vx, vz = dL1 * sin + L1 * dtheta * cos, dL1 * cos - L1 * dtheta * sin
+    return jnp.concatenate(
+        [
+            jnp.stack([theta, dtheta, vx, vz]),
+            jnp.where(is_leg_1, L1, s.L0),
+            jnp.where(is_leg_1, dL1, 0.0),
+            jnp.where(
+                is_leg_1, float(CONTACT_STICK), LOCKED_CODE_OFFSET + CONTACT_OFF + 0.0 * theta
+            ),
+        ]
+    )
+
+
+def replace_invalid_start(
+    params: WheelParams, friction: Elementwise, x: FullState, is_even_ground: bool = True
+) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
+    """Return whether a step may begin at this input, and the input or, if not, a valid substitute.
+
+    If the ground is uneven, feet may be below the extended line of the next foothold's slope.
+    """
+    safe_state = embed_section_state(
+        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
+    )
+    safe_x = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
+    is_valid = is_valid_start(params, x) & (friction >= 0.0)
+    is_valid = is_valid & _is_possible(params.symbols(), x) if is_even_ground else is_valid
+    params, x = replace_invalid(is_valid, params, x, safe_x)
+    return is_valid, params, jnp.where(is_valid, friction, 1.0), x
+
+
+PENETRATION_TOLERANCE = 1e-3
+"""Largest accepted error of a start, as a fraction of the leg length: larger than the errors of
+integration and Newton's method, and small enough for the first events to correct it."""
+
+
+def _unpack_posture(
+    s: Symbols, x: FullState
+) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
+    """Return angle, hub position, lengths, length rates, contact modes and stoppers of a section
+    state.
+
+    Leg labels are those of the starting step. Loaded feet are on the slope, and the landing foot is
+    the origin.
+    """
+    n = s.n
+    theta = x[0] - s.alpha
+    leg_rows = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
+    L, dL, code = (jnp.concatenate([row[-1:], row[:-1]]) for row in leg_rows)
+    code = jnp.floor(code + 0.5).astype(jnp.int32)
+    contact, locked = code & (LOCKED_CODE_OFFSET - 1), code >= LOCKED_CODE_OFFSET
+    L = jnp.where(locked, s.L0, L)
+    legs = leg_directions(s, theta)
+    hub = L[0] * legs.sin[0], L[0] * legs.cos[0]
+    L = jnp.where((contact != CONTACT_OFF) & ~locked, hub[1] / legs.cos, L)
+    return theta, hub, L, dL, contact, locked
+
+
+def _is_possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
+    """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long."""
+    theta, (_, z), L, _, contact, _ = _unpack_posture(s, x)
+    height, tolerance = z - L * leg_directions(s, theta).cos, PENETRATION_TOLERANCE * s.L0
+    is_contact_consistent = (contact == CONTACT_OFF) | (height <= tolerance)
+    return jnp.all((height >= -tolerance) & is_contact_consistent & (tolerance >= L - s.L0), axis=0)
+
+
+def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, ContactState]:
+    """Return motion and contact state just before the landing, in the leg labels of the starting
+    step.
+
+    The landing foot is the origin. Loaded feet are placed on the slope, so that every vector near a
+    section state is one. The landing brings sticking feet to rest.
+    """
+    theta, (hub_x, hub_z), L, dL, contact, locked = _unpack_posture(s, x)
+    dtheta, vx, vz = x[1], x[2], x[3]
+    motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
+    no_legs = locked & False
+    return motion, ContactState(contact, locked, no_legs, no_legs, no_legs)
+
+
+def pack_section_state(
+    motion: WheelMotion, contact_state: ContactState, tilt: Elementwise | None = None
+) -> FullState:
+    """Return the section state of a motion just before the next landing, in the slope's frame
+    there.
+
+    - `tilt`: by which the ground ahead is steeper, if it is.
+    """
+    code = contact_state.contact + LOCKED_CODE_OFFSET * contact_state.locked
+    theta, vx, vz = motion.theta, motion.vx, motion.vz
+    if tilt is not None:
+        sin, cos = jnp.sin(tilt), jnp.cos(tilt)
+        theta, vx, vz = theta - tilt, vx * cos - vz * sin, vz * cos + vx * sin
+    return jnp.concatenate(
+        [
+            jnp.stack([theta, motion.dtheta, vx, vz]),
+            motion.L,
+            motion.dL,
+            code.astype(motion.L.dtype),
+        ]
+    )

@@ -1,0 +1,344 @@
+"""Record of a step with unilateral contact, for one wheel or, elementwise, for a batch.
+
+A step is a sequence of events, each followed by an interval in which no contact changes. Its first
+event is the opening landing; the step is complete when the foremost foot lands.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.contact.contact_modes import CONTACT_OFF, PAPER_RULE_SENTINEL, Friction
+from vrw_jax.contact.contact_state import Accumulators, ContactState, GuardLayout
+from vrw_jax.contact.impacts import (
+    ContactLaw,
+    Event,
+    EventResult,
+    classify_event,
+    project_motion,
+    resolve_event,
+)
+from vrw_jax.contact.mechanics import WheelMotion, landing_position
+from vrw_jax.contact.section import FullState, pack_section_state
+from vrw_jax.measures import STOPPER_MARGIN_MEASURES
+from vrw_jax.models import AbstractContactStep
+from vrw_jax.numerics import Elementwise, StepOptions, tree_where
+from vrw_jax.wheel import Outcome, Symbols
+
+DIP_DEPTH_PER_ATOL, MIN_DIP_EPS = 1e-2, 4e2
+"""Smallest depth of a followed dip: the first as a fraction of the tolerance, the second in
+rounding units of a leg's length, 1e-13 m in float64."""
+REST_SPEED_RAMP_START = 100
+"""Number of events of a step after which each further event raises the rest speed by its initial
+value; a quarter of the allowed events if that is more. Walks make 4 to 60 events, and chains of
+ever smaller dips make hundreds, which this ends where a tolerance would continue them. Of 400
+events, the last dip is as large as a tolerance of 1e-6 leaves from the first."""
+
+
+def min_dip_depth(L0: Elementwise, options: StepOptions) -> Array:
+    """Return the smallest depth of a dip that a step follows, m."""
+    return jnp.maximum(
+        DIP_DEPTH_PER_ATOL * options.atol, MIN_DIP_EPS * jnp.finfo(L0.dtype).eps * L0
+    )
+
+
+def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
+    """Return friction with `PAPER_RULE_SENTINEL` in place of infinity under the paper's rule."""
+    return (
+        jnp.where(friction == jnp.inf, PAPER_RULE_SENTINEL, friction)
+        if uses_paper_rule
+        else friction
+    )
+
+
+def make_contact_law(
+    s: Symbols,
+    friction: Friction,
+    options: StepOptions,
+    is_one_sided: bool,
+    counts_solutions: bool,
+    restitution: Elementwise | None = None,
+    tilt: Elementwise | None = None,
+) -> ContactLaw:
+    """Return the contact law of a walk; the rest speed is that of the smallest dip under
+    gravity.
+    """
+    rest_speed = jnp.sqrt(2.0 * s.g * min_dip_depth(s.L0, options))
+    return ContactLaw(s, friction, is_one_sided, counts_solutions, rest_speed, restitution, tilt)
+
+
+def process_event(
+    law: ContactLaw,
+    layout: GuardLayout,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    guard: Int[Array, "..."],
+    n_events: Int[Array, "..."],
+    max_events: int,
+) -> tuple[EventResult, Event, Int[Array, "..."]]:
+    """Return the result of a guard's event, the event, and STEPPED if it was resolved.
+
+    - `n_events`: number of earlier events in this step, of at most `max_events`.
+
+    The integrator lets feet drift by its error, so the motion is projected onto its contacts first.
+    A foot that lifts off rises like the third power of time, from the slope and from rest; without
+    the projection it would land again at once.
+    """
+    ramp_start = max(REST_SPEED_RAMP_START, max_events // 4)
+    law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
+    motion, event = (
+        project_motion(law.s, motion, contact_state.contact, contact_state.locked),
+        classify_event(layout, guard),
+    )
+    result = resolve_event(law, motion, contact_state, event)
+    outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
+    outcome = jnp.where(result.is_paradox, Outcome.PAINLEVE_PARADOX, outcome)
+    outcome = jnp.where(result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
+    return result, event, outcome.astype(jnp.int32)
+
+
+class UnilateralMargins(eqx.Module):
+    """Margins of bilateral stoppers over one step.
+
+    Negative where a one-sided stopper would have released a leg in the air.
+    """
+
+    stopper_force: Elementwise  # minimum over locked legs in the air, N
+    stopper_impulse: Elementwise  # minimum over locked legs in the air, N s
+
+
+class StepCounters(NamedTuple):
+    """Counters and durations of a step."""
+
+    n_events: Int[Array, "..."]  # contacts and stoppers that changed
+    durations: Float[Array, "3 ..."]  # with two loaded feet, one, none, s
+    n_solver_steps: Int[Array, "..."]  # attempted
+
+
+def init_counters(reference: Array) -> StepCounters:
+    """Return the counters at the start of a step, for wheels of the shape and dtype of the
+    argument.
+    """
+    zero_count = jnp.zeros(reference.shape, jnp.int32)
+    return StepCounters(zero_count, jnp.zeros((3, *reference.shape), reference.dtype), zero_count)
+
+
+def add_interval(
+    counters: StepCounters,
+    contact_state: ContactState,
+    duration: Elementwise,
+    n_solver_steps: Array,
+) -> StepCounters:
+    """Return the counters after one more interval in this contact state."""
+    n_loaded = jnp.sum(contact_state.contact != CONTACT_OFF, axis=0)
+    has_n_feet = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
+    durations = counters.durations + jnp.where(has_n_feet, duration, 0.0)
+    return counters._replace(
+        durations=durations, n_solver_steps=counters.n_solver_steps + n_solver_steps
+    )
+
+
+def interval_outcome(
+    counters: StepCounters,
+    layout: GuardLayout,
+    is_at_event: Array,
+    guard: Array,
+    has_landed: Array,
+    failure: Array,
+    max_events: int,
+) -> Int[Array, "..."]:
+    """Return STEPPED if the walk continues from the guard or the foremost foot `has_landed`.
+
+    If the interval ended at no event, the result is `failure`.
+    """
+    code = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
+    code = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, code)
+    code = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, code)
+    return jnp.where(is_at_event, jnp.where(has_landed, Outcome.STEPPED, code), failure)
+
+
+class StepDetails(NamedTuple):
+    """Further results of a step, named as in `UnilateralStep`."""
+
+    post_impact: Float[Array, "2 ..."]
+    mode_durations: Float[Array, "4 4 ..."]
+    landing_normal: Float[Array, "2 ..."]
+    landing_tangential: Float[Array, "2 ..."]
+    energy_impacts: Elementwise
+    margins: UnilateralMargins
+    impacts: Int[Array, "..."]
+    fewest_solutions: Int[Array, "..."]
+    most_solutions: Int[Array, "..."]
+
+
+def init_details(dtype: jnp.dtype) -> StepDetails:
+    """Return the details of one wheel at the start of a step."""
+    zero, zero_count = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    pair = jnp.zeros((2,), dtype)
+    return StepDetails(
+        post_impact=pair,
+        mode_durations=jnp.zeros((4, 4), dtype),
+        landing_normal=pair,
+        landing_tangential=pair,
+        energy_impacts=zero,
+        margins=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
+        impacts=zero_count,
+        fewest_solutions=zero_count + jnp.iinfo(jnp.int32).max,
+        most_solutions=zero_count,
+    )
+
+
+def record_event(
+    details: StepDetails, is_first: Array, result: EventResult, event: Event
+) -> StepDetails:
+    """Return the details after one more event.
+
+    - `is_first`: whether the event is the first of the step.
+    """
+    opening = (
+        jnp.stack([result.motion.theta, result.motion.dtheta]),
+        jnp.stack(result.normal_impulse),
+        jnp.stack(result.tangential_impulse),
+    )
+    previous = details.post_impact, details.landing_normal, details.landing_tangential
+    post_impact, normal, tangential = tree_where(is_first, opening, previous)
+    impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
+    return details._replace(
+        post_impact=post_impact,
+        landing_normal=normal,
+        landing_tangential=tangential,
+        energy_impacts=details.energy_impacts + result.energy_lost,
+        margins=UnilateralMargins(details.margins.stopper_force, impulse),
+        impacts=details.impacts + event.is_impact,
+        fewest_solutions=jnp.minimum(details.fewest_solutions, result.n_solutions),
+        most_solutions=jnp.maximum(details.most_solutions, result.most_solutions),
+    )
+
+
+def record_interval(
+    details: StepDetails,
+    contact: Int[Array, "2 ..."],
+    duration: Elementwise,
+    stopper_force: Elementwise,
+) -> StepDetails:
+    """Return the details after one more interval.
+
+    They gain the durations of the slots' modes, and the minimum stopper force of legs in the air at
+    the ends of the interval.
+    """
+    modes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
+    first_mode, second_mode = (
+        (modes == contact[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
+    )
+    stopper_force = jnp.minimum(details.margins.stopper_force, stopper_force)
+    return details._replace(
+        mode_durations=details.mode_durations
+        + first_mode[:, None] * second_mode[None, :] * duration,
+        margins=UnilateralMargins(stopper_force, details.margins.stopper_impulse),
+    )
+
+
+class UnilateralStep(AbstractContactStep):
+    """One step, from the landing of the foremost foot to the next. Batched under vmap.
+
+    Fields of a step whose outcome is not STEPPED are finite and describe the partial motion; its
+    `section_state` is all zeros, which is not a valid section state.
+
+    - `section_state`: just before the next landing;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: with two feet loaded, with one, with none, s;
+    - `mode_durations`: by mode of the first and second loaded foot, s;
+    - `step_length`: between the places of the two landings, m;
+    - `landing_normal`: normal impulses of the opening landing, N s;
+    - `landing_tangential`: tangential ones; fore and rear foot;
+    - `energy_impacts`: lost in impacts, J;
+    - `energy_damping`: lost in the dampers, J;
+    - `energy_friction`: lost by sliding between impacts, J;
+    - `slip`: path length of sliding feet, m;
+    - `events`: number of changes of contacts and stoppers;
+    - `impacts`: number of events in which velocities jumped;
+    - `fewest_solutions`, `most_solutions`: numbers of admissible combinations at an event: 1 if
+      well posed;
+    - `margins`: of the assumptions of this model;
+    - `outcome`: an Outcome;
+    - `solver_steps`: attempted solver steps;
+    - `engine`: name of the engine, see `StepOptions`.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.energy_friction:.1f} J lost by sliding")
+        1.3 J lost by sliding
+    """
+
+    section_state: FullState
+    post_impact: Float[Array, "2 ..."]
+    durations: Float[Array, "3 ..."]
+    mode_durations: Float[Array, "4 4 ..."]
+    step_length: Elementwise
+    landing_normal: Float[Array, "2 ..."]
+    landing_tangential: Float[Array, "2 ..."]
+    energy_impacts: Elementwise
+    energy_damping: Elementwise
+    energy_friction: Elementwise
+    slip: Elementwise
+    margins: UnilateralMargins
+    events: Int[Array, "..."]
+    impacts: Int[Array, "..."]
+    fewest_solutions: Int[Array, "..."]
+    most_solutions: Int[Array, "..."]
+    outcome: Int[Array, "..."]
+    solver_steps: Int[Array, "..."]
+    engine: str = eqx.field(static=True, default="")
+
+    def model_measures(self) -> dict[str, Array]:
+        return AbstractContactStep.model_measures(self) | {
+            name: getattr(self.margins, name) for name in STOPPER_MARGIN_MEASURES
+        }
+
+
+def final_section_state(
+    motion: WheelMotion,
+    contact_state: ContactState,
+    outcome: Array,
+    tilt: Elementwise | None = None,
+) -> FullState:
+    """Return the section state at the end of a step; zeros if it failed."""
+    x = pack_section_state(motion, contact_state, tilt)
+    return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
+
+
+def make_unilateral_step(
+    motion: WheelMotion,
+    contact_state: ContactState,
+    accumulators: Accumulators,
+    counters: StepCounters,
+    details: StepDetails,
+    outcome: Array,
+    engine: str,
+    tilt: Elementwise | None = None,
+) -> UnilateralStep:
+    """Return the step of this final state and these records."""
+    landing = landing_position(motion.L.shape[0], motion)
+    finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
+    details = details._replace(
+        margins=jax.tree.map(finite, details.margins),
+        fewest_solutions=jnp.where(counters.n_events > 0, details.fewest_solutions, 0),
+    )
+    return UnilateralStep(
+        section_state=final_section_state(motion, contact_state, outcome, tilt),
+        durations=counters.durations,
+        step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
+        energy_damping=accumulators.damping,
+        energy_friction=accumulators.friction,
+        slip=accumulators.slip,
+        events=counters.n_events,
+        outcome=outcome,
+        solver_steps=counters.n_solver_steps,
+        engine=engine,
+        **details._asdict(),
+    )

@@ -1,0 +1,505 @@
+"""Unilateral model: one-sided contacts with Coulomb friction, in any order of events."""
+
+import dataclasses
+import functools
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.contact.batch_integrator import is_at_singularity
+from vrw_jax.contact.contact_modes import Friction
+from vrw_jax.contact.contact_state import (
+    Accumulators,
+    ContactState,
+    GuardLayout,
+    PackedState,
+    compute_forces,
+    guard_scales,
+    guard_values,
+    make_guard_layout,
+    make_mode_dynamics,
+    min_stopper_force,
+    pack_state,
+    unpack_state,
+    vector_field,
+)
+from vrw_jax.contact.impacts import ContactLaw
+from vrw_jax.contact.mechanics import landing_position
+from vrw_jax.contact.section import (
+    FullState,
+    embed_section_state,
+    full_section_size,
+    replace_invalid_start,
+    unpack_section_state,
+)
+from vrw_jax.contact.single_step import (
+    IntervalLog,
+    SampledIntervals,
+    build_contact_step_function,
+    build_contact_step_jacobian,
+    build_contact_step_sampler,
+)
+from vrw_jax.contact.step_record import (
+    StepCounters,
+    StepDetails,
+    UnilateralStep,
+    add_interval,
+    apply_friction_rule,
+    final_section_state,
+    init_counters,
+    init_details,
+    interval_outcome,
+    make_contact_law,
+    make_unilateral_step,
+    process_event,
+    record_event,
+    record_interval,
+)
+from vrw_jax.contact.walk_kernel import StepSummary
+from vrw_jax.hybrid import MonitoredFunctions, integrate_phase, sample_phase
+from vrw_jax.models import PAPER_START, AbstractWheel, AdvanceResult, StepGround, can_use_lanes
+from vrw_jax.numerics import (
+    Elementwise,
+    ForwardFunction,
+    RealInput,
+    Scalar,
+    StepOptions,
+    enable_all_ad_modes,
+    opaque_condition,
+)
+from vrw_jax.validation import check_choice, check_int, check_reals
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+
+STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
+"""Effect of stoppers on legs in the air: they hold with any force, or only push."""
+FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
+"""Meaning of infinite friction: the limit of large friction, or the paper's rule (A1)-(A4)."""
+
+
+class UnilateralTrajectory(eqx.Module):
+    """The motion of one step between its events. Axes: phase, sample.
+
+    A phase that did not happen has duration 0. The origin is the position of the opening landing.
+    """
+
+    time: Float[Array, "phases n"]  # from the landing, s
+    state: Float[Array, "phases n dim"]  # see `motion.unpack_state`
+    contact: Int[Array, "phases legs"]  # mode of every foot
+    locked: Bool[Array, "phases legs"]  # on the stopper
+    tangential: Float[Array, "phases n legs"]  # force on every foot, N
+    normal: Float[Array, "phases n legs"]
+    duration: Float[Array, " phases"]  # s
+    section_state: FullState  # after the step
+    step_length: Scalar
+    outcome: Int[Array, ""]
+    model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
+
+
+class _EventLoopState(NamedTuple):
+    """State of the event loop between two events of a step."""
+
+    state: PackedState
+    contact_state: ContactState
+    guard: Int[Array, ""]  # of the last event
+    outcome: Int[Array, ""]
+    is_running: Bool[Array, ""]
+    counters: StepCounters
+    details: StepDetails | None
+    log: IntervalLog | None
+
+
+class UnevenGround(NamedTuple):
+    """Uneven ground: quantities of a step besides the ground of its own landing."""
+
+    friction: Scalar  # of the feet that landed before
+    tilt: Scalar  # by which the ground ahead is steeper, rad
+
+
+def _convert_restitution(value: Any) -> Array | None:
+    """Return Newton's coefficient of restitution; None means 0.
+
+    Raises `ValueError` for a number outside [0, 1].
+    """
+    if value is None or (isinstance(value, float | int) and value == 0):
+        return None
+    restitution = check_reals("restitution", value)
+    if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
+        (restitution >= 0.0) & (restitution <= 1.0)
+    ):
+        raise ValueError(f"restitution is {value}, but feet come back at 0 to 1 of their speed.")
+    return restitution
+
+
+class UnilateralWheel(AbstractWheel):
+    """Feet push on the ground and slide by Coulomb's law; no leg has a fixed role.
+
+    - `friction`: coefficient of the ground, `inf` for feet that never slide;
+    - `max_events`: largest number of events of one step; after a quarter of them (at least 100),
+      the rest speed grows with each event;
+    - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays on it until its
+      foot is loaded; with "one-sided", it leaves as soon as the stopper would have to pull;
+    - `restitution`: ratio of a striking foot's speed after to its speed before, as far as energy
+      allows; None has the effect of 0 and compiles to a smaller program;
+    - `infinite_friction_rule`: meaning of infinite friction: the limit of large friction, or with
+      "paper" the rule of the paper, (A1) to (A4), continued to where it stops;
+    - `uneven_ground`: what differs between footholds; `vrw.walk` sets it from slopes and friction
+      over steps.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.slip:.2f} m of slip, {vrw.Outcome(int(step.outcome)).name}")
+        0.04 m of slip, STEPPED
+    """
+
+    model_name: ClassVar[str] = "unilateral"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
+    batch_kernel: ClassVar[str] = "legs"
+
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+    max_events: int = eqx.field(
+        static=True, converter=partial(check_int, "max_events"), default=400
+    )
+    stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
+    restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
+    infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
+    uneven: UnevenGround | None = None
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            friction: RealInput = 0.7,
+            max_events: int = 400,
+            stoppers: Literal["bilateral", "one-sided"] = "bilateral",
+            restitution: RealInput | None = None,
+            infinite_friction_rule: Literal["limit", "paper"] = "limit",
+            uneven: UnevenGround | None = None,
+        ) -> None: ...
+
+    def __check_init__(self) -> None:
+        check_choice("stoppers", self.stoppers, (STOPPERS_BILATERAL, STOPPERS_ONE_SIDED))
+        check_choice(
+            "infinite_friction_rule",
+            self.infinite_friction_rule,
+            (FRICTION_LIMIT, FRICTION_PAPER_RULE),
+        )
+
+    @property
+    def has_one_sided_stoppers(self) -> bool:
+        """Whether stoppers of legs in the air may release them."""
+        return self.stoppers == STOPPERS_ONE_SIDED
+
+    @property
+    def uses_paper_rule(self) -> bool:
+        """Whether infinite friction means the paper's rule."""
+        return self.infinite_friction_rule == FRICTION_PAPER_RULE
+
+    def default_start(self, params: WheelParams) -> FullState:
+        """Return a start close to the paper's gait of Table 1."""
+        return embed_section_state(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
+
+    def section_size(self, params: WheelParams) -> int:
+        return full_section_size(params.n_legs)
+
+    def n_continuous(self, params: WheelParams) -> int:
+        return full_section_size(params.n_legs) - params.n_legs
+
+    def embed_section(self, params: WheelParams, x: Array) -> FullState:
+        """Return the full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
+        return _embedded(params, x) if x.shape == (3,) else x
+
+    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
+        step_shape, inputs = (n_steps,), (params.slope, self.friction)
+        if not any(value.shape == step_shape for value in inputs):
+            return None
+        slope, friction = (jnp.broadcast_to(value, step_shape) for value in inputs)
+        next_slope = jnp.append(slope[1:], slope[-1:])
+        previous_friction = jnp.append(friction[:1], friction[:-1])
+        return slope, friction, previous_friction, next_slope - slope
+
+    def with_ground(
+        self, params: WheelParams, ground: StepGround
+    ) -> tuple["UnilateralWheel", WheelParams]:
+        slope, friction, previous_friction, tilt = ground
+        model = dataclasses.replace(
+            self, friction=friction, uneven=UnevenGround(previous_friction, tilt)
+        )
+        return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
+
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        outputs, engine = self._compute_step(params, x, options, is_detailed=False)
+        section_state, durations, outcome, solver_steps = outputs
+        return AdvanceResult(section_state, durations, outcome, solver_steps, engine=engine)
+
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> UnilateralStep:
+        return self._compute_step(params, x, options, is_detailed=True)[0]
+
+    def _compute_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
+    ) -> tuple[Any, str]:
+        """Return the outputs of a step, and the engine that took it."""
+        (leaves, structure), engine = self._leaves(params, x, options), self._engine(options)
+        return eqx.combine(*_compile_step(structure, is_detailed, engine)(*leaves)), engine
+
+    def _leaves(self, params: WheelParams, x: FullState, options: StepOptions) -> tuple[list, Any]:
+        """Return the leaves and the tree structure of (wheel, params, x, options)."""
+        # Not by `replace`: friction is already validated and may be traced.
+        model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
+        return jax.tree.flatten((model, params, x, options))
+
+    def _engine(self, options: StepOptions) -> str:
+        """Return the name of the engine for these options."""
+        return (
+            "lanes"
+            if self._is_supported_by_lanes(options) and can_use_lanes(options)
+            else "diffrax"
+        )
+
+    def _is_supported_by_lanes(self, options: StepOptions) -> bool:
+        """Return whether the batch kernel supports this ground.
+
+        Raises `ValueError` if the options require that engine and it does not.
+        """
+        is_supported = self.restitution is None and self.uneven is None
+        if options.engine == "lanes" and not is_supported:
+            raise ValueError(
+                "engine is 'lanes', but lanes know neither feet that come back nor ground that "
+                "varies from step to step: take engine='auto' or 'diffrax'."
+            )
+        return is_supported
+
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> UnilateralTrajectory:
+        if self._engine(options) == "lanes":
+            leaves, structure = self._leaves(params, x, options)
+            samples = build_contact_step_sampler(structure, n_samples)(*leaves)
+        else:
+            samples = self._sample_with_diffrax(params, x, options, n_samples)
+        log, summary = samples.log, samples.ends
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
+        return UnilateralTrajectory(
+            time=start_times[:, None] + jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None],
+            state=samples.state,
+            contact=log.contact,
+            locked=log.locked,
+            tangential=samples.tangential,
+            normal=samples.normal,
+            duration=log.duration,
+            section_state=summary.section_state,
+            step_length=summary.step_length,
+            outcome=samples.outcome,
+        )
+
+    def _sample_with_diffrax(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> SampledIntervals:
+        """Return the sampled step, integrated by diffrax."""
+        loop_state = _run_event_loop(self, params, x, options, is_detailed=False, has_log=True)
+        log, outcome = loop_state.log, loop_state.outcome
+        assert log is not None
+        tilt = None if self.uneven is None else self.uneven.tilt
+        s, friction = params.symbols(), _foot_friction(self, self.friction)
+
+        def sample_phase_of_log(log: IntervalLog) -> tuple:
+            no_legs = jnp.zeros((s.n,), bool)
+            dynamics = make_mode_dynamics(
+                s, friction, False, ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
+            )
+            arguments = partial(vector_field, dynamics), log.state, log.duration, n_samples, options
+
+            def foot_forces(state: PackedState) -> tuple:
+                solution = compute_forces(dynamics, unpack_state(state)[0]).solution
+                return dynamics.slots.scatter(solution.tangential), dynamics.slots.scatter(
+                    solution.normal
+                )
+
+            states = sample_phase(*arguments)
+            return states, *jax.vmap(foot_forces)(states)
+
+        section_state, durations, *_ = _minimal_result(loop_state, tilt)
+        position = landing_position(s.n, unpack_state(loop_state.state)[0])
+        step_length = jnp.where(outcome == Outcome.STEPPED, position, 0.0)
+        summary = StepSummary(section_state, durations, step_length)
+        return SampledIntervals(log, summary, outcome, *lax.map(sample_phase_of_log, log))
+
+
+def _foot_friction(wheel: UnilateralWheel, friction: Elementwise) -> Friction:
+    """Return the friction of all feet, or that of the foot that landed last and of the others."""
+    friction = apply_friction_rule(friction, wheel.uses_paper_rule)
+    if wheel.uneven is None:
+        return friction
+    return friction, apply_friction_rule(wheel.uneven.friction, wheel.uses_paper_rule)
+
+
+def _run_event_loop(
+    wheel: UnilateralWheel,
+    params: WheelParams,
+    x: FullState,
+    options: StepOptions,
+    is_detailed: bool,
+    has_log: bool = False,
+) -> _EventLoopState:
+    """Return the event loop's state at the end of a step, integrated by diffrax."""
+    is_even_ground = wheel.uneven is None
+    is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, is_even_ground)
+    s, n = params.symbols(), params.n_legs
+    tilt = None if wheel.uneven is None else wheel.uneven.tilt
+    law_arguments = s, _foot_friction(wheel, friction), options, wheel.has_one_sided_stoppers
+    law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
+    layout = make_guard_layout(n, wheel.has_one_sided_stoppers)
+    motion, contact_state = unpack_section_state(s, x)
+    zero = jnp.zeros_like(motion.theta)
+    state = pack_state(motion, Accumulators(zero, zero, zero, zero))
+    allocate = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
+    first_log = IntervalLog(
+        state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0])
+    )
+    initial = _EventLoopState(
+        state=state,
+        contact_state=contact_state,
+        guard=jnp.int32(layout.landing),
+        outcome=jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
+        is_running=is_valid,
+        counters=init_counters(x[0]),
+        details=init_details(x.dtype) if is_detailed else None,
+        log=jax.tree.map(allocate, first_log) if has_log else None,
+    )
+    advance = partial(_advance_to_event, law, layout, wheel.max_events, options)
+    return lax.while_loop(
+        lambda loop_state: opaque_condition(loop_state.is_running, loop_state.counters.n_events),
+        advance,
+        initial,
+    )
+
+
+def _advance_to_event(
+    law: ContactLaw,
+    layout: GuardLayout,
+    max_events: int,
+    options: StepOptions,
+    loop_state: _EventLoopState,
+) -> _EventLoopState:
+    """Return the state at the next event."""
+    motion, accumulators = unpack_state(loop_state.state)
+    event_arguments = loop_state.guard, loop_state.counters.n_events, max_events
+    result, event, outcome = process_event(
+        law, layout, motion, loop_state.contact_state, *event_arguments
+    )
+    dynamics = make_mode_dynamics(
+        law.s, law.friction, law.is_one_sided, result.contact_state, tilt=law.tilt
+    )
+    is_valid = outcome == Outcome.STEPPED
+    start = pack_state(
+        result.motion, accumulators._replace(clock=jnp.zeros_like(accumulators.clock))
+    )
+    start = jnp.where(is_valid, start, loop_state.state)
+    guard_spec = MonitoredFunctions(
+        partial(guard_values, dynamics), layout.total, guard_scales=guard_scales(dynamics)
+    )
+    end = integrate_phase(partial(vector_field, dynamics), guard_spec, start, is_valid, options)
+
+    counters = loop_state.counters._replace(n_events=loop_state.counters.n_events + 1)
+    counters = add_interval(counters, result.contact_state, end.duration, end.solver_steps)
+    end_forces = (
+        compute_forces(dynamics, result.motion),
+        compute_forces(dynamics, unpack_state(end.state)[0]),
+    )
+    determinant_before, determinant_after = (
+        lax.stop_gradient(event_arguments.solution.painleve_determinant)
+        for event_arguments in end_forces
+    )
+    # Forces change sign at the singularity without passing through zero.
+    is_singular = is_at_singularity(determinant_before, determinant_after, options)
+    failure = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
+    failure = jnp.where(
+        is_valid, jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, failure), outcome
+    )
+    has_event = is_valid & (end.guard >= 0) & ~is_singular
+    has_landed = has_event & (end.guard == layout.foremost_landing)
+    outcome = interval_outcome(
+        counters, layout, has_event, end.guard, has_landed, failure, max_events
+    )
+    details, log = loop_state.details, loop_state.log
+    if details is not None:
+        details = record_event(details, loop_state.counters.n_events == 0, result, event)
+        stopper_forces = [
+            min_stopper_force(dynamics, event_arguments) for event_arguments in end_forces
+        ]
+        details = record_interval(
+            details, dynamics.contact, end.duration, jnp.minimum(*stopper_forces)
+        )
+    if log is not None:
+        row = IntervalLog(
+            start, result.contact_state.contact, result.contact_state.locked, end.duration
+        )
+        log = jax.tree.map(lambda old, new: old.at[loop_state.counters.n_events].set(new), log, row)
+    return _EventLoopState(
+        state=end.state,
+        contact_state=result.contact_state,
+        guard=end.guard,
+        outcome=outcome.astype(jnp.int32),
+        is_running=(outcome == Outcome.STEPPED) & ~has_landed,
+        counters=counters,
+        details=details,
+        log=log,
+    )
+
+
+_embedded = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
+
+
+@functools.cache
+def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
+    """Return the step over the leaves of (wheel, params, x, options), differentiable in any
+    mode.
+    """
+
+    def compute_step(tightens: bool, *leaves: Array) -> tuple:
+        wheel, params, x, options = jax.tree.unflatten(structure, leaves)
+        options = options.with_derivative_tolerances() if tightens else options
+        loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
+        tilt = None if wheel.uneven is None else wheel.uneven.tilt
+        outputs = (
+            _full_result(loop_state, engine, tilt)
+            if is_detailed
+            else _minimal_result(loop_state, tilt)
+        )
+        return eqx.partition(outputs, eqx.is_inexact_array)
+
+    evaluate, evaluate_tighter = partial(compute_step, False), partial(compute_step, True)
+    if engine == "diffrax":
+        return enable_all_ad_modes(evaluate, evaluate_tighter)
+    static_config = structure, is_detailed
+    return enable_all_ad_modes(
+        build_contact_step_function(*static_config),
+        evaluate_tighter,
+        partial(build_contact_step_jacobian, *static_config),
+    )
+
+
+def _minimal_result(loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
+    """Return the minimal result: section state, durations, outcome, solver steps."""
+    counters = loop_state.counters
+    final_state = unpack_state(loop_state.state)[0], loop_state.contact_state
+    section_state = final_section_state(*final_state, loop_state.outcome, tilt)
+    return section_state, counters.durations, loop_state.outcome, counters.n_solver_steps
+
+
+def _full_result(
+    loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
+) -> UnilateralStep:
+    """Return the full result."""
+    motion, accumulators = unpack_state(loop_state.state)
+    assert loop_state.details is not None
+    records = loop_state.counters, loop_state.details, loop_state.outcome
+    return make_unilateral_step(
+        motion, loop_state.contact_state, accumulators, *records, engine, tilt
+    )

@@ -1,0 +1,335 @@
+"""Walks of many wheels with unilateral contact, in lanes side by side.
+
+The laws are those of one wheel, elementwise over lanes. A lane at an event is resolved, and then
+all lanes are integrated further (`integrate_interval`). A landing of the foremost foot is an event
+like any other. On a CPU all of it is one machine-code program in which few lanes are idle;
+elsewhere XLA compiles the same source.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.contact.batch_integrator import (
+    N_ACCUMULATOR_ROWS,
+    STATUS_EVENT,
+    STATUS_RUNNING,
+    IntervalPoint,
+    IntervalState,
+    init_interval,
+    integrate_interval,
+    motion_from_point,
+    pack_coordinates,
+)
+from vrw_jax.contact.contact_state import (
+    Accumulators,
+    ContactState,
+    ModeDynamics,
+    compute_forces,
+    make_guard_layout,
+    make_mode_dynamics,
+    min_stopper_force,
+)
+from vrw_jax.contact.mechanics import WheelMotion, landing_position, stop_gradients
+from vrw_jax.contact.section import pack_section_state, replace_invalid_start, unpack_section_state
+from vrw_jax.contact.step_record import (
+    StepCounters,
+    StepDetails,
+    add_interval,
+    apply_friction_rule,
+    final_section_state,
+    init_counters,
+    init_details,
+    interval_outcome,
+    make_contact_law,
+    make_unilateral_step,
+    process_event,
+    record_event,
+    record_interval,
+)
+from vrw_jax.integrator import ButcherTableau
+from vrw_jax.numerics import StepOptions, tree_where, zeros_like_output
+from vrw_jax.wheel import Outcome, Symbols, compute_symbols, stack_parameters, wheel_from_parameters
+
+STATUS_UNFINISHED = -1
+"""Code of an unfinished lane in place of its outcome."""
+
+
+class StepSummary(NamedTuple):
+    """Summary of the last step of a walk."""
+
+    section_state: Array
+    durations: Array  # (3, lanes)
+    step_length: Array
+
+
+class BatchWalkResult(NamedTuple):
+    """Result of a walk, for every lane."""
+
+    step_result: Any  # of the last step: `StepSummary`, or a `UnilateralStep`
+    outcome: Array
+    n_stepped: Array
+    n_solver_steps: Array
+
+
+def make_result_template(n: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
+    """Return zeros in the structure of the result of one wheel with n legs."""
+    zero, zero_count = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    legs, no_contact = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
+    final_state = (
+        WheelMotion(*(zero,) * 6, legs, legs),
+        ContactState(no_contact, *(no_contact > 0,) * 4),
+    )
+    step_result: Any = StepSummary(pack_section_state(*final_state), jnp.zeros(3, dtype), zero)
+    if is_detailed:
+        accumulators = Accumulators(zero, zero, zero, zero)
+        step_result = make_unilateral_step(
+            *final_state,
+            accumulators,
+            init_counters(zero),
+            init_details(dtype),
+            zero_count,
+            "lanes",
+        )
+    return BatchWalkResult(step_result, zero_count, zero_count, zero_count)
+
+
+class LaneTangents(NamedTuple):
+    """Differentiable part of a lane's state."""
+
+    q: Array
+    v: Array
+    accumulated: tuple[Array | None, Array | None]  # in this step, and since the last event
+    time: Array
+    durations: Array
+    details: Any  # their floats
+
+
+class LaneState(NamedTuple):
+    """State of a lane."""
+
+    interval: IntervalState
+    counters: StepCounters  # of this step; attempted solver steps count over the walk
+    details: StepDetails | None  # of this step, if requested
+    accumulators: Array | None  # rows of `IntervalState.accumulated`, of this step
+    n_stepped: Array
+    outcome: Array
+
+    def get_tangents(self) -> LaneTangents:
+        """Return the differentiable part of the state."""
+        point, details = self.interval.point, eqx.filter(self.details, eqx.is_inexact_array)
+        accumulated = self.accumulators, self.interval.accumulated
+        return LaneTangents(
+            point.q, point.v, accumulated, self.interval.time, self.counters.durations, details
+        )
+
+    def replace_tangents(self, tangents: LaneTangents) -> "LaneState":
+        """Return the state with another differentiable part."""
+        accumulators, accumulated = tangents.accumulated
+        point = self.interval.point._replace(q=tangents.q, v=tangents.v)
+        others = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
+        return self._replace(
+            interval=self.interval._replace(
+                point=point, accumulated=accumulated, time=tangents.time
+            ),
+            counters=self.counters._replace(durations=tangents.durations),
+            details=eqx.combine(tangents.details, others),
+            accumulators=accumulators,
+        )
+
+
+class BatchWalk(NamedTuple):
+    """Settings common to all wheels of a batch."""
+
+    n: int
+    n_steps: Array | int
+    max_events: int
+    is_one_sided: bool
+    uses_paper_rule: bool
+    is_detailed: bool  # whether full results of the step are requested
+    options: StepOptions
+    tableau: ButcherTableau
+
+    def make_dynamics(self, columns: Array, contact_state: ContactState) -> ModeDynamics:
+        """Return the dynamics of the lanes in this contact state."""
+        s, friction = self.unpack_columns(columns)
+        return make_mode_dynamics(s, friction, self.is_one_sided, contact_state, self.is_detailed)
+
+    def unpack_columns(self, columns: Array) -> tuple[Symbols, Array]:
+        """Return symbols and friction of the columns."""
+        return compute_symbols(self.n, *columns[:-1]), apply_friction_rule(
+            columns[-1], self.uses_paper_rule
+        )
+
+    def begin_walk(self, columns: Array, x: Array) -> LaneState:
+        """Return the lanes at the first landing of their walk, before it is resolved."""
+        motion, contact_state = unpack_section_state(self.unpack_columns(columns)[0], x)
+        dynamics = self.make_dynamics(columns, contact_state)
+        interval = zeros_like_output(lambda: init_interval(dynamics, motion, self.options.dt0))
+        q, v = pack_coordinates(motion)
+        point = IntervalPoint(q, v, jnp.full_like(interval.point.dynamics_rows, jnp.inf))
+        interval = interval._replace(
+            point=point, contact_state=contact_state, status=interval.status + STATUS_EVENT
+        )
+        return LaneState(
+            interval,
+            *self._init_records(x[0]),
+            interval.guard * 0,
+            interval.guard * 0 + STATUS_UNFINISHED,
+        )
+
+    def _init_records(
+        self, reference: Array
+    ) -> tuple[StepCounters, StepDetails | None, Array | None]:
+        """Return counters, details and accumulators at the start of a step."""
+        if not self.is_detailed:
+            return init_counters(reference), None, None
+        broadcast = lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *reference.shape))
+        details = jax.tree.map(broadcast, init_details(reference.dtype))
+        return (
+            init_counters(reference),
+            details,
+            jnp.zeros((N_ACCUMULATOR_ROWS, *reference.shape), reference.dtype),
+        )
+
+    def process_events(self, columns: Array, lane: LaneState) -> LaneState:
+        """Return the stopped lanes after their events, or at the end of their walk."""
+        interval, layout = lane.interval, make_guard_layout(self.n, self.is_one_sided)
+        s, friction = self.unpack_columns(columns)
+        counters = add_interval(
+            lane.counters, interval.contact_state, interval.time, interval.n_solver_steps
+        )
+        details, accumulators = lane.details, lane.accumulators
+        if details is not None and accumulators is not None and interval.accumulated is not None:
+            dynamics_before = self.make_dynamics(columns, interval.contact_state)
+            details = record_stopper_force(
+                details, dynamics_before, motion_from_point(interval.point), interval.time
+            )
+            accumulators = accumulators + interval.accumulated
+        at_event = interval.status == STATUS_EVENT
+        has_landed = at_event & (interval.guard == layout.foremost_landing)
+        arguments = counters, layout, at_event, interval.guard, has_landed, interval.status
+        outcome = interval_outcome(*arguments, self.max_events).astype(jnp.int32)
+        n_stepped = lane.n_stepped + has_landed
+        has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
+        ended_lane = LaneState(interval, counters, details, accumulators, n_stepped, outcome)
+
+        # A landing of the foremost foot opens the next step; every event is processed.
+        opens_step, motion = has_landed & ~has_ended, motion_from_point(interval.point)
+        opened_state = unpack_section_state(s, pack_section_state(motion, interval.contact_state))
+        motion, contact_state = tree_where(
+            opens_step, opened_state, (motion, interval.contact_state)
+        )
+        new_counters, *new_records = self._init_records(motion.x)
+        new_counters = new_counters._replace(n_solver_steps=counters.n_solver_steps)
+        counters, details, accumulators = tree_where(
+            opens_step, (new_counters, *new_records), (counters, details, accumulators)
+        )
+        guard = jnp.where(opens_step, layout.landing, interval.guard)
+        law = make_contact_law(
+            s, friction, self.options, self.is_one_sided, counts_solutions=self.is_detailed
+        )
+        event_arguments = guard, counters.n_events, self.max_events
+        result, event, event_outcome = process_event(
+            law, layout, motion, contact_state, *event_arguments
+        )
+        dynamics = self.make_dynamics(columns, result.contact_state)
+        next_interval = init_interval(*stop_gradients((dynamics, result.motion, self.options.dt0)))
+        q, v = pack_coordinates(result.motion)
+        status = jnp.where(event_outcome != Outcome.STEPPED, event_outcome, next_interval.status)
+        next_interval = next_interval._replace(
+            point=next_interval.point._replace(q=q, v=v), status=status
+        )
+        if details is not None:
+            details = record_event(details, counters.n_events == 0, result, event)
+            zero = jnp.zeros_like(motion.x)
+            details = record_stopper_force(details, dynamics, result.motion, zero)
+        counters = counters._replace(n_events=counters.n_events + 1)
+        continued_lane = LaneState(
+            next_interval, counters, details, accumulators, n_stepped, lane.outcome
+        )
+        is_at_end = (interval.status != STATUS_RUNNING) & (lane.outcome == STATUS_UNFINISHED)
+        return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane)
+
+    def compute_result(self, lane: LaneState) -> Any:
+        """Return the result of the last step, for finished lanes."""
+        final_state, outcome = (
+            (motion_from_point(lane.interval.point), lane.interval.contact_state),
+            lane.outcome,
+        )
+        if lane.details is not None and lane.accumulators is not None:
+            accumulators = Accumulators(jnp.zeros_like(lane.accumulators[0]), *lane.accumulators)
+            return make_unilateral_step(
+                *final_state, accumulators, lane.counters, lane.details, outcome, "lanes"
+            )
+        return self.summarize(final_state, lane.counters, outcome)
+
+    def summarize(
+        self, final_state: tuple[WheelMotion, ContactState], counters: StepCounters, outcome: Array
+    ) -> StepSummary:
+        """Return the summary of a step with this final state."""
+        step_length = jnp.where(
+            outcome == Outcome.STEPPED, landing_position(self.n, final_state[0]), 0.0
+        )
+        return StepSummary(
+            final_section_state(*final_state, outcome), counters.durations, step_length
+        )
+
+    def replace_invalid(self, columns: Array, x: Array) -> tuple[Array, Array, Array]:
+        """Return columns and states with valid input in every lane, and which lanes were valid."""
+        is_valid, params, friction, x = replace_invalid_start(
+            wheel_from_parameters(columns[:-1], self.n), columns[-1], x
+        )
+        return jnp.stack([*stack_parameters(params), friction]), x, is_valid
+
+    def deactivate(self, lane: LaneState, is_valid: Array) -> LaneState:
+        """Return the lane state with invalid lanes deactivated."""
+        return lane._replace(outcome=jnp.where(is_valid, lane.outcome, Outcome.BAD_INPUT))
+
+
+def record_stopper_force(
+    details: StepDetails, dynamics: ModeDynamics, motion: WheelMotion, duration: Array
+) -> StepDetails:
+    """Return the details with the stopper forces at one end of an interval."""
+    force = min_stopper_force(dynamics, compute_forces(dynamics, motion))
+    return record_interval(details, dynamics.contact, duration, force)
+
+
+def init_lanes(walk: BatchWalk, columns: Array, x: Array) -> tuple[Array, LaneState]:
+    """Return valid columns, and the lanes before their first landing."""
+    columns, x, is_valid = walk.replace_invalid(columns, x)
+    return columns, walk.deactivate(walk.begin_walk(columns, x), is_valid)
+
+
+def advance_round(
+    walk: BatchWalk, columns: Array, lane: LaneState, waits_for_events: bool = False
+) -> tuple[LaneState, LaneState]:
+    """Return the lanes after their events, and the lanes integrated further.
+
+    - `waits_for_events`: integrate every lane to its next event.
+    """
+    processed = walk.process_events(columns, lane)
+    is_walking, dynamics_at = (
+        processed.outcome == STATUS_UNFINISHED,
+        lambda columns_at: walk.make_dynamics(columns_at, processed.interval.contact_state),
+    )
+    is_walking = is_walking & (not waits_for_events)
+    interval = integrate_interval(
+        dynamics_at, columns, processed.interval, is_walking, walk.options, walk.tableau
+    )
+    return processed, processed._replace(interval=interval)
+
+
+def run_walks(walk: BatchWalk, columns: Array, x: Array) -> BatchWalkResult:
+    """Return every lane after `n_steps` landings of the foremost foot."""
+    columns, lane = init_lanes(walk, columns, x)
+    run_round = lambda lane: advance_round(walk, columns, lane)[1]
+    should_continue = lambda lane: jnp.any(lane.outcome == STATUS_UNFINISHED)
+    lane = lax.while_loop(should_continue, run_round, lane)
+    return BatchWalkResult(
+        walk.compute_result(lane), lane.outcome, lane.n_stepped, lane.counters.n_solver_steps
+    )

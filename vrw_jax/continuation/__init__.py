@@ -1,0 +1,39 @@
+"""Fixed points of maps, Floquet multipliers, pseudo-arclength continuation and test functions."""
+
+from vrw_jax.continuation import arclength, floquet
+from vrw_jax.continuation.arclength import (
+    AbstractContinuationProblem,
+    ArclengthOptions,
+    ConstraintPlane,
+    ContinuationPoint,
+    ContinuationStatus,
+    FixedPointProblem,
+    NewtonStep,
+    SectionVector,
+    Unknowns,
+)
+from vrw_jax.continuation.batched_continuation import (
+    continue_many_from,
+    solve_many_on_planes,
+    solve_on_plane,
+)
+from vrw_jax.continuation.fixed_points import (
+    FixedPointResult,
+    solve_fixed_point,
+    solve_fixed_point_implicit,
+)
+from vrw_jax.continuation.floquet import floquet_multipliers
+from vrw_jax.continuation.sign_changes import (
+    BIFURCATION_NAMES,
+    evaluate_bifurcation_functions,
+    find_sign_changes,
+    has_unit_circle_pair,
+    locate_zeros,
+)
+from vrw_jax.continuation.test_functions import (
+    AbstractTestFunction,
+    TestFunctionCurve,
+    TestFunctionNewtonStep,
+    TestFunctionPoint,
+    offset_bifurcation_margins,
+)

@@ -1,0 +1,628 @@
+"""Pseudo-arclength continuation of fixed points in one parameter, through folds.
+
+A problem is an `AbstractContinuationProblem`, which defines how Newton's method corrects the
+unknowns z at a parameter p and how z changes with p. Many branches run concurrently, each with
+buffers of fixed size for its points.
+
+Lengths are measured in the section state and in the parameter as a fraction of its range.
+"""
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics import Scalar, StatusCode, tree_where, value_and_jacobian
+from vrw_jax.validation import check_int, check_positive
+
+Unknowns = Any
+"""A pytree of float arrays with everything that Newton's method corrects."""
+SectionVector = Float[Array, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ArclengthOptions:
+    """Numerical options of a continuation; each change compiles again.
+
+    - `initial_ds`, `max_ds`, `min_ds`: continuation step along the branch, in the section state and
+      in the parameter as a fraction of its range;
+    - `max_points`: limit of points in each direction;
+    - `max_newton_iterations`: limit of Newton's iterations for one point;
+    - `tolerance`: limit of the norm of Newton's last correction;
+    - `max_turn_angle`: largest turn of the branch in one continuation step, rad.
+
+    Examples:
+        >>> vrw.ArclengthOptions(max_ds=0.05).max_points
+        400
+    """
+
+    initial_ds: float = 0.005
+    max_ds: float = 0.02
+    min_ds: float = 1e-6
+    max_points: int = 400
+    max_newton_iterations: int = 10
+    tolerance: float = 1e-10
+    max_turn_angle: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name in ("max_points", "max_newton_iterations"):
+            check_int(name, getattr(self, name))
+        for name in ("initial_ds", "max_ds", "min_ds", "tolerance", "max_turn_angle"):
+            check_positive(name, getattr(self, name))
+        if not self.min_ds <= self.initial_ds <= self.max_ds:
+            raise ValueError(
+                f"the steps are {self.min_ds:g} (smallest), {self.initial_ds:g} (first) and "
+                f"{self.max_ds:g} (largest), but they must not fall in this order: "
+                "give min_ds <= initial_ds <= max_ds."
+            )
+
+
+class NewtonStep(NamedTuple):
+    """Correction and tangent of Newton's method at a trial point (z, p)."""
+
+    correction: Unknowns  # of z at fixed p
+    tangent: Unknowns  # dz/dp, the tangent of the branch
+    jacobian: Float[Array, "n n"]  # of the return map over the section's numbers
+
+
+class AbstractContinuationProblem(eqx.Module):
+    """Base class of continuation problems; `args` is a pytree with all other inputs of the
+    equations.
+    """
+
+    is_traceable: ClassVar[bool] = True
+    """Whether `linearize` can be compiled into a loop; otherwise it is called for many points at
+    once from outside of compiled code."""
+
+    @abc.abstractmethod
+    def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
+        """Return correction, tangent and Jacobian; they are not finite where the map
+        is undefined.
+        """
+
+    @abc.abstractmethod
+    def section_state(self, z: Unknowns) -> SectionVector:
+        """Return the section state, a part of z."""
+
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        """Return the initial guess of Newton's method at a fraction in [0, 1] between
+        two points.
+        """
+        return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
+
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+        """Return the norm of a correction, its largest entry, which is compared with
+        the tolerance.
+        """
+        return jnp.max(jnp.abs(correction))
+
+    def is_admissible(self, args: Any, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
+        """Return whether a converged z satisfies the conditions of its branch."""
+        return jnp.all(jnp.isfinite(z))
+
+
+def fixed_point_newton_step(
+    return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
+) -> NewtonStep:
+    """Return the Newton step of `return_map(z, p)` = z, whose first `n_continuous` entries are
+    continuous.
+
+    The other entries are codes, which are copied from the image.
+    """
+    continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
+    image_point, jacobians = value_and_jacobian(continuous_map, z[:n_continuous], p)
+    jacobian_z, jacobian_p = (jacobian[:n_continuous] for jacobian in jacobians)
+    defect = image_point - z
+    rhs = jnp.stack([defect[:n_continuous], jacobian_p], -1)
+    solutions = jnp.linalg.solve(jnp.eye(n_continuous, dtype=z.dtype) - jacobian_z, rhs)
+    code_changes = defect[n_continuous:]
+    tangent = jnp.concatenate([solutions[:, 1], jnp.zeros_like(code_changes)])
+    return NewtonStep(jnp.concatenate([solutions[:, 0], code_changes]), tangent, jacobian_z)
+
+
+class FixedPointProblem(AbstractContinuationProblem):
+    """Fixed points of a map x -> `function(args, x, p)` that JAX differentiates in forward mode.
+
+    The map returns NaN where it is not defined.
+    """
+
+    function: Callable[[Any, SectionVector, Scalar], SectionVector] = eqx.field(static=True)
+
+    def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
+        return fixed_point_newton_step(lambda x, p: self.function(args, x, p), z, p, z.shape[0])
+
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z
+
+
+class ContinuationStatus(StatusCode):
+    """Reason why the continuation of a branch ended in one direction."""
+
+    RUNNING = 0, "It was still being followed."
+    RANGE_END_REACHED = 1, "The parameter's range ended."
+    POINT_NOT_ADMISSIBLE = 2, "Its points no longer are what they stand for."
+    STEP_SIZE_UNDERFLOW = 3, "Newton's method found no next point, however short the step."
+    MAX_POINTS_REACHED = 4, "It has as many points as were allowed: raise max_points."
+    START_NOT_FOUND = 5, "No point was found to start from."
+    CURVE_CLOSED = 6, "It came back to where it began."
+
+
+class ContinuationPoint(NamedTuple):
+    """A point of a branch with the unit tangent to the branch."""
+
+    z: Unknowns
+    p: Scalar
+    tangent: Unknowns  # dz per length along the branch; () for stored points
+    fraction_rate: Scalar  # rate of the parameter, as a fraction of its range, per length
+    jacobian: Float[Array, "n n"]
+    is_admissible: Bool[Array, ""]
+
+
+class ContinuationResult(NamedTuple):
+    """Points of one or more branches in buffers of `max_points`, of which the first `n_points` are
+    set.
+    """
+
+    points: ContinuationPoint
+    n_points: Int[Array, " branches"]
+    status: Int[Array, " branches"]  # a ContinuationStatus
+    n_linearizations: Int[Array, " branches"]  # calls of `linearize`
+
+
+class ConstraintPlane(NamedTuple):
+    """The condition that selects a point: the projection on the normal equals that of the given
+    point.
+    """
+
+    section_state: SectionVector
+    fraction: Scalar
+    normal_section: SectionVector
+    normal_fraction: Scalar
+
+
+class CorrectorState(NamedTuple):
+    """State of the corrector after one Newton iteration."""
+
+    z: Unknowns
+    fraction: Scalar
+    correction_norm: Scalar
+    tangent: Unknowns  # dz per fraction of the parameter's range
+    jacobian: Float[Array, "n n"]
+
+
+def newton_step_at_fraction(
+    problem: AbstractContinuationProblem, args: Any, bounds: Array, z: Unknowns, fraction: Scalar
+) -> NewtonStep:
+    """Return the Newton step at a fraction of the parameter's range."""
+    return problem.linearize(args, z, bounds[0] + (bounds[1] - bounds[0]) * fraction)
+
+
+def correct_point(
+    problem: AbstractContinuationProblem,
+    newton_step: NewtonStep,
+    bounds: Array,
+    plane: ConstraintPlane,
+    z: Unknowns,
+    fraction: Scalar,
+) -> CorrectorState:
+    """Apply one Newton iteration to the branch's equations and the constraint plane together."""
+    scale = bounds[1] - bounds[0]
+    tangent = jax.tree.map(lambda section_state: scale * section_state, newton_step.tangent)
+    section_state = problem.section_state(z) + problem.section_state(newton_step.correction)
+    plane_residual = plane.normal_section @ (
+        section_state - plane.section_state
+    ) + plane.normal_fraction * (fraction - plane.fraction)
+    d_fraction = -plane_residual / (
+        plane.normal_section @ problem.section_state(tangent) + plane.normal_fraction
+    )
+    dz = jax.tree.map(lambda a, b: a + d_fraction * b, newton_step.correction, tangent)
+    correction_norm = jnp.maximum(problem.correction_norm(z, dz), jnp.abs(d_fraction))
+    return CorrectorState(
+        jax.tree.map(jnp.add, z, dz),
+        fraction + d_fraction,
+        correction_norm,
+        tangent,
+        newton_step.jacobian,
+    )
+
+
+def _fraction_from_parameter(p: Array, bounds: Array) -> Array:
+    return (p - bounds[0]) / (bounds[1] - bounds[0])
+
+
+def parameter_from_fraction(fraction: Array, bounds: Array) -> Array:
+    """Return the parameter at a fraction of its range; it is exact at both ends."""
+    p = bounds[0] + (bounds[1] - bounds[0]) * fraction
+    return jnp.where(fraction == 1.0, bounds[1], p)
+
+
+class _TrialPoint(NamedTuple):
+    plane: ConstraintPlane
+    z: Unknowns
+    fraction: Scalar
+    length: Scalar  # predicted arc length from the last point
+    is_final: Bool[Array, ""]  # whether it lies on the end of the range
+
+
+def _predict_point(
+    problem: AbstractContinuationProblem,
+    previous_point: ContinuationPoint,
+    current_point: ContinuationPoint,
+    has_two_points: Bool[Array, ""],
+    ds: Scalar,
+    bounds: Array,
+) -> _TrialPoint:
+    """Return the predicted point one step along the tangent, or on the end of the range if it is
+    nearer.
+
+    With `has_two_points`, Newton's method starts on the cubic through the last two points and along
+    their tangents. The cubic is nearer to the branch by two orders and saves one iteration of
+    three.
+    """
+    fraction, fraction_rate = (
+        _fraction_from_parameter(current_point.p, bounds),
+        current_point.fraction_rate,
+    )
+    bound = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
+    is_stationary = fraction_rate == 0.0
+    bound_distance = jnp.where(
+        is_stationary, jnp.inf, (bound - fraction) / jnp.where(is_stationary, 1.0, fraction_rate)
+    )
+    is_final = bound_distance <= ds
+    length = jnp.where(is_final, bound_distance, ds)
+    section_tangent, section_state = (
+        problem.section_state(current_point.tangent),
+        problem.section_state(current_point.z),
+    )
+    target_fraction = jnp.where(is_final, bound, fraction + length * fraction_rate)
+    plane = ConstraintPlane(
+        section_state + length * section_tangent,
+        target_fraction,
+        jnp.where(is_final, 0.0, section_tangent),
+        jnp.where(is_final, 1.0, fraction_rate),
+    )
+    previous_fraction = _fraction_from_parameter(previous_point.p, bounds)
+    displacement = jnp.append(
+        section_state - problem.section_state(previous_point.z), fraction - previous_fraction
+    )
+    chord = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
+
+    def extrapolate(a: Array, da: Array, b: Array, db: Array) -> Array:
+        mean_rate = (b - a) / chord
+        curvature = (db - mean_rate) / chord + (length + chord) * (
+            da + db - 2.0 * mean_rate
+        ) / chord**2
+        return b + length * db + jnp.where(has_two_points, length**2 * curvature, 0.0)
+
+    z = jax.tree.map(
+        extrapolate,
+        previous_point.z,
+        previous_point.tangent,
+        current_point.z,
+        current_point.tangent,
+    )
+    fraction = jnp.where(
+        is_final,
+        bound,
+        extrapolate(previous_fraction, previous_point.fraction_rate, fraction, fraction_rate),
+    )
+    return _TrialPoint(plane, z, fraction, length, is_final)
+
+
+class ContinuationState(NamedTuple):
+    """State of the continuation of one branch."""
+
+    previous_point: ContinuationPoint
+    current_point: ContinuationPoint
+    first_point: ContinuationPoint  # of the branch, if it exists
+    ds: Scalar
+    trial: _TrialPoint
+    iteration: Int[Array, ""]
+    n_points: Int[Array, ""]
+    status: Int[Array, ""]
+    n_linearizations: Int[Array, ""]
+
+
+class _TrialAssessment(NamedTuple):
+    """Assessment of a trial after one Newton iteration; if neither flag is set, the iteration goes
+    on.
+    """
+
+    is_accepted: Bool[Array, ""]
+    has_failed: Bool[Array, ""]
+    fraction_rate: Scalar  # along the branch, in the direction of the continuation
+
+
+def _assess_trial(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    state: ContinuationState,
+    corrector: CorrectorState,
+    direction: Scalar,
+) -> _TrialAssessment:
+    """Return whether a trial is accepted or has failed, and the parameter's rate along
+    the branch.
+    """
+    current_point, trial, is_first = state.current_point, state.trial, state.n_points == 0
+    distance = jnp.maximum(
+        jnp.max(jnp.abs(problem.section_state(corrector.z) - trial.plane.section_state)),
+        jnp.abs(corrector.fraction - trial.plane.fraction),
+    )
+    is_valid = jnp.isfinite(corrector.correction_norm) & (is_first | (distance <= state.ds))
+    is_converged = is_valid & (corrector.correction_norm < options.tolerance)
+    section_tangent = problem.section_state(corrector.tangent)
+    alignment = (
+        problem.section_state(current_point.tangent) @ section_tangent + current_point.fraction_rate
+    )
+    alignment = jnp.where(is_first, direction, alignment)
+    norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
+    is_straight = is_first | (jnp.abs(alignment) >= norm * jnp.cos(options.max_turn_angle))
+    is_accepted = is_converged & is_straight
+    has_failed = ~is_accepted & (
+        ~is_valid | is_converged | (state.iteration + 1 >= options.max_newton_iterations)
+    )
+    return _TrialAssessment(is_accepted, has_failed, jnp.where(alignment >= 0.0, 1.0, -1.0) / norm)
+
+
+def _choose_next_ds(
+    options: ArclengthOptions, state: ContinuationState, assessment: _TrialAssessment
+) -> Scalar:
+    """Return the next continuation step.
+
+    The step grows after few Newton iterations, shrinks after many, and halves after a failure.
+    """
+    is_quick, is_slow = state.iteration < 4, state.iteration >= 6
+    growth = jnp.where(is_quick, 1.4, jnp.where(is_slow, 0.6, 1.0))
+    longer_ds = jnp.minimum(state.ds * growth, options.max_ds)
+    shorter_ds = jnp.where(assessment.has_failed, 0.5 * state.ds, state.ds)
+    ds = jnp.where(assessment.is_accepted, longer_ds, shorter_ds)
+    return jnp.where(state.n_points == 0, options.initial_ds, ds)
+
+
+def _is_curve_closed(
+    problem: AbstractContinuationProblem,
+    start: ContinuationPoint,
+    current_point: ContinuationPoint,
+    next_point: ContinuationPoint,
+    bounds: Array,
+) -> Bool[Array, ""]:
+    """Return whether the segment from one point to the next passes over the branch's start."""
+    coordinates_of = lambda point: jnp.append(
+        problem.section_state(point.z), _fraction_from_parameter(point.p, bounds)
+    )
+    chord, start_offset = (
+        coordinates_of(next_point) - coordinates_of(current_point),
+        coordinates_of(start) - coordinates_of(current_point),
+    )
+    chord_squared = chord @ chord
+    fraction = start_offset @ chord / jnp.where(chord_squared > 0.0, chord_squared, 1.0)
+    deviation = start_offset - fraction * chord
+    return (fraction >= 0.0) & (fraction <= 1.0) & (deviation @ deviation < 0.01 * chord_squared)
+
+
+def _update_status(
+    options: ArclengthOptions,
+    state: ContinuationState,
+    assessment: _TrialAssessment,
+    new_point: ContinuationPoint,
+    ds: Scalar,
+    next_length: Scalar,
+    is_closed: Bool[Array, ""],
+) -> Int[Array, ""]:
+    """Return whether and why the branch ends at this trial; `next_length` is the next step's
+    length.
+    """
+    is_accepted, has_failed, _ = assessment
+    n_points, status = state.n_points + is_accepted, state.status
+    for has_occurred, code in (
+        (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
+        (has_failed & (state.n_points == 0), ContinuationStatus.START_NOT_FOUND),
+        (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
+        (
+            is_accepted & (state.trial.is_final | (next_length <= 1e-12)),
+            ContinuationStatus.RANGE_END_REACHED,
+        ),
+        (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
+        (is_accepted & is_closed & (state.n_points > 2), ContinuationStatus.CURVE_CLOSED),
+    ):
+        status = jnp.where(has_occurred, int(code), status)
+    return status.astype(jnp.int32)
+
+
+def _init_branch(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    bounds: Array,
+    z: Unknowns,
+    p: Scalar,
+    direction: Scalar,
+) -> ContinuationState:
+    x = problem.section_state(z)
+    n, dtype = x.shape[0], x.dtype
+    zero, zero_count, false = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
+    zero_tangent, fraction = jax.tree.map(jnp.zeros_like, z), _fraction_from_parameter(p, bounds)
+    point = ContinuationPoint(z, p, zero_tangent, zero + direction, jnp.zeros((n, n), dtype), false)
+    trial = _TrialPoint(
+        ConstraintPlane(x, fraction, jnp.zeros_like(x), zero + 1.0), z, fraction, zero, false
+    )
+    running = zero_count + int(ContinuationStatus.RUNNING)
+    return ContinuationState(
+        point,
+        point,
+        point,
+        zero + options.initial_ds,
+        trial,
+        zero_count,
+        zero_count,
+        running,
+        zero_count,
+    )
+
+
+MAX_CONCURRENT_BRANCHES = 8
+"""Branches that are continued concurrently, chosen because they fill one group of lanes of machine
+code."""
+
+BranchBatch = tuple[ContinuationState, ContinuationPoint]
+"""States of concurrent branches, and the buffers of points that they have reached."""
+
+
+def init_branches(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    z: Unknowns,
+    p: Array,
+    bounds: Array,
+    directions: Array,
+    is_requested: Array,
+) -> BranchBatch:
+    """Return the initial states of the branches and their empty buffers of points."""
+    states = jax.vmap(functools.partial(_init_branch, problem, options, bounds))(z, p, directions)
+    status = jnp.where(is_requested, states.status, int(ContinuationStatus.START_NOT_FOUND))
+    states = states._replace(status=status.astype(jnp.int32))
+    allocate_buffer = lambda x: jnp.zeros((x.shape[0], options.max_points, *x.shape[1:]), x.dtype)
+    return states, jax.tree.map(allocate_buffer, states.current_point._replace(tangent=()))
+
+
+def is_active(branches: BranchBatch) -> Array:
+    """Return which branches still run."""
+    return branches[0].status == int(ContinuationStatus.RUNNING)
+
+
+def iterate_branches(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    batch_args: Any,
+    bounds: Array,
+    directions: Array,
+    buffer_rows: Array,
+    branches: BranchBatch,
+    newton_steps: NewtonStep,
+) -> BranchBatch:
+    """Advance each branch by one linearization of its trial, and store the accepted points.
+
+    The branches own the rows `buffer_rows` of the buffers.
+    """
+
+    def iterate_branch(
+        args: Any, direction: Scalar, state: ContinuationState, newton_step: NewtonStep
+    ) -> tuple[ContinuationState, ContinuationPoint, Bool[Array, ""]]:
+        trial = state.trial
+        corrector = correct_point(
+            problem, newton_step, bounds, trial.plane, trial.z, trial.fraction
+        )
+        assessment = _assess_trial(problem, options, state, corrector, direction)
+        p = parameter_from_fraction(
+            jnp.where(trial.is_final, trial.plane.fraction, corrector.fraction), bounds
+        )
+        is_admissible = problem.is_admissible(args, corrector.z, p)
+        tangent = jax.tree.map(lambda x: assessment.fraction_rate * x, corrector.tangent)
+        new_point = ContinuationPoint(
+            corrector.z, p, tangent, assessment.fraction_rate, corrector.jacobian, is_admissible
+        )
+        current_point = tree_where(assessment.is_accepted, new_point, state.current_point)
+        first_point = tree_where(
+            assessment.is_accepted & (state.n_points == 0), new_point, state.first_point
+        )
+        previous_point = tree_where(
+            assessment.is_accepted, state.current_point, state.previous_point
+        )
+        n_points = state.n_points + assessment.is_accepted
+        ds = _choose_next_ds(options, state, assessment)
+        next_trial = _predict_point(
+            problem, previous_point, current_point, n_points > 1, ds, bounds
+        )
+        is_finished = assessment.is_accepted | assessment.has_failed
+        next_trial = tree_where(
+            is_finished, next_trial, trial._replace(z=corrector.z, fraction=corrector.fraction)
+        )
+        is_closed = _is_curve_closed(problem, first_point, state.current_point, new_point, bounds)
+        status = _update_status(
+            options, state, assessment, new_point, ds, next_trial.length, is_closed
+        )
+        iteration = jnp.where(is_finished, 0, state.iteration + 1)
+        counters = n_points, status, state.n_linearizations + 1
+        next_state = ContinuationState(
+            previous_point, current_point, first_point, ds, next_trial, iteration, *counters
+        )
+        return next_state, new_point, assessment.is_accepted
+
+    # Buffers are updated outside of `tree_where`, which would copy them at every iteration.
+    state, points = branches
+    next_states, new_points, is_accepted = jax.vmap(iterate_branch)(
+        batch_args, directions, state, newton_steps
+    )
+    buffer_index = jnp.where(is_active(branches) & is_accepted, state.n_points, options.max_points)
+    write_row = lambda buffer, new_points: buffer.at[buffer_rows, buffer_index].set(
+        new_points, mode="drop"
+    )
+    points = jax.tree.map(write_row, points, new_points._replace(tangent=()))
+    return jax.vmap(tree_where)(is_active(branches), next_states, state), points
+
+
+def to_continuation_result(branches: BranchBatch) -> ContinuationResult:
+    """Return the result of a continuation from the states of its branches."""
+    states, points = branches
+    return ContinuationResult(points, states.n_points, states.status, states.n_linearizations)
+
+
+@eqx.filter_jit
+def continue_from(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    batch_args: Any,
+    z: Unknowns,
+    p: Float[Array, "*branches"],
+    bounds: Float[Array, "2"],
+    directions: Float[Array, "*branches"],
+    is_requested: Bool[Array, "*branches"] | None = None,
+) -> ContinuationResult:
+    """Continue the branches from the points near (z, p) in the given directions.
+
+    The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
+    several with a leading axis, of which only those that are requested run. Each branch ends at the
+    end of the range, or with its first point that is not admissible, which is kept. Groups of
+    branches run concurrently with one linearization of each per iteration; when a branch ends, the
+    next one starts.
+    """
+    if p.ndim == 0:
+        add_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
+        result = continue_from(
+            problem, options, add_axis(batch_args), add_axis(z), p[None], bounds, directions[None]
+        )
+        return jax.tree.map(lambda x: x[0], result)
+    is_requested = jnp.ones(p.shape, bool) if is_requested is None else is_requested
+
+    def advance_group(branches: BranchBatch) -> BranchBatch:
+        rows = jnp.argsort(~is_active(branches), stable=True)[:MAX_CONCURRENT_BRANCHES]
+        group_args, group_directions, state = jax.tree.map(
+            lambda x: x[rows], (batch_args, directions, branches[0])
+        )
+        has_waiting = jnp.sum(is_active(branches)) > len(rows)
+
+        def advance_once(branches: BranchBatch) -> BranchBatch:
+            linearize_trial = lambda args, trial: newton_step_at_fraction(
+                problem, args, bounds, trial.z, trial.fraction
+            )
+            newton_steps = jax.vmap(linearize_trial)(group_args, branches[0].trial)
+            return iterate_branches(
+                problem, options, group_args, bounds, group_directions, rows, branches, newton_steps
+            )
+
+        has_active = lambda branches: jnp.where(
+            has_waiting, jnp.all(is_active(branches)), jnp.any(is_active(branches))
+        )
+        state, points = lax.while_loop(has_active, advance_once, (state, branches[1]))
+        return jax.tree.map(lambda x, new: x.at[rows].set(new), branches[0], state), points
+
+    branches = init_branches(problem, options, z, p, bounds, directions, is_requested)
+    return to_continuation_result(
+        lax.while_loop(lambda branches: jnp.any(is_active(branches)), advance_group, branches)
+    )

@@ -1,0 +1,232 @@
+"""Points of branches on constraint planes, and concurrent branches outside of compiled code.
+
+Where a map is machine code for many points together, nothing is traced: linearizations are called
+from outside of compiled code, and `arclength` performs the rest of each iteration.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.continuation.arclength import (
+    AbstractContinuationProblem,
+    ArclengthOptions,
+    ConstraintPlane,
+    ContinuationPoint,
+    ContinuationResult,
+    CorrectorState,
+    NewtonStep,
+    Unknowns,
+    correct_point,
+    init_branches,
+    is_active,
+    iterate_branches,
+    newton_step_at_fraction,
+    parameter_from_fraction,
+    to_continuation_result,
+)
+from vrw_jax.numerics import take_rows, tree_where
+
+JACOBIAN_REUSE_FRACTION = 1e-2
+"""Fraction of the tolerance below which the last Jacobian is reused.
+
+It is chosen because after a correction this small, the Jacobian of the trial before it is exact.
+"""
+
+
+class PlaneSolveState(NamedTuple):
+    """State of Newton's method for a point on a plane."""
+
+    corrector: CorrectorState
+    n_iterations: Int[Array, ""]
+    n_converged: Int[Array, ""]
+
+
+def init_plane_solve(z: Unknowns, plane: ConstraintPlane) -> PlaneSolveState:
+    """Return the initial state of Newton's method on a plane."""
+    n_section, zero_tangent, zero_count = (
+        plane.section_state.shape[0],
+        jax.tree.map(jnp.zeros_like, z),
+        jnp.zeros((), jnp.int32),
+    )
+    zero_jacobian = jnp.zeros((n_section, n_section), plane.section_state.dtype)
+    initial_corrector = CorrectorState(
+        z, plane.fraction, jnp.ones_like(plane.fraction), zero_tangent, zero_jacobian
+    )
+    return PlaneSolveState(initial_corrector, zero_count, zero_count)
+
+
+def needs_iteration(options: ArclengthOptions, state: PlaneSolveState) -> Array:
+    """Return whether Newton's method needs another iteration."""
+    return (
+        (state.n_converged < 2)
+        & (state.n_iterations < options.max_newton_iterations)
+        & jnp.isfinite(state.corrector.correction_norm)
+    )
+
+
+def iterate_plane_solve(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    bounds: Array,
+    plane: ConstraintPlane,
+    state: PlaneSolveState,
+    newton_step: NewtonStep,
+) -> PlaneSolveState:
+    """Return the state after one Newton iteration."""
+    corrector = state.corrector
+    next_corrector = correct_point(
+        problem, newton_step, bounds, plane, corrector.z, corrector.fraction
+    )
+    # A trial that is not finite keeps its state, so that no NaN reaches other batch elements.
+    is_valid = jnp.isfinite(next_corrector.correction_norm)
+    next_corrector = tree_where(is_valid, next_corrector, corrector)._replace(
+        correction_norm=next_corrector.correction_norm
+    )
+    n_counted = jnp.where(
+        next_corrector.correction_norm < JACOBIAN_REUSE_FRACTION * options.tolerance, 2, 1
+    )
+    n_converged = jnp.where(
+        next_corrector.correction_norm < options.tolerance, state.n_converged + n_counted, 0
+    )
+    return PlaneSolveState(next_corrector, state.n_iterations + 1, n_converged)
+
+
+def finish_plane_solve(
+    problem: AbstractContinuationProblem, args: Any, bounds: Array, state: PlaneSolveState
+) -> tuple[ContinuationPoint, Bool[Array, ""]]:
+    """Return the point of a finished solve, and whether it converged."""
+    corrector, p = state.corrector, parameter_from_fraction(state.corrector.fraction, bounds)
+    is_admissible = problem.is_admissible(args, corrector.z, p)
+    return ContinuationPoint(
+        corrector.z, p, (), jnp.ones_like(p), corrector.jacobian, is_admissible
+    ), state.n_converged >= 1
+
+
+@eqx.filter_jit
+def solve_on_plane(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    args: Any,
+    z: Unknowns,
+    plane: ConstraintPlane,
+    bounds: Float[Array, "2"],
+) -> tuple[ContinuationPoint, Bool[Array, ""]]:
+    """Solve for the point of the branch on a plane, from z near it; return it and whether it
+    converged.
+
+    Once converged, Newton's method takes one more iteration, unless its correction is negligible:
+    the Jacobian is then as exact as the point.
+    """
+
+    def iterate_once(state: PlaneSolveState) -> PlaneSolveState:
+        newton_step = newton_step_at_fraction(
+            problem, args, bounds, state.corrector.z, state.corrector.fraction
+        )
+        return iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
+
+    needs_more = functools.partial(needs_iteration, options)
+    return finish_plane_solve(
+        problem, args, bounds, lax.while_loop(needs_more, iterate_once, init_plane_solve(z, plane))
+    )
+
+
+def continue_many_from(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    batch_args: Any,
+    z: Unknowns,
+    p: Float[Array, " branches"],
+    bounds: Float[Array, "2"],
+    directions: Float[Array, " branches"],
+    is_requested: Bool[Array, " branches"],
+) -> ContinuationResult:
+    """Continue branches as `arclength.continue_from` does, outside of compiled code."""
+    state, row_indices = (
+        init_branches(problem, options, z, p, bounds, directions, is_requested),
+        jnp.arange(len(p)),
+    )
+    while np.any(is_open := np.asarray(_is_active_jit(state))):
+        trial = state[0].trial
+        newton_steps = _linearize_selected(
+            problem, batch_args, bounds, trial.z, trial.fraction, is_open
+        )
+        state = _iterate_branches_jit(
+            problem, options, batch_args, bounds, directions, row_indices, state, newton_steps
+        )
+    return to_continuation_result(state)
+
+
+def _linearize_selected(
+    problem: AbstractContinuationProblem,
+    batch_args: Any,
+    bounds: Array,
+    z: Unknowns,
+    fraction: Array,
+    is_selected: Any,
+) -> NewtonStep:
+    """Return the Newton steps of the selected branches; those of the others are NaN."""
+    lower_bound, upper_bound = np.asarray(bounds)
+    p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
+    selected_steps = problem.linearize(*jax.device_put(take_rows((batch_args, z, p), is_selected)))
+    make_nan_rows = lambda x: np.full((len(is_selected), *x.shape[1:]), np.nan)
+    all_steps = jax.tree.map(make_nan_rows, selected_steps)
+    for target, x in zip(jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True):
+        target[is_selected] = x
+    return jax.device_put(all_steps)
+
+
+def solve_many_on_planes(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    batch_args: Any,
+    z: Unknowns,
+    planes: ConstraintPlane,
+    bounds: Float[Array, "2"],
+) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
+    """Solve for many points as `solve_on_plane` does; all arrays have a leading axis."""
+    state = _init_plane_solves(z, planes)
+    while np.any(is_open := np.asarray(_needs_iteration_jit(options, state))):
+        newton_step = _linearize_selected(
+            problem, batch_args, bounds, state.corrector.z, state.corrector.fraction, is_open
+        )
+        state = _iterate_plane_solves(problem, options, bounds, planes, state, newton_step)
+    return _finish_plane_solves(problem, batch_args, bounds, state)
+
+
+_is_active_jit: Any = eqx.filter_jit(is_active)
+_iterate_branches_jit: Any = eqx.filter_jit(iterate_branches)
+_init_plane_solves: Any = eqx.filter_jit(jax.vmap(init_plane_solve))
+_needs_iteration_jit: Any = eqx.filter_jit(needs_iteration)
+
+
+@eqx.filter_jit
+def _finish_plane_solves(
+    problem: AbstractContinuationProblem, batch_args: Any, bounds: Array, state: PlaneSolveState
+) -> Any:
+    return jax.vmap(lambda args, state: finish_plane_solve(problem, args, bounds, state))(
+        batch_args, state
+    )
+
+
+@eqx.filter_jit
+def _iterate_plane_solves(
+    problem: AbstractContinuationProblem,
+    options: Any,
+    bounds: Array,
+    planes: ConstraintPlane,
+    *states_and_steps: Any,
+) -> PlaneSolveState:
+    def iterate_one(
+        plane: ConstraintPlane, state: PlaneSolveState, newton_step: NewtonStep
+    ) -> PlaneSolveState:
+        next_state = iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
+        return tree_where(needs_iteration(options, state), next_state, state)
+
+    return jax.vmap(iterate_one)(planes, *states_and_steps)

@@ -1,0 +1,263 @@
+"""Fixed points of any return map, by Newton's method on the section."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
+from vrw_jax.printing import format_numbers, format_quantity, format_text
+from vrw_jax.validation import check_callable, check_int, check_positive, check_reals
+
+
+class FixedPointResult(NamedTuple):
+    """A fixed point of a map, and the map's Jacobian there.
+
+    - `x`: the point, shape (n,);
+    - `jacobian`: of the map, or of its period_n-th iterate;
+    - `residual`: largest entry of map(x) - x;
+    - `converged`, `n_iterations`: of Newton's method.
+
+    Examples:
+        >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
+        >>> float(result.x[0]), float(result.jacobian[0, 0])
+        (2.0, 0.5)
+    """
+
+    x: Float[Array, " n"]
+    jacobian: Float[Array, "n n"]
+    residual: Scalar
+    converged: Bool[Array, ""]
+    n_iterations: Int[Array, ""]
+
+    def __repr__(self) -> str:
+        if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
+            return f"SectionCycle{tuple(self)}"
+        rows = (
+            ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
+            ("x", format_numbers(self.x)),
+            ("residual", format_quantity(self.residual, "")),
+            ("multipliers", format_numbers(np.linalg.eigvals(self.jacobian))),
+        )
+        return format_text("FixedPointResult", rows)
+
+
+MAX_NEWTON_ITERATIONS = 30
+"""Default limit of Newton's iterations."""
+
+
+def solve_fixed_point(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+    max_iterations: int = MAX_NEWTON_ITERATIONS,
+) -> FixedPointResult:
+    """Solve for a fixed point of `function` applied `period_n` times, by Newton's method from
+    `start`.
+
+    The result is differentiable in whatever `function` closes over, by two further iterations that
+    carry derivatives: the point to third order, the Jacobian to first. A start that does not
+    converge is returned unchanged, without derivative.
+
+    Args:
+        function: a map of a vector to a vector of the same shape, differentiable in forward mode.
+        start: shape (n,), near the fixed point.
+        period_n: number of times the map is applied.
+        tolerance: of Newton's last correction, in units of `start`.
+        max_iterations: limit of Newton's iterations.
+
+    Returns:
+        A `FixedPointResult`.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, in one sentence.
+
+    Examples:
+        >>> result = vrw.solve_fixed_point(lambda x: jnp.cos(x), jnp.array([0.7]))
+        >>> print(f"{result.x[0]:.6f} {bool(result.converged)}")
+        0.739085 True
+    """
+
+    return _solve_checked(_run_newton, function, start, period_n, tolerance, max_iterations)
+
+
+def solve_fixed_point_implicit(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+) -> FixedPointResult:
+    """Solve for a fixed point of a map whose second derivatives are expensive.
+
+    The point's first derivatives require only first derivatives of `function`, and its second
+    derivatives second ones. Derivatives of the Jacobian are NaN.
+    """
+    return _solve_checked(
+        _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
+    )
+
+
+def _solve_checked(
+    run_newton: Callable[..., FixedPointResult],
+    function: Callable[[Array], Array],
+    start: Any,
+    period_n: int,
+    tolerance: float | Scalar,
+    iterations: int,
+) -> FixedPointResult:
+    """Validate the arguments, and solve with one of the two methods below."""
+    check_callable("function", function, "that maps a state to the next")
+    start, period_n = check_reals("start", start), check_int("period_n", period_n)
+    iterations = check_int("iterations", iterations)
+    if not isinstance(tolerance, jax.Array):
+        check_positive("tolerance", tolerance)
+
+    def iterate(x: Array) -> Array:
+        for _ in range(period_n):
+            x = function(x)
+        return x
+
+    start = lax.stop_gradient(start)
+    output = jax.eval_shape(function, start)
+    if getattr(output, "shape", None) != start.shape:
+        description = getattr(output, "shape", type(output).__name__)
+        raise ValueError(
+            f"the map gives {description} for a start of shape {start.shape}, but it must give its like: "
+            "take a map of a state to the next."
+        )
+    converted_map, closed_over = jax.closure_convert(iterate, start)
+    tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    return run_newton(converted_map, iterations, start, tolerance, *closed_over)
+
+
+ConvertedMap = Callable[..., Array]
+
+
+def _newton_correction(
+    converted_map: ConvertedMap, x: Array, closed_over: tuple
+) -> tuple[Array, Array, Array]:
+    """Return Newton's correction, the map's Jacobian, and the defect of the map."""
+    image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over), x)
+    defect = image_point - x
+    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, defect), jacobian, defect
+
+
+N_DERIVATIVE_ITERATIONS = 2
+"""Number of iterations with derivatives, chosen because one from a point without derivatives yields
+only its first."""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _run_newton(
+    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> FixedPointResult:
+    """Run Newton's method in one loop, so that the map, often a large program, is compiled once."""
+
+    def is_searching(correction_norm: Array, n_iterations: Array) -> Array:
+        return (
+            (correction_norm > tolerance)
+            & (n_iterations < iterations)
+            & jnp.isfinite(correction_norm)
+        )
+
+    def needs_iteration(state: tuple) -> Array:
+        _, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+        return is_searching(correction_norm, n_iterations) | (
+            (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
+        )
+
+    def iterate_newton(state: tuple) -> tuple:
+        x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+        is_searching_now = is_searching(correction_norm, n_iterations)
+        correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
+        correction_norm = jnp.max(
+            jnp.abs(correction)
+        )  # checked in the last iterations too: the map may jump next to the point
+        next_x = jnp.where(jnp.all(jnp.isfinite(correction)), x + correction, x)
+        jacobian_and_residual = jacobian, jnp.max(jnp.abs(defect))
+        return (
+            next_x,
+            correction_norm,
+            n_iterations + is_searching_now,
+            n_derivative_iterations + ~is_searching_now,
+            *jacobian_and_residual,
+        )
+
+    zero, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    initial_state = (
+        start,
+        unit_norm,
+        zero,
+        zero,
+        jnp.zeros((start.size,) * 2, start.dtype),
+        unit_norm,
+    )
+    x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
+        needs_iteration, iterate_newton, initial_state
+    )
+    is_converged = correction_norm <= tolerance
+    return FixedPointResult(
+        jnp.where(is_converged, x, start), jacobian, residual, is_converged, n_iterations
+    )
+
+
+@_run_newton.defjvp
+def _run_newton_jvp(
+    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
+    """Return the tangent, by iterations from the fixed point that carry derivatives."""
+    start, _, *closed_over = primals
+    result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
+
+    def solve_from_fixed_point(*closed_over: Any) -> FixedPointResult:
+        def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            correction, jacobian, defect = _newton_correction(converted_map, point, closed_over)
+            next_point = point + jnp.where(result.converged, correction, 0.0)
+            return next_point, (jacobian, jnp.max(jnp.abs(defect)))
+
+        point, (jacobians, residuals) = lax.scan(
+            iterate_with_derivatives, result.x, None, length=N_DERIVATIVE_ITERATIONS
+        )
+        x = jnp.where(result.converged, point, start)
+        return FixedPointResult(
+            x, jacobians[-1], residuals[-1], result.converged, result.n_iterations
+        )
+
+    return jax.jvp(solve_from_fixed_point, tuple(closed_over), tuple(tangents[2:]))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _run_newton_implicit(
+    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+) -> FixedPointResult:
+    return _run_newton(converted_map, iterations, start, tolerance, *closed_over)
+
+
+@_run_newton_implicit.defjvp
+def _run_newton_implicit_jvp(
+    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
+    """Return the tangent by the implicit function theorem, at a point that is differentiated by
+    this rule.
+    """
+    result = _run_newton_implicit(converted_map, iterations, *primals)
+    closed_over, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
+    _, map_tangent = jax.jvp(
+        lambda *arguments: converted_map(result.x, *arguments), closed_over, closed_over_tangents
+    )
+    _, jacobian = value_and_jacobian(lambda x: converted_map(x, *closed_over), result.x)
+    point_tangent = jnp.linalg.solve(
+        jnp.eye(result.x.size, dtype=result.x.dtype) - jacobian, map_tangent
+    )
+    point_tangent = jnp.where(result.converged, point_tangent, 0.0)
+    unknown_jacobian = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
+    zero_result = zero_tangent(result)
+    return result, zero_result._replace(x=point_tangent, jacobian=unknown_jacobian)

@@ -1,0 +1,139 @@
+"""Curves in two parameters on which a test function of fixed points is zero, for `arclength`.
+
+The second parameter joins the unknowns of Newton's method, and the test function joins its
+equations. A curve is then a branch along the first parameter, through turning points as through
+folds.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.continuation.arclength import (
+    AbstractContinuationProblem,
+    NewtonStep,
+    SectionVector,
+    Unknowns,
+)
+from vrw_jax.continuation.floquet import bifurcation_margins
+from vrw_jax.numerics import Elementwise, Scalar
+
+ParameterPair = Float[Array, "2"]
+"""Values of the two parameters."""
+
+
+class TestFunctionNewtonStep(NamedTuple):
+    """Newton step at a trial (z, p), and the test function whose zero is continued."""
+
+    correction: Unknowns  # of z at fixed p
+    tangents: tuple[Unknowns, Unknowns]  # dz/dp along the curve of fixed points
+    jacobian: Float[Array, "n n"]  # of the return map
+    value: Scalar  # of the test function at the corrected z
+    parameter_gradient: ParameterPair  # derivatives of the value by p along the fixed points
+
+
+class AbstractTestFunction(eqx.Module):
+    """Base class of test functions of fixed points in two parameters.
+
+    `args` is a pytree with all other inputs.
+    """
+
+    @abc.abstractmethod
+    def linearize(self, args: Any, z: Unknowns, p: ParameterPair) -> TestFunctionNewtonStep:
+        """Return all that one iteration needs; it is not finite where the map is undefined."""
+
+    @abc.abstractmethod
+    def section_state(self, z: Unknowns) -> SectionVector:
+        """Return the section state, a part of z."""
+
+    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+        """Return the norm of a correction, its largest entry, which is compared with
+        the tolerance.
+        """
+        return jnp.max(jnp.abs(correction))
+
+    def is_admissible(self, args: Any, z: Unknowns, p: ParameterPair) -> Bool[Array, ""]:
+        """Return whether a converged z satisfies the conditions of its branch."""
+        return jnp.all(jnp.isfinite(self.section_state(z)))
+
+
+class TestFunctionPoint(NamedTuple):
+    """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
+
+    z: Unknowns
+    fraction: Elementwise  # of the second parameter's range
+
+
+class TestFunctionCurve(AbstractContinuationProblem):
+    """The curve on which a test function is zero, along the first of its parameters.
+
+    Lengths along it include the second parameter as a fraction of its range, which it must not
+    leave.
+    """
+
+    test_function: AbstractTestFunction
+    bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
+
+    def second_parameter(self, z: TestFunctionPoint) -> Elementwise:
+        """Return the second parameter at a point of the curve."""
+        low, high = self.bounds
+        return low + (high - low) * z.fraction
+
+    def linearize(self, args: Any, z: TestFunctionPoint, p: Scalar) -> NewtonStep:
+        scale = self.bounds[1] - self.bounds[0]
+        newton_step = self.test_function.linearize(
+            args, z.z, jnp.stack([p, self.second_parameter(z)])
+        )
+        derivative_first, derivative_fraction = (
+            newton_step.parameter_gradient[0],
+            scale * newton_step.parameter_gradient[1],
+        )
+        fraction_change, fraction_tangent = (
+            -newton_step.value / derivative_fraction,
+            -derivative_first / derivative_fraction,
+        )
+        first_tangent, second_tangent = newton_step.tangents
+        add_second = lambda change: lambda a, b: a + scale * change * b
+        correction = jax.tree.map(
+            add_second(fraction_change), newton_step.correction, second_tangent
+        )
+        tangent = jax.tree.map(add_second(fraction_tangent), first_tangent, second_tangent)
+        jacobian = jnp.pad(
+            newton_step.jacobian, (0, 1)
+        )  # a zero multiplier for the fraction has no effect
+        return NewtonStep(
+            TestFunctionPoint(correction, fraction_change),
+            TestFunctionPoint(tangent, fraction_tangent),
+            jacobian,
+        )
+
+    def section_state(self, z: TestFunctionPoint) -> SectionVector:
+        return jnp.append(self.test_function.section_state(z.z), z.fraction)
+
+    def correction_norm(self, z: TestFunctionPoint, correction: TestFunctionPoint) -> Scalar:
+        return jnp.maximum(
+            self.test_function.correction_norm(z.z, correction.z), jnp.abs(correction.fraction)
+        )
+
+    def is_admissible(self, args: Any, z: TestFunctionPoint, p: Scalar) -> Bool[Array, ""]:
+        is_inside = (z.fraction >= 0.0) & (z.fraction <= 1.0)
+        return is_inside & self.test_function.is_admissible(
+            args, z.z, jnp.stack([p, self.second_parameter(z)])
+        )
+
+
+FOLD_MARGIN_OFFSET = 1e-6
+"""Value of the fold's margin on the curve that represents the fold.
+
+It is chosen because the equations are singular at the fold itself. The parameters turn at the fold
+and are wrong by the square of this value.
+"""
+
+
+def offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
+    """Return the bifurcation margins, each zero where one of `BIFURCATION_NAMES` occurs."""
+    return bifurcation_margins(jacobian).at[0].add(-FOLD_MARGIN_OFFSET)

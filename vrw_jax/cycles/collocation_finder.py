@@ -1,0 +1,212 @@
+"""Gaits of the paper's model: one algebraic system for the cycle, and one step as a check."""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.cycles.collocation_search import CollocationState, CollocationSystem, surface_start
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
+from vrw_jax.cycles.finder import (
+    AbstractGaitFinder,
+    BranchPoint,
+    Gait,
+    GaitMeasures,
+    Values,
+    measure_from_cycle,
+    measure_from_gait,
+    move_derivative_axis_first,
+)
+from vrw_jax.cycles.limit_cycle_result import (
+    LimitCycle,
+    find_limit_cycle,
+    guess_from_walk,
+    sample_walk,
+    transfer_to_mesh,
+)
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
+from vrw_jax.numerics import StepOptions, value_and_jacobian
+from vrw_jax.simulation import validate_arguments
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    WheelParams,
+    stack_parameters,
+    transitions,
+    wheel_from_parameters,
+)
+
+
+class CollocationFinder(AbstractGaitFinder):
+    """Finder of limit cycles that needs no start. `period_n` applies to `find_cycle` alone."""
+
+    model: ViscoelasticWheel
+    n_legs: int = eqx.field(static=True)
+    step_options: StepOptions
+    cycle_options: CycleOptions = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+
+    options_type: ClassVar[type] = CycleOptions
+    cycle_measures: ClassVar[tuple[str, ...]] = tuple(CYCLE_MEASURE_FUNCTIONS)
+    readable_measures: ClassVar[tuple[str, ...]] = (
+        *cycle_measures, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
+        *(n for n in MARGIN_MEASURES if n not in CYCLE_MEASURE_FUNCTIONS),
+    )  # fmt: skip
+    differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in readable_measures if not MEASURES[n].dimension
+    )
+    supports_cold_start: ClassVar[bool] = True
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in cycle_measures if n != "spectral_margin"
+    )
+
+    @classmethod
+    def from_options(
+        cls,
+        model: Any,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
+    ) -> "CollocationFinder":
+        return cls(model, n_legs, step_options, cycle_options, period_n)
+
+    @property
+    def search_options(self) -> CycleOptions:
+        return self.cycle_options
+
+    @property
+    def system(self) -> CollocationSystem:
+        return CollocationSystem(
+            self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
+        )
+
+    def finer(self) -> "CollocationFinder":
+        return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
+
+    @classmethod
+    def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        """Return a measure of a gait by name.
+
+        If the foot scuffs at take-off, the clearance in SLS-I is that in SLS-II, because it would
+        jump otherwise. Callers must check `takeoff_acceleration` too.
+        """
+        value = cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
+        if name == "clearance_sls1":
+            scuffs = cycle.measure("takeoff_acceleration") < 0.0
+            return jnp.where(scuffs, step.measures()["clearance_sls2"], value)
+        return value
+
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
+        if isinstance(guess, LimitCycle) and guess.system == self.system:
+            guess = guess.collocation_state
+        elif guess is not None and not isinstance(guess, CollocationState):
+            section_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+            params, state, _, _ = validate_arguments(params, section_state, None, None)
+            guess = self.guess_from_state(*lax.stop_gradient((params, state)))
+        return dataclasses.replace(find_limit_cycle(params, self.system, guess), model=self.model)
+
+    def guess_from_state(self, params: WheelParams, x: SectionState) -> CollocationState:
+        """Return a start of the search: the next `period_n` steps of a walk from section
+        state `x`."""
+        walk = sample_walk(self.model, params, x, self.period_n)
+        return guess_from_walk(self.system, params, walk)
+
+    @eqx.filter_jit
+    def shift_first_step(
+        self, step_index: int, params: WheelParams, collocation_state: CollocationState
+    ) -> CollocationState:
+        """Return the same cycle with another of its steps as the first one."""
+        end_before = collocation_state.ends[step_index - 1]
+        landing = transitions.land(params.symbols(), end_before[0], *end_before[2:])
+        solution, is_active, ends = jax.tree.map(
+            lambda x: jnp.roll(x, -step_index, 0),
+            (collocation_state.solution, collocation_state.phase_active, collocation_state.ends),
+        )
+        section = jnp.stack([landing.theta, landing.motion.dtheta])
+        return collocation_state._replace(
+            solution=solution._replace(section_state=section), phase_active=is_active, ends=ends
+        )
+
+    def transfer_to_mesh(
+        self, system: CollocationSystem, collocation_state: CollocationState
+    ) -> CollocationState:
+        """Return a start on the mesh of `system` from a solution on this finder's mesh."""
+        solution = transfer_to_mesh(system, self.system, collocation_state.solution)
+        return collocation_state._replace(solution=solution)
+
+    @eqx.filter_jit
+    def initial_guess(self, values: Values) -> CollocationState:
+        start = surface_start(self.system, values[:, None], jnp.ones((1,), bool))
+        return jax.tree.map(lambda x: x[..., 0], start)
+
+    def find_gait(self, values: Values, guess: CollocationState) -> Gait:
+        cycle, d_cycle = cycle_with_jacobian(self.system, values, guess)
+        x, dx = cycle.section_state, d_cycle.section_state
+        step, d_step = step_with_jacobian(self.model, self.n_legs, values, x, dx, self.step_options)
+        gait_coordinates = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
+        branch_data = (
+            gait_coordinates(cycle),
+            gait_coordinates(d_cycle),
+            cycle.collocation_state.phase_active,
+            cycle.monodromy_value,
+        )
+        return Gait(cycle, step, d_cycle, d_step, BranchPoint(*branch_data))
+
+    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
+        if set(names) <= set(self.cycle_measures):
+            return measure_from_cycle(self, values, guess, names)
+        cycle: Any = None if guess is None else self.find_cycle_from_values(values, guess)
+        start = self.initial_guess(values) if cycle is None else cycle.collocation_state
+        return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
+
+    def precompile(self, params: WheelParams) -> None:
+        values = stack_parameters(params)
+        x = jnp.asarray(self.model.default_start(params), values.dtype)
+        dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
+        with ThreadPoolExecutor(2) as pool:
+            cycle = pool.submit(
+                cycle_with_jacobian, self.system, values, self.initial_guess(values)
+            )
+            step = pool.submit(
+                step_with_jacobian, self.model, self.n_legs, values, x, dx, self.step_options
+            )
+            cycle.result(), step.result()
+
+
+@eqx.filter_jit
+def cycle_with_jacobian(
+    system: CollocationSystem, values: Array, guess: CollocationState
+) -> tuple[LimitCycle, LimitCycle]:
+    """Return the cycle near `guess`, and its derivatives with respect to all parameters as a
+    leading axis."""
+
+    find_cycle = lambda values: find_limit_cycle(
+        wheel_from_parameters(values, system.n_legs), system, guess
+    )
+    cycle, jacobian = value_and_jacobian(find_cycle, values)
+    return cycle, move_derivative_axis_first(jacobian)
+
+
+@eqx.filter_jit
+def step_with_jacobian(
+    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: StepOptions
+) -> tuple[StepResult, StepResult]:
+    """Return one step and its derivatives with respect to all parameters if its start moves by `dx`
+    with them."""
+
+    n_values = values.shape[0]
+    take_step = lambda inputs: model.take_step(
+        wheel_from_parameters(inputs[:n_values], n_legs), inputs[n_values:], options
+    )
+    step, jacobian = value_and_jacobian(take_step, jnp.concatenate([values, x]))
+    input_tangents = jnp.concatenate([jnp.eye(n_values, dtype=x.dtype), dx], axis=1)
+    return step, move_derivative_axis_first(
+        jax.tree.map(lambda derivative: derivative @ input_tangents.T, jacobian)
+    )

@@ -1,0 +1,135 @@
+"""Selection of the finder for a model, and checks of the arguments for a search."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycles.collocation_finder import CollocationFinder
+from vrw_jax.cycles.collocation_search import CollocationState
+from vrw_jax.cycles.cycle import AbstractCycle
+from vrw_jax.cycles.finder import AbstractGaitFinder
+from vrw_jax.cycles.limit_cycle_result import LimitCycle
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.return_map_finder import ReturnMapCycle, ReturnMapFinder
+from vrw_jax.cycles.unilateral_finder import UnilateralFinder
+from vrw_jax.numerics import StepOptions
+from vrw_jax.printing import format_numbers
+from vrw_jax.simulation import (
+    ModelLike,
+    check_model,
+    check_options,
+    check_section_state,
+    check_single_wheel,
+)
+from vrw_jax.validation import check_type, is_traced
+from vrw_jax.wheel import WheelParams
+
+Guess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
+"""A neighbor's cycle, or a section state near the wanted gait."""
+
+FINDER_CLASSES: dict[str, type[AbstractGaitFinder]] = {
+    "viscoelastic": CollocationFinder, "unilateral": UnilateralFinder
+}  # fmt: skip
+"""Finder class by name of the model; all other models use `ReturnMapFinder`."""
+
+
+def make_finder(
+    model: ModelLike | None,
+    n_legs: int,
+    *,
+    period_n: int = 1,
+    cycle_options: CycleOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> AbstractGaitFinder:
+    """Return the finder that finds, checks and differentiates gaits of this model."""
+    if cycle_options is not None:
+        check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
+    resolved_model = check_model(model)
+    make_from_options = FINDER_CLASSES.get(resolved_model.model_name, ReturnMapFinder).from_options
+    return make_from_options(resolved_model, n_legs, check_options(step_options), period_n,
+                CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
+
+
+def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
+    """Return the model of this wheel's gait: for the ladder, the lowest model whose margins are
+    met.
+
+    The paper's gait is tried first. If it is not found or violates a margin on this ground, the
+    upper model is returned. Any other model is returned unchanged. The ladder is returned unchanged
+    if the parameters have no values.
+    """
+    return resolve_model_with_reason(params, model)[0]
+
+
+def resolve_model_with_reason(
+    params: WheelParams, model: ModelLike | None
+) -> tuple[ModelLike | None, str | None]:
+    """Return `resolve_model` and, for the ladder, the reason in one sentence."""
+    ladder: Any = check_model(model)
+    if ladder.fallback_model is ladder or not isinstance(params, WheelParams):
+        return model, None
+    if is_traced(params, model) or params.damping.ndim:
+        return model, None
+    cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
+    if not bool(cycle.found):
+        return ladder.fallback_model, f"The paper's wheel has no gait: {cycle.why}"
+    section_state = ladder.embed_section(params, cycle.section_state)
+    choice = ladder.choose_model(params, section_state, StepOptions())[0]
+    return choice.model, choice.why
+
+
+def check_guess(guess: Any) -> Any:
+    """Return a user's guess: a cycle, a `CollocationState` or a finite section state.
+
+    Raises: ValueError: the section state is not finite.
+    """
+    if guess is None or isinstance(guess, AbstractCycle | CollocationState):
+        return guess
+    state = check_section_state(guess, "guess")
+    if not is_traced(state) and not np.isfinite(state).all():
+        raise ValueError(
+            f"guess is {format_numbers(state)}, but a search can begin at finite numbers only: give a "
+            "neighbour's cycle, or a section state near the gait."
+        )
+    return state
+
+
+def resolve_finder(
+    params: WheelParams,
+    model: ModelLike | None,
+    options: CycleOptions | StepOptions | None,
+    period_n: int = 1,
+) -> AbstractGaitFinder:
+    """Return the finder for these options, after checks of the arguments.
+
+    Raises: TypeError, ValueError: the arguments do not fit the model.
+    """
+    check_single_wheel(
+        params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
+    )
+    if options is not None:
+        check_type("options", options, (CycleOptions, StepOptions), "give vrw.CycleOptions()")
+    has_cycle_options = isinstance(options, CycleOptions)
+    finder = make_finder(
+        model,
+        params.n_legs,
+        period_n=period_n,
+        cycle_options=options if has_cycle_options else None,  # type: ignore[arg-type]
+        step_options=None if has_cycle_options else options,  # type: ignore[arg-type]
+    )
+    if options is not None and not isinstance(options, finder.options_type):
+        if has_cycle_options:
+            raise TypeError(
+                f"options is a CycleOptions, but {type(finder.model).__name__} is solved on its "
+                "return map: give the vrw.StepOptions of its step."
+            )
+        raise TypeError(
+            "options is an Options, but the paper's wheel is solved by collocation: "
+            "give vrw.CycleOptions(), or CycleOptions.tight()."
+        )
+    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    return finder

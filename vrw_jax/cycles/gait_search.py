@@ -1,0 +1,534 @@
+"""Limit cycles wherever a gait can be reached: by a search, on finer meshes, or from walks.
+
+The search (`cycles`) starts from predicted gaits of the paper's parameter ranges, on a mesh that
+suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the wheel. A
+walk that continues is the start of another search. If the mesh is too coarse, it is refined. These
+fallbacks depend on concrete values; under a `jit` or `vmap` of the caller only the search runs.
+"""
+
+import functools
+from typing import Any, Literal, NamedTuple, get_args, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from vrw_jax import cycles
+from vrw_jax.batches import step_batch
+from vrw_jax.cycles.attracting_gaits import (
+    START_DISTANCE,
+    compute_fallback_starts,
+    compute_walk_starts,
+    find_attracting_gaits,
+    find_slowest_indices,
+)
+from vrw_jax.cycles.collocation_finder import CollocationFinder
+from vrw_jax.cycles.collocation_search import CollocationState
+from vrw_jax.cycles.finder import AbstractGaitFinder
+from vrw_jax.cycles.finder_selection import Guess
+from vrw_jax.cycles.limit_cycle_result import LimitCycle
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.return_map_finder import ReturnMapCycle
+from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.simulation import ModelLike
+from vrw_jax.validation import check_choice, check_int, check_not_traced, is_traced
+from vrw_jax.wheel import Outcome, WheelParams, stack_parameters
+
+RETRY_OUTCOMES = (
+    Outcome.NO_CYCLE_FOUND,
+    Outcome.EVENT_ORDER_MISMATCH,
+    Outcome.BRANCH_ENDS_BEFORE_TARGET,
+    Outcome.MESH_TOO_COARSE,
+)
+"""Outcomes of a search that may have missed a gait."""
+
+REFINE_ABOVE_MESH_ERROR = 1e-7
+"""Estimate of the mesh's error above which a finer mesh is used. The errors themselves are a
+hundredth of it, as the options promise."""
+
+N_GAIT_WALK_STEPS = 80
+"""Number of steps of a walk towards a gait of the paper's model."""
+
+MAX_MESH_REFINEMENTS = 3
+"""Largest number of times that a mesh is made twice as fine."""
+
+GAIT_BATCH_SIZES = (8, 64, 512, 4096)
+"""Batch sizes that programs are compiled for. A single wheel takes the time of eight."""
+
+
+FailureValue = Literal["zeros", "nan"]
+FAILURE_VALUES: tuple[str, ...] = get_args(FailureValue)
+
+GaitChoice = Literal["slowest", "fastest"] | int
+"""Choice among the attracting gaits of a wheel, by speed: the slowest, the fastest, or an index,
+slowest first."""
+
+
+@overload
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: None = None,
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
+) -> LimitCycle: ...
+
+
+@overload
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: ModelLike,
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle: ...
+
+
+def limit_cycle(
+    params: WheelParams,
+    *,
+    guess: Guess | None = None,
+    period_n: int = 1,
+    model: ModelLike | None = None,
+    options: CycleOptions | StepOptions | None = None,
+    on_failure: FailureValue = "zeros",
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle:
+    """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
+
+    For `period_n` 1 no start is needed. With a `guess`, a neighbor's cycle or a section state
+    (theta-, dtheta-, dL1-) near the gait, the search is faster and selects that branch. Found
+    cycles satisfy the paper's sequence of phases at all nodes, stable or not. Errors are 1e-9
+    relative in values and 1e-8 in first derivatives. Without `options` the mesh is made as fine as
+    these errors require. With `options` the mesh is fixed, and `mesh_error` estimates its error.
+    The cycle is differentiable in every mode and order.
+
+    If the search fails, walks and finer meshes are tried. Under `jax.jit` and `jax.vmap` neither is
+    possible; the search then runs alone, on the mesh of the options. See `limit_cycles`.
+
+    If no gait is found, `outcome` and `explanation` give the reason, and numbers and derivatives
+    are zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
+    unnoticed.
+
+    For any other model, the fixed point of its return map is computed, with the `StepOptions` of
+    its step. The result is a `ReturnMapCycle` with the errors of the step. With unilateral contact
+    several gaits may attract. Without a `guess`, walks from a stated set of starts distinguish them
+    (`cycles.attracting_gaits`). `which` selects the "slowest", the "fastest" or an index in their
+    list, slowest first. `limit_cycles` returns all. Model "auto" selects the lowest model whose
+    margins the gait meets on its ground. A `LimitCycle` then belongs to the paper's model, a
+    `ReturnMapCycle` to unilateral contact.
+
+    Args:
+        params: the wheel.
+        guess: a neighbor's cycle, or a section state near the gait; a cycle that was not found
+            counts as no guess.
+        period_n: number of steps after which the gait repeats.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: `CycleOptions`; for other models `StepOptions`.
+        on_failure: values where there is no gait, "zeros" or "nan".
+        which: with unilateral contact "slowest", "fastest", or an index in the list, slowest first.
+
+    Returns:
+        A `LimitCycle`; a `ReturnMapCycle` for other models.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams())
+        >>> print(f"{cycle.dls_fraction:.4f} {cycle.speed:.4f} m/s")
+        0.5315 0.8700 m/s
+        >>> gradient = jax.grad(lambda p: vrw.limit_cycle(p).dls_fraction)(vrw.WheelParams())
+        >>> print(f"{gradient.damping:.6f} per N s/m")
+        0.000115 per N s/m
+    """
+    parse_gait_choice(which)
+    model = cycles.resolve_model(params, model)
+    finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
+    uses_nan = check_choice("lost", on_failure, FAILURE_VALUES) == "nan"
+    if guess is None and period_n > 1 and not finder.is_multistable:
+        raise ValueError(
+            f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
+            "many beside the gait of one step: give guess=, a section state near it."
+        )
+    cycle: Any = _search_with_fallbacks(
+        finder, params, cycles.check_guess(guess), options is None, which
+    )
+    return cycle.replace_missing_by_nan(params) if uses_nan else cycle
+
+
+def limit_cycles(
+    params: WheelParams,
+    *,
+    period_n: int = 1,
+    model: ModelLike | None = None,
+    options: CycleOptions | StepOptions | None = None,
+    which: GaitChoice = "slowest",
+) -> LimitCycle | ReturnMapCycle:
+    """Return `limit_cycle` of a batch of wheels. Fields of `params` and of the result have one
+    leading axis.
+
+    All cycles are computed on one mesh, as fine as any of them needs. For a single wheel with
+    unilateral contact, return all attracting gaits, slowest first.
+
+    Args:
+        params: the wheels; fields are scalars or of shape (wheels,).
+        period_n: number of steps after which the gaits repeat.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: as in `limit_cycle`.
+        which: as in `limit_cycle`, for batches.
+
+    Returns:
+        A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over wheels.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> cycles = vrw.limit_cycles(vrw.WheelParams(damping=np.array([100.0, 150.0, 300.0])))
+        >>> cycles.found.tolist(), cycles.period.round(3).tolist()
+        ([True, True, False], [0.595, 0.6980000000000001, 0.0])
+    """
+    parse_gait_choice(which)
+    shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
+    if not shape:
+        model = cycles.resolve_model(params, model)
+        finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
+        if finder.is_multistable:
+            check_not_traced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
+            return find_attracting_gaits(finder, finder.model.parameter_values(params)[None])[1]
+    if len(shape) != 1:
+        raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
+    single_params = jax.tree.map(lambda x: x[0], params)
+    finder = cycles.resolve_finder(single_params, model, options, check_int("period_n", period_n))
+    cycle: Any = _search_with_fallbacks(finder, params, None, options is None, which)
+    return cycle
+
+
+def parse_gait_choice(which: GaitChoice) -> int:
+    """Return the index of a gait in a list sorted by speed, slowest first.
+
+    Raises: ValueError: the choice is neither a name nor an integer.
+    """
+    if which in ("slowest", "fastest"):
+        return 0 if which == "slowest" else -1
+    if isinstance(which, str) or int(which) != which:
+        raise ValueError(
+            f"which is {which!r}, but it names one of a wheel's gaits: give 'slowest', 'fastest' "
+            "or its place in vrw.limit_cycles(params, model=...)."
+        )
+    return int(which)
+
+
+def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
+    n_wheels, rank = params.damping.shape[0], parse_gait_choice(which)
+    wheel_index, gaits = find_attracting_gaits(finder, jax.vmap(finder.model.values)(params))
+    n_gaits_per_wheel = np.bincount(wheel_index, minlength=n_wheels)
+    too_few = n_gaits_per_wheel[(rank >= n_gaits_per_wheel) | (rank < -n_gaits_per_wheel)]
+    if len(too_few):
+        n_gaits = int(too_few[0])
+        raise ValueError(
+            f"which is {which}, but {n_gaits} gait{'s' * (n_gaits > 1)} of this wheel attract"
+            f"{'s' * (n_gaits == 1)}: vrw.limit_cycles(params, model=...) returns them."
+        )
+    return _take_rows_on_device(
+        gaits, find_slowest_indices(wheel_index, n_wheels) + rank % n_gaits_per_wheel
+    )
+
+
+def _search_with_fallbacks(
+    finder: Any, params: WheelParams, guess: Any, refines_mesh: bool, which: GaitChoice
+) -> Any:
+    """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
+    is_batch = params.damping.ndim > 0
+    params_without_tangents = lax.stop_gradient(params)
+    is_traced_value, is_concrete = is_traced(params_without_tangents), not is_traced(params)
+    if finder.is_multistable and guess is None and not is_traced_value:
+        cycle = _select_gait(
+            finder,
+            params_without_tangents
+            if is_batch
+            else _take_rows_on_device(params_without_tangents, None),
+            which,
+        )
+        cycle = cycle if is_batch else _take_rows_on_device(cycle, 0)
+        return cycle if is_concrete else _search(finder, params, cycle.section_state)
+    cycle = _search(finder, params, guess)
+    params_and_cycle = lax.stop_gradient((params, cycle))  # differentiated arrays have values, too
+    if not finder.supports_cold_start or is_traced(params_and_cycle):
+        return cycle
+    if not is_batch:
+        params_and_cycle = _take_rows_on_device(params_and_cycle, None)
+    fallback = _fallback_starts(finder, *params_and_cycle, refines_mesh)
+    if finder.period_n > 1 and guess is not None:
+        section_state = np.asarray(_guess_section_state(guess))[None]
+        if fallback is None:
+            fallback = _retry_from_other_steps(finder, *params_and_cycle, section_state)
+        fallback = _align_first_step(finder, *params_and_cycle, section_state, fallback)
+    if fallback is None:
+        return cycle
+    finder, collocation_state = fallback
+    if is_concrete:
+        cycle = map_in_batches(
+            finder.find_cycles, GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
+        )  # a compiled program
+        return cycle if is_batch else _take_rows_on_device(cycle, 0)
+    return _search(
+        finder,
+        params,
+        jax.device_put(collocation_state)
+        if is_batch
+        else _take_rows_on_device(collocation_state, 0),
+    )
+
+
+def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+    return (finder.find_cycles if params.damping.ndim else finder.find_cycle)(params, guess)
+
+
+def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
+    """Return rows of a tree by numpy, because JAX would compile a program for each shape."""
+    return jax.device_put(take_rows(tree, row_indices))
+
+
+def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
+    def replace(leaf: Any, new_rows: Any) -> np.ndarray:
+        leaf = np.array(leaf)
+        leaf[row_indices] = new_rows
+        return leaf
+
+    return jax.tree.map(replace, tree, values)
+
+
+def _walk_and_measure_defect(
+    finder: CollocationFinder, params: WheelParams, start_states: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Walk N_GAIT_WALK_STEPS from each state and measure the defect of one more period.
+
+    The defect is infinite where a walk ended early.
+    """
+    walk_result = step_batch(params, start_states, N_GAIT_WALK_STEPS, model=finder.model)
+    states, continues = (
+        np.array(walk_result.section_state),
+        np.asarray(walk_result.outcome) == Outcome.STEPPED,
+    )
+    period_defect = np.full(len(states), np.inf)
+    if continues.any():
+        next_period = step_batch(
+            _take_rows_on_device(params, continues),
+            states[continues],
+            finder.period_n,
+            model=finder.model,
+        )
+        distance = np.abs(np.asarray(next_period.section_state) - states[continues]).max(-1)
+        period_defect[continues] = np.where(
+            np.asarray(next_period.outcome) == Outcome.STEPPED, distance, np.inf
+        )
+    return states, period_defect
+
+
+class _WalkResults(NamedTuple):
+    """State of a batch of wheels after walks of N_GAIT_WALK_STEPS."""
+
+    is_usable: np.ndarray  # whether a walk continues, and repeats to START_DISTANCE
+    section_states: np.ndarray  # (wheels, 3): section state of the walk that repeats best
+
+
+def _walk_from_all_starts(
+    finder: CollocationFinder, params: WheelParams, is_wanted: np.ndarray
+) -> _WalkResults:
+    n_wheels, indices = len(is_wanted), np.flatnonzero(is_wanted)
+    smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
+    for compute_starts in (compute_walk_starts, compute_fallback_starts):
+        own_params = _take_rows_on_device(params, indices)
+        for start in compute_starts(own_params) if len(indices) else ():
+            states, period_defect = _walk_and_measure_defect(finder, own_params, start)
+            is_better = period_defect < smallest_defect[indices]
+            better_indices = indices[is_better]
+            smallest_defect[better_indices], section_states[better_indices] = (
+                period_defect[is_better],
+                states[is_better],
+            )
+        indices = np.flatnonzero(is_wanted & (smallest_defect >= START_DISTANCE))
+    return _WalkResults(smallest_defect < START_DISTANCE, section_states)
+
+
+def _initial_guesses(
+    finder: CollocationFinder,
+    params: WheelParams,
+    collocation_state: CollocationState,
+    has_state: np.ndarray,
+    walk_results: _WalkResults,
+) -> CollocationState:
+    """Return the starts of searches: the known states, else states from walks, else the surface of
+    gaits."""
+    guesses = map_in_batches(
+        lambda batch_params: finder.initial_guesses(stack_parameters(batch_params).T),
+        GAIT_BATCH_SIZES,
+        params,
+    )
+    from_walk = np.flatnonzero(walk_results.is_usable & ~has_state)
+    if len(from_walk):
+        guess_from_state = jax.vmap(finder.guess_from_state)
+        guesses = _replace_rows(
+            guesses,
+            from_walk,
+            map_in_batches(
+                guess_from_state,
+                GAIT_BATCH_SIZES,
+                _take_rows_on_device(params, from_walk),
+                walk_results.section_states[from_walk],
+            ),
+        )
+    return _replace_rows(guesses, has_state, _take_rows_on_device(collocation_state, has_state))
+
+
+def _fallback_starts(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, refines_mesh: bool
+) -> tuple[CollocationFinder, CollocationState] | None:
+    """Return a finder, and starts from which it finds more of a batch's gaits; None if there are
+    none.
+
+    `refines_mesh` allows a finer mesh.
+    """
+    outcome = np.asarray(cycle.outcome)
+    is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > REFINE_ABOVE_MESH_ERROR)
+    is_missing = np.isin(outcome, RETRY_OUTCOMES)
+    is_open = is_missing | is_rough
+    if not is_open.any():
+        return None
+    walk_results = _walk_from_all_starts(finder, params, is_missing)
+    # Best start of each wheel so far, found by a search, on the mesh of `finder`.
+    collocation_state, has_state = cycle.collocation_state, is_rough.copy()
+    is_coarse = outcome == Outcome.MESH_TOO_COARSE
+    best_result = None
+    for refinement_index in range(1 + MAX_MESH_REFINEMENTS * refines_mesh):
+        if refinement_index:
+            coarser_finder, finder = finder, finder.finer()
+            transfer = jax.vmap(functools.partial(finder.transfer_to_mesh, coarser_finder.system))
+            collocation_state = map_in_batches(transfer, GAIT_BATCH_SIZES, collocation_state)
+        # The search without walks has used this mesh already. One finer mesh is always tried.
+        is_promising = (
+            walk_results.is_usable
+            | has_state
+            | (is_coarse & (refinement_index > 0))
+            | (refinement_index == 1)
+        )
+        indices = np.flatnonzero(is_open & is_promising)
+        if not len(indices):
+            continue
+        subset_params, subset_walks = (
+            _take_rows_on_device(params, indices),
+            _WalkResults(*(part[indices] for part in walk_results)),
+        )
+        guesses = _initial_guesses(
+            finder,
+            subset_params,
+            _take_rows_on_device(collocation_state, indices),
+            has_state[indices],
+            subset_walks,
+        )
+        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, guesses)
+        is_found, mesh_error = np.asarray(retry.found), np.asarray(retry.mesh_error)
+        collocation_state = _replace_rows(
+            collocation_state,
+            indices[is_found],
+            _take_rows_on_device(retry.collocation_state, is_found),
+        )
+        if is_found.any():
+            best_result = finder, collocation_state
+        has_state[indices[is_found]] = True
+        is_coarse[indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
+        is_open[
+            indices[is_found & ((mesh_error <= REFINE_ABOVE_MESH_ERROR) | (not refines_mesh))]
+        ] = False
+    return best_result
+
+
+def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
+    """Return the search's result, with cycles from walks where the search found none, on the same
+    mesh."""
+    fallback = _fallback_starts(finder, params, search_result, refines_mesh=False)
+    if fallback is None:
+        return search_result
+    cycle: LimitCycle = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params, fallback[1])
+    return cycle
+
+
+def _guess_section_state(guess: Any) -> Any:
+    """Return the section state of a guess, which is a cycle, a `CollocationState` or a section
+    state."""
+    if isinstance(guess, CollocationState):
+        return guess.ends[-1][jnp.array([0, 2, 3])]
+    return getattr(guess, "section_state", guess)
+
+
+def _retry_from_other_steps(
+    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
+) -> tuple[CollocationFinder, CollocationState] | None:
+    """Search for the same orbit with another of its steps as the first one.
+
+    A guess contains the accelerations of all steps, whose errors accumulate. A step without double
+    support is the most sensitive. As the first or last step it may make the guess fail.
+    """
+    missing = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
+    if not len(missing):
+        return None
+    subset_params, section_states, best_result = (
+        _take_rows_on_device(params, missing),
+        np.array(section_states[missing]),
+        None,
+    )
+    collocation_state = cycle.collocation_state
+    for _ in range(1, finder.period_n):
+        section_states = np.asarray(
+            step_batch(subset_params, section_states, model=finder.model).section_state
+        )
+        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, section_states)
+        found_indices = np.flatnonzero(
+            np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing] < 0.5)
+        )
+        if len(found_indices):
+            collocation_state = _replace_rows(
+                collocation_state,
+                missing[found_indices],
+                _take_rows_on_device(retry.collocation_state, found_indices),
+            )
+            best_result = finder, collocation_state
+    return best_result
+
+
+def _align_first_step(
+    finder: CollocationFinder,
+    params: WheelParams,
+    cycle: LimitCycle,
+    first_states: np.ndarray,
+    fallback: tuple[CollocationFinder, CollocationState] | None,
+) -> tuple[CollocationFinder, CollocationState] | None:
+    """Return the same orbits with the step nearest to `first_states` as the first one."""
+    finder, collocation_state = fallback or (finder, cycle.collocation_state)
+    ends = np.asarray(collocation_state.ends)[:, :, [0, 2, 3]]
+    distances = np.abs(np.roll(ends, 1, axis=1) - first_states[:, None]).max(-1)
+    distances = np.where(np.asarray(collocation_state.found)[:, None] > 0.5, distances, 0.0)
+    for step_index in range(1, finder.period_n):
+        indices = np.flatnonzero(np.argmin(distances, 1) == step_index)
+        if len(indices):
+            shift_step = jax.vmap(functools.partial(finder.shift_first_step, step_index))
+            collocation_state = _replace_rows(
+                collocation_state,
+                indices,
+                shift_step(
+                    _take_rows_on_device(params, indices),
+                    _take_rows_on_device(collocation_state, indices),
+                ),
+            )
+            fallback = finder, collocation_state
+    return fallback

@@ -1,0 +1,111 @@
+"""Prediction of gaits by a cubic surface fitted to the gaits of many wheels; the start of every
+search.
+
+Lengths are in L0, times in sqrt(L0 / g) and masses in the total mass, so that wheels of any size
+are covered. The surface was fitted by experiments/gaits/fit_surface.py to the gaits that a
+continuation from Table 1 reaches. The fit uses Table 1's mass ratio, center of mass and eight legs.
+There it is accurate to about 1 %. Elsewhere it is clipped to its range and is a start for a
+homotopy.
+"""
+
+import functools
+import importlib.resources
+import itertools
+import operator
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution, PhaseMesh, mesh_transfer_matrix
+from vrw_jax.numerics import Elementwise
+from vrw_jax.wheel import WheelParams
+
+SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
+"""Meshes of the surface's accelerations, for DLS, SLS-I and SLS-II."""
+PHASE_DIMENSIONS = (1, 3, 2)
+SURFACE_DEGREE = 3
+
+
+class GaitSurface(NamedTuple):
+    """Coefficients (monomial, unknown) over centered coordinates, and the range of the
+    coordinates."""
+
+    centre: np.ndarray
+    spread: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    coefficients: np.ndarray
+
+
+@functools.cache
+def load_surface() -> GaitSurface:
+    file = importlib.resources.files(__package__) / "surface.npz"
+    with file.open("rb") as stream, np.load(stream) as arrays:
+        return GaitSurface(**{name: arrays[name] for name in GaitSurface._fields})
+
+
+def time_unit(params: WheelParams) -> Elementwise:
+    """Return the wheel's unit of time, sqrt(L0 / g), s."""
+    return jnp.sqrt(params.locked_length / params.gravity)
+
+
+def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
+    """Return the root of damping, stiffness, natural length and slope, unitless."""
+    mass = params.hub_mass + params.n_legs * params.leg_mass
+    length, gravity = params.locked_length, params.gravity
+    return (
+        jnp.sqrt(params.damping * time_unit(params) / mass),
+        params.stiffness * length / (mass * gravity),
+        params.natural_length / length,
+        params.slope,
+    )
+
+
+def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
+    ones = jnp.ones_like(centered[0])
+    return [
+        functools.reduce(operator.mul, factors, ones)
+        for degree in range(SURFACE_DEGREE + 1)
+        for factors in itertools.combinations_with_replacement(centered, degree)
+    ]
+
+
+def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
+    """Return section, durations and accelerations on `meshes` of the surface's gait, with lanes
+    last."""
+    surface = load_surface()
+    ranges = (x.tolist() for x in surface[:4])  # Python floats preserve the dtype of the parameters
+    centered = tuple(
+        (jnp.clip(x, lower, upper) - center) / spread
+        for x, center, spread, lower, upper in zip(
+            surface_coordinates(params), *ranges, strict=True
+        )
+    )
+    features = jnp.stack(evaluate_monomials(centered))
+    values = jnp.tensordot(jnp.asarray(surface.coefficients.T, features.dtype), features, 1)
+    time_scale = time_unit(params)
+    section = jnp.stack([values[0], values[1] / time_scale])
+    durations = values[None, 2:5] * time_scale
+    accelerations, start_index = [], 5
+    for dim, surface_mesh, mesh in zip(PHASE_DIMENSIONS, SURFACE_MESHES, meshes, strict=True):
+        size = surface_mesh.n_intervals * N_GAUSS_NODES * dim
+        flat = values[start_index : start_index + size].reshape(-1, dim, *features.shape[1:])
+        start_index += size
+        matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), features.dtype)
+        scale = _acceleration_scale(dim, params, time_scale)
+        phase_accelerations = jnp.tensordot(matrix, flat, 1) * scale
+        accelerations.append(
+            phase_accelerations.reshape(
+                1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
+            )
+        )
+    return CollocationSolution(section, durations, tuple(accelerations))
+
+
+def _acceleration_scale(dim: int, params: WheelParams, time_scale: Elementwise) -> Array:
+    """Return the units of the accelerations of (theta, L1, L2)."""
+    angle_scale = 1.0 / time_scale**2
+    length_scale = params.locked_length / time_scale**2
+    return jnp.stack([angle_scale, length_scale, length_scale][:dim])

@@ -1,0 +1,342 @@
+"""Limit cycles of the paper's model as differentiable functions of its parameters.
+
+The search (see `collocation_search`) carries no derivative. Derivatives come from the implicit
+function theorem: they are the tangents of the linearized pass at the cycle. They are valid on
+unstable cycles, in forward and reverse mode, and to any order.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.collocation import (
+    N_GAUSS_NODES,
+    CollocationSolution,
+    estimate_mesh_error,
+    mesh_transfer_matrix,
+)
+from vrw_jax.continuation import floquet
+from vrw_jax.cycles.collocation_search import (
+    MESH_CHECK,
+    CollocationState,
+    CollocationSystem,
+    init_search_flags,
+)
+from vrw_jax.cycles.cycle import AbstractCycle
+from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle_with_derivatives
+from vrw_jax.cycles.margin_defaults import gait_takeoff_acceleration
+from vrw_jax.cycles.phase_sequence import ADMISSIBILITY_CHECKS
+from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
+from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
+from vrw_jax.printing import TextRow, format_numbers
+from vrw_jax.simulation import step
+from vrw_jax.wheel import (
+    Motion,
+    Outcome,
+    Symbols,
+    WheelParams,
+    make_phases,
+    stack_parameters,
+    transitions,
+    wheel_from_parameters,
+)
+
+
+class LimitCycle(AbstractCycle):
+    """Gait of the paper's model, found by collocation. Batched under vmap.
+
+    See `AbstractCycle`. It is differentiable in the parameters, in every mode and to any order.
+
+    - `section_state`: (theta-, dtheta-, dL1-) before touchdown, fixed under return_map;
+    - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
+    - `durations`: of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1;
+    - `step_length`: distance between the feet at the landing, m; (n,) for n > 1;
+    - `indicators`: of the landing; (n,) each for n > 1;
+    - `outcome`: Outcome.STEPPED, or the reason of the failure;
+    - `residual`: last correction of Newton's method, rad, rad/s, s or m;
+    - `n_newton_iterations`: number of linearized passes of the search;
+    - `parameters`: in the order of params.PARAMETER_NAMES;
+    - `collocation_state`: the solution with its phases, a start for neighbors;
+    - `monodromy_value`: monodromy matrix, without derivative;
+    - `system`, `model`: the collocation system and the model.
+
+    Examples:
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams())
+        >>> bool(cycle.found), cycle.multipliers.round(3).tolist()
+        (True, [(0.329+0j), (0.022-0j)])
+    """
+
+    section_state: SectionState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "*n 3"]
+    step_length: Float[Array, "*n"]
+    indicators: DoubleSupportIndicators
+    outcome: Int[Array, ""]
+    residual: Scalar
+    n_newton_iterations: Int[Array, ""]
+    parameters: Float[Array, " n_parameters"]
+    collocation_state: CollocationState
+    monodromy_value: Float[Array, "2 2"]
+    system: CollocationSystem = eqx.field(static=True)
+    model: ViscoelasticWheel = eqx.field(
+        default_factory=ViscoelasticWheel
+    )  # whose ground `margins` uses
+
+    @property
+    def period_n(self) -> int:
+        return self.system.period_n
+
+    @property
+    def warm_start(self) -> CollocationState:
+        return self.collocation_state
+
+    def _map_over_batch(self, function: Callable) -> Callable:
+        """Map a function of one cycle over the axes of this batch."""
+        for _ in range(self.outcome.ndim):
+            function = jax.vmap(function)
+        return function
+
+    @property
+    def monodromy(self) -> Float[Array, "... 2 2"]:
+        """Return the Jacobian of the return map on the section after the impact, over (theta+,
+        dtheta+).
+
+        A third multiplier, on the section before the impact, is zero.
+        """
+        attach_function = attach_monodromy if is_inside_jit() else _compiled_attach_monodromy
+        attach = self._map_over_batch(functools.partial(attach_function, self.system))
+        return attach(self.monodromy_value, self.parameters, self.collocation_state)
+
+    @property
+    def jury_margins(self) -> Array:
+        """Return the margins to fold, period doubling and Neimark-Sacker: see
+        floquet.jury_margins."""
+        return floquet.jury_margins(self.monodromy)
+
+    @property
+    def has_double_multiplier(self) -> Bool[Array, "..."]:
+        """Return whether the spectral radius has a kink because two multipliers are equal."""
+        return floquet.has_double_multiplier(self.monodromy_value) & self.found
+
+    @property
+    def mesh_error(self) -> Array:
+        """Return an estimate of the mesh's error, mostly too large: see
+        collocation.estimate_mesh_error.
+
+        Above 1e-5 a gait does not count as found. More mesh intervals in `CycleOptions` reduce it.
+        """
+        error_of_cycle = functools.partial(_mesh_error_if_found, self.system)
+        return self._map_over_batch(error_of_cycle)(self.found, self.collocation_state.solution)
+
+    @property
+    def takeoff_acceleration(self) -> Array:
+        """Return the rear foot's acceleration at take-off, m/s^2, least over the steps: see
+        `margin_defaults`."""
+        acceleration_of_cycle = functools.partial(_takeoff_acceleration, self.system)
+        return self._mask_missing(
+            self._map_over_batch(acceleration_of_cycle)(self.parameters, self.collocation_state)
+        )
+
+    @property
+    def margins(self) -> Margins:
+        """Return the margins over the (first) step, computed by one event-driven step."""
+
+        def margins_of_step(parameters: Array, section_state: Array) -> Margins:
+            wheel = wheel_from_parameters(parameters, self.system.n_legs)
+            return step(wheel, section_state, model=self.model).margins
+
+        return self._map_over_batch(margins_of_step)(self.parameters, self.section_state)
+
+    @property
+    def why(self) -> str:
+        if self.outcome not in (Outcome.EVENT_ORDER_MISMATCH, Outcome.BRANCH_ENDS_BEFORE_TARGET):
+            return super().why
+        check = ADMISSIBILITY_CHECKS[
+            int(self.collocation_state.failed_check - 1) % len(ADMISSIBILITY_CHECKS)
+        ]
+        return f"{super().why} Broken: {check}."
+
+    def model_rows(self) -> list[TextRow]:
+        forces = self.indicators
+        forces_text = f"{format_numbers(forces.lambda_I4)} N s, {format_numbers(forces.lambda_2)} N"
+        return [
+            ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
+            ("indicators λ_I4, λ2⁺, λ4⁺", f"{forces_text}, {format_numbers(forces.lambda_4)} N"),
+        ]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _mesh_error_if_found(
+    system: CollocationSystem, is_found: Array, solution: CollocationSolution
+) -> Array:
+    solution_with_lane = jax.tree.map(lambda x: x[..., None], solution)
+    return jnp.where(
+        is_found, estimate_mesh_error(system.sequence, system.meshes, solution_with_lane)[0], 0.0
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _takeoff_acceleration(
+    system: CollocationSystem, parameters: Array, collocation_state: CollocationState
+) -> Array:
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    _, steps = system.evaluate_passages(parameters, collocation_state.solution)
+    return jnp.min(jnp.stack([gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
+
+
+_compiled_attach_monodromy = jax.jit(attach_monodromy, static_argnums=0)
+
+
+def find_limit_cycle(
+    params: WheelParams, system: CollocationSystem, guess: CollocationState | None
+) -> LimitCycle:
+    find_cycle = _find_cycle if is_inside_jit() else _compiled_find_cycle
+    return find_cycle(params, system, guess)
+
+
+def _find_cycle(
+    params: WheelParams, system: CollocationSystem, guess: CollocationState | None
+) -> LimitCycle:
+    is_usable = params.is_in_domain()
+    table_1 = WheelParams(n_legs=system.n_legs)
+    safe_params = jax.tree.map(
+        lambda x, d: jnp.where(is_usable, x, d.astype(x.dtype)), params, table_1
+    )
+    parameters = stack_parameters(safe_params)
+    collocation_state, (monodromy_value, residual, n_newton_iterations) = (
+        solve_cycle_with_derivatives(system, parameters, guess)
+    )
+    is_found = is_usable & (collocation_state.found > 0.5)
+    # Mask inputs and outputs: measures and derivatives are zero where there is no cycle.
+    mask = lambda x: jnp.where(is_found, x, 0.0)
+    stand_in = lambda x, d: jnp.where(is_found, x, d)
+    parameters = jax.tree.map(
+        stand_in, parameters, stack_parameters(table_1).astype(parameters.dtype)
+    )
+
+    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    period_n = system.period_n
+    # theta, its rate and the rate of L1: L1 itself follows from theta at touchdown.
+    states = jnp.concatenate([collocation_state.ends[:, :1], collocation_state.ends[:, 2:]], 1)
+    # The landing at the start of a step follows the state at the end of the previous step.
+    landings = jax.vmap(lambda x: transitions.land(s, *x))(jnp.roll(states, 1, 0))
+    fore, rear = jax.vmap(lambda landing: transitions.landing_forces(s, landing))(landings)
+
+    def over_steps(values: Array) -> Array:
+        return mask(values[0] if period_n == 1 else values)
+
+    durations = collocation_state.solution.durations
+    code = jnp.where(
+        collocation_state.failed_check > 0.0, Outcome.EVENT_ORDER_MISMATCH, Outcome.NO_CYCLE_FOUND
+    )
+    code = jnp.where(collocation_state.failed_check == MESH_CHECK, Outcome.MESH_TOO_COARSE, code)
+    code = jnp.where(
+        collocation_state.failed_check > MESH_CHECK, Outcome.BRANCH_ENDS_BEFORE_TARGET, code
+    )
+    code = jnp.where(is_found, Outcome.STEPPED, code)
+    return LimitCycle(
+        section_state=mask(states[-1]),
+        post_impact=mask(collocation_state.solution.section_state),
+        durations=over_steps(durations),
+        step_length=over_steps(landings.distance),
+        indicators=DoubleSupportIndicators(
+            lambda_I4=over_steps(landings.rear_impulse.normal),
+            lambda_2=over_steps(fore.normal),
+            lambda_4=over_steps(rear.normal),
+        ),
+        outcome=jnp.where(is_usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
+        residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
+        n_newton_iterations=n_newton_iterations,
+        parameters=parameters,
+        collocation_state=collocation_state,
+        monodromy_value=mask(monodromy_value),
+        system=system,
+    )
+
+
+_compiled_find_cycle = eqx.filter_jit(_find_cycle)
+
+N_PHASE_SAMPLES = 1025
+"""Number of points of each phase between which a walked guess is interpolated. With too few (33 at
+c = 221), the fast start of a step without double support is lost and Newton's method fails."""
+
+
+class WalkSamples(NamedTuple):
+    """Event-driven walk, sampled as a start on any mesh."""
+
+    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
+    distances: Float[Array, " n"]  # between the feet at each landing, m
+    durations: Float[Array, "n 3"]
+    states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
+
+
+@eqx.filter_jit
+def sample_walk(
+    model: ViscoelasticWheel, params: WheelParams, section_state: SectionState, n_steps: int
+) -> WalkSamples:
+    """Return `n_steps` event-driven steps from a section state, sampled in time."""
+    options, s = StepOptions(), params.symbols()
+    landing = transitions.land(s, *section_state)
+    section = jnp.stack([landing.theta, landing.motion.dtheta])
+
+    def sample_next_step(x: Array, _: None) -> tuple[Array, tuple]:
+        trajectory = model.sample_step(params, x, options, N_PHASE_SAMPLES)
+        step_samples = transitions.land(s, *x).distance, trajectory.durations, trajectory.state
+        return trajectory.section_state, step_samples
+
+    _, samples = lax.scan(sample_next_step, section_state, None, length=n_steps)
+    return WalkSamples(section, *samples)
+
+
+@eqx.filter_jit
+def guess_from_walk(
+    system: CollocationSystem, params: WheelParams, walk: WalkSamples
+) -> CollocationState:
+    """Return the cycle's unknowns from a walk of `period_n` steps."""
+    accelerations = functools.partial(_sample_accelerations, system, params.symbols())
+    is_active = (walk.durations > 0.0).astype(walk.durations.dtype)
+    by_phase = jax.vmap(accelerations)(walk.distances, walk.states)
+    solution = CollocationSolution(walk.post_impact, walk.durations, by_phase)
+    search_flags = init_search_flags(system, walk.post_impact)
+    return lax.stop_gradient(CollocationState(solution, is_active, *search_flags))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def transfer_to_mesh(
+    known_system: CollocationSystem, wanted_system: CollocationSystem, solution: CollocationSolution
+) -> CollocationSolution:
+    """Return a solution transferred to another mesh. The accelerations in each mesh interval are a
+    polynomial."""
+    accelerations = []
+    for known_mesh, wanted_mesh, rows in zip(
+        known_system.meshes, wanted_system.meshes, solution.accelerations, strict=True
+    ):
+        matrix = jnp.asarray(
+            mesh_transfer_matrix(known_mesh, wanted_mesh), solution.section_state.dtype
+        )
+        n, _, _, dim = rows.shape
+        resampled = jnp.einsum("ij,njd->nid", matrix, rows.reshape(n, -1, dim))
+        accelerations.append(resampled.reshape(n, wanted_mesh.n_intervals, N_GAUSS_NODES, dim))
+    return CollocationSolution(solution.section_state, solution.durations, tuple(accelerations))
+
+
+def _sample_accelerations(
+    system: CollocationSystem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
+) -> tuple[Array, ...]:
+    """Return accelerations at the nodes of each phase, (step, node, coordinate), of a sampled
+    step."""
+    accelerations, phases = [], make_phases(s, distance, stop_at_lift_off=False)
+    sample_times = jnp.linspace(0.0, 1.0, states.shape[1])
+    for phase, mesh, samples in zip(phases, system.meshes, states, strict=True):
+        rows = [
+            jnp.interp(jnp.asarray(mesh.node_fractions), sample_times, row) for row in samples.T
+        ]
+        nodes = jnp.stack(phase.acceleration(Motion.from_angle(*rows))[: phase.n_dof], axis=-1)
+        accelerations.append(nodes.reshape(mesh.n_intervals, N_GAUSS_NODES, phase.n_dof))
+    return tuple(accelerations)

@@ -1,0 +1,68 @@
+"""Margins of the paper's model that searches along gaits keep, and their default least values."""
+
+from collections.abc import Mapping
+
+from vrw_jax.collocation import PhasePassage
+from vrw_jax.measures import MEASURES
+from vrw_jax.numerics import Elementwise
+from vrw_jax.validation import check_type
+from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
+
+
+def gait_takeoff_acceleration(s: Symbols, sls1: PhasePassage) -> Elementwise:
+    """Return the rear foot's acceleration at the start of a gait's passage through SLS-I, m/s^2;
+    see `dynamics`."""
+    return dynamics.takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
+
+
+MARGIN_NAMES: tuple[str, ...] = (
+    "fore_foot_force",
+    "takeoff_acceleration",
+    "clearance_sls1",
+    "clearance_sls2",
+    "locked_stopper_force",
+    "rear_stopper_force",
+    "contraction",
+    "friction_fore",
+    "lambda_I4",
+    "lambda_2_plus",
+    "lambda_4_plus",
+)
+"""Margins on forces, clearances and indicators that gaits of this model can keep."""
+
+DEFAULT_MARGIN_SHARE = 1e-3
+"""Default least value of a margin, as a share of the wheel's weight, leg length or gravity."""
+
+
+def default_margins(params: WheelParams) -> Mapping[str, float]:
+    """Return least values of `MARGIN_NAMES`: a thousandth of each unit's natural scale on this
+    wheel.
+
+    The values are not zero because a search needs a distance from the limits. At lambda_4_plus = 0,
+    for example, the gait itself ends.
+
+    Args:
+        params: one wheel.
+
+    Returns:
+        Least values by name of the measure, each in the measure's unit.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)
+        0.177
+    """
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    params.require_single("take one after the other")
+    mass = float(params.hub_mass + params.n_legs * params.leg_mass)
+    length, gravity = float(params.locked_length), float(params.gravity)
+    unit_scales = {
+        "N": mass * gravity,
+        "m": length,
+        "m/s^2": gravity,
+        "N s": mass * (gravity * length) ** 0.5,
+        "1": 1.0,
+    }
+    return {name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[name].unit] for name in MARGIN_NAMES}

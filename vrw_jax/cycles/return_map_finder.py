@@ -1,0 +1,246 @@
+"""Gaits of any model, found by Newton's method on its return map from a start nearby.
+
+The paper's model has a faster method (see `collocation_finder`). This module uses only the
+interface of the models.
+"""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.continuation import FixedPointResult, solve_fixed_point, solve_fixed_point_implicit
+from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
+from vrw_jax.cycles.finder import (
+    AbstractGaitFinder,
+    BranchPoint,
+    Gait,
+    Values,
+    move_derivative_axis_first,
+    value_and_tangents,
+)
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
+from vrw_jax.printing import TextRow, format_numbers
+from vrw_jax.simulation import validate_arguments, walk_toward_gait
+from vrw_jax.wheel import Outcome, WheelParams
+
+MIN_NEWTON_TOLERANCE = 1e-12
+"""Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
+too."""
+
+
+def newton_tolerance(options: StepOptions) -> Scalar:
+    """Return the tolerance of Newton's last correction for these step options."""
+    return jnp.maximum(MIN_NEWTON_TOLERANCE, options.rtol)
+
+
+class ReturnMapCycle(AbstractCycle):
+    """Gait that repeats after `period_n` steps, a fixed point of the return map. Batched under
+    vmap.
+
+    It is differentiable in the parameters by the implicit function theorem, to second order. If no
+    gait is found, `outcome` gives the reason and every other number is zero.
+
+    - `section_state`: fixed under `period_n` return maps;
+    - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
+    - `durations`: as the model's step returns them, s; (n, 3) for period_n = n > 1;
+    - `step_length`: distance between the feet at the landing, m;
+    - `steps`: the model's step results, with an axis over the steps of one cycle;
+    - `monodromy_value`: Jacobian of the return map;
+    - `outcome`: Outcome.STEPPED, or the reason of the failure;
+    - `residual`: largest entry of map(x) - x, rad, rad/s or m/s;
+    - `n_iterations`: of Newton's method.
+
+    Examples:
+        >>> wheel = vrw.RigidWheel(holds_rear_foot=True)
+        >>> cycle = vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=wheel, guess=[0.39, 1.5, 0.0])
+        >>> print(f"{cycle.period:.3f} s")
+        0.425 s
+    """
+
+    section_state: Float[Array, " n_section"]
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "*n 3"]
+    step_length: Float[Array, "*n"]
+    steps: Any
+    monodromy_value: Float[Array, "n_section n_section"]
+    outcome: Int[Array, ""]
+    residual: Scalar
+    n_iterations: Int[Array, ""]
+
+    @property
+    def period_n(self) -> int:
+        return self.steps.durations.shape[self.outcome.ndim]
+
+    def _squeeze_steps(self, tree: Any) -> Any:
+        """Remove the axis over steps if there is only one step."""
+        axis, is_single_step = self.outcome.ndim, self.period_n == 1
+        return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if is_single_step else leaf, tree)
+
+    @property
+    def indicators(self) -> Any:
+        """Return the indicators of each landing."""
+        return self._squeeze_steps(self.steps.indicators)
+
+    @property
+    def margins(self) -> Any:
+        """Return the margins of each step."""
+        return self._squeeze_steps(self.steps.margins)
+
+    @property
+    def warm_start(self) -> Array:
+        return self.section_state
+
+    @property
+    def monodromy(self) -> Array:
+        return self.monodromy_value
+
+    def model_rows(self) -> list[TextRow]:
+        return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
+
+
+@eqx.filter_jit
+def find_return_map_cycle(
+    params: WheelParams,
+    section_state: Array,
+    model: AbstractWheel,
+    options: StepOptions,
+    period_n: int,
+    uses_jvp_rule: bool,
+) -> ReturnMapCycle:
+    """Find a cycle by Newton's method on the model's return map.
+
+    `uses_jvp_rule` selects `solve_fixed_point_implicit`, because second derivatives of a step are
+    expensive with unilateral contact. The search then uses the same step as the result, so that
+    only one program is compiled.
+    """
+    take_step, solver = (
+        (model.take_step, solve_fixed_point_implicit)
+        if uses_jvp_rule
+        else (model.advance, solve_fixed_point)
+    )
+    return_map = lambda section_state: take_step(params, section_state, options).section_state
+    fixed_point = solver(
+        return_map, section_state, period_n=period_n, tolerance=newton_tolerance(options)
+    )
+    section_state, results = fixed_point.x, []
+    for _ in range(period_n):
+        results.append(model.take_step(params, section_state, options))
+        section_state = results[-1].section_state
+    return make_cycle(
+        params, fixed_point, jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+    )
+
+
+def make_cycle(params: WheelParams, fixed_point: FixedPointResult, steps: Any) -> ReturnMapCycle:
+    """Return the cycle of a fixed point whose steps have a leading axis."""
+    # A step that fails returns zeros, which Newton's method may take for a fixed point.
+    is_valid = fixed_point.converged & jnp.all(steps.outcome == Outcome.STEPPED)
+    failure = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
+    mask = lambda leaf: jnp.where(is_valid, leaf, jnp.zeros_like(leaf))
+    steps = jax.tree.map(mask, steps)
+    return ReturnMapCycle(
+        mask(fixed_point.x),
+        *summarize_steps(steps),
+        steps=steps,
+        monodromy_value=mask(fixed_point.jacobian),
+        outcome=jnp.where(is_valid, Outcome.STEPPED, failure).astype(jnp.int32),
+        residual=fixed_point.residual,
+        n_iterations=fixed_point.n_iterations,
+    )
+
+
+def summarize_steps(steps: Any) -> tuple[Array, Array, Array]:
+    """Return post-impact state, durations and step lengths of a cycle from its steps, which have a
+    leading axis."""
+    durations, lengths = steps.durations, steps.step_length
+    if len(durations) == 1:
+        durations, lengths = durations[0], lengths[0]
+    return steps.post_impact[0], durations, lengths
+
+
+class AbstractReturnMapFinder(AbstractGaitFinder):
+    """Finder of gaits as fixed points of `period_n` steps of the model."""
+
+    model: AbstractWheel
+    n_legs: int = eqx.field(static=True)
+    step_options: StepOptions
+    period_n: int = eqx.field(static=True, default=1)
+
+    options_type: ClassVar[type] = StepOptions
+    supports_cold_start: ClassVar[bool] = False
+
+    @classmethod
+    def from_options(
+        cls,
+        model: AbstractWheel,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
+    ) -> "AbstractReturnMapFinder":
+        return cls(model, n_legs, step_options, period_n)
+
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
+        arguments = prepare_search(self, params, guess)
+        return find_return_map_cycle(*arguments, self.period_n, uses_jvp_rule=False)
+
+    def initial_guess(self, values: Values) -> Array:
+        """Return the last section state of a walk from the model's start."""
+        model, params = self.model.from_values(values, self.n_legs)
+        return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
+
+    def precompile(self, params: WheelParams) -> None:
+        self.find_gait(self.model.parameter_values(params), self.model.default_start(params))
+
+
+class ReturnMapFinder(AbstractReturnMapFinder):
+    """Finder for any model, with the derivatives of Newton's method."""
+
+    cycle_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in CYCLE_MEASURE_FUNCTIONS if n != "takeoff_acceleration"
+    )
+    differentiable_measures: ClassVar[tuple[str, ...]] = cycle_measures
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        n for n in cycle_measures if n != "spectral_margin"
+    )
+    readable_measures: ClassVar[tuple[str, ...]] = cycle_measures
+
+    @eqx.filter_jit
+    def find_gait(self, values: Values, guess: Array) -> Gait:
+        cycle, jacobian = value_and_jacobian(
+            lambda values: self.find_cycle_from_values(values, guess), values
+        )
+        d_cycle: Any = move_derivative_axis_first(jacobian)
+        step = jax.tree.map(lambda x: x[0], cycle.steps)
+        d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
+        return make_gait(self.model, self.n_legs, cycle, step, d_cycle, d_step)
+
+
+def prepare_search(
+    finder: AbstractReturnMapFinder, params: WheelParams, guess: Any
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    """Return wheel, section state, model and options of a search near `guess`."""
+    start = guess.section_state if isinstance(guess, AbstractCycle) else guess
+    section_state = finder.model.default_start(params) if start is None else start
+    return validate_arguments(params, section_state, finder.model, finder.step_options)
+
+
+def make_gait(
+    model: AbstractWheel, n_legs: int, cycle: Any, step: Any, d_cycle: Any, d_step: Any
+) -> Gait:
+    """Return a gait with the data that identify its branch. With unilateral contact the order of
+    events may change along a branch."""
+    n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
+    gait_coordinates = lambda cycle, step: jnp.concatenate(
+        [cycle.section_state[:n_coordinates], step.durations]
+    )
+    branch_data = value_and_tangents(gait_coordinates, (cycle, step), (d_cycle, d_step))
+    return_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
+    return Gait(
+        cycle, step, d_cycle, d_step, BranchPoint(*branch_data, jnp.ones(1), return_jacobian)
+    )

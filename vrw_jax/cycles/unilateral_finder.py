@@ -1,0 +1,458 @@
+"""Gaits with unilateral contact, found by Newton's method on batched steps and their derivatives.
+
+All tangents of a step are computed beside its motion in the same machine code. Many wheels are
+therefore searched side by side, and no large program is compiled for the derivatives.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.contact import UnilateralWheel, step_batch_with_jacobian
+from vrw_jax.continuation import FixedPointResult
+from vrw_jax.cycles.attracting_gaits import find_slow_gaits
+from vrw_jax.cycles.cycle import AbstractCycle
+from vrw_jax.cycles.finder import (
+    Gait,
+    GaitMeasures,
+    Values,
+    measure_from_gait,
+    move_derivative_axis_first,
+)
+from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.return_map_finder import (
+    AbstractReturnMapFinder,
+    ReturnMapCycle,
+    ReturnMapFinder,
+    find_return_map_cycle,
+    make_cycle,
+    make_gait,
+    newton_tolerance,
+    prepare_search,
+    summarize_steps,
+)
+from vrw_jax.measures import UNILATERAL_DIFFERENTIABLE_NAMES
+from vrw_jax.models import AbstractStep, AbstractWheel
+from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.simulation import validate_arguments
+from vrw_jax.validation import is_traced
+from vrw_jax.wheel import Outcome, WheelParams
+
+MAX_CONTACT_NEWTON_ITERATIONS, MAX_STEP_HALVINGS = 15, 6
+"""Largest number of Newton iterations, and of halvings of a correction after which no step ends."""
+
+FAR_STEP_TOLERANCE, NEAR_CORRECTION = 1e-6, 1e-4
+"""Tolerance of the steps far from a gait, and the correction below which a state is near a gait."""
+
+CLEAR_CONVERGENCE_FACTOR = 0.01
+"""Factor below the tolerance at which a correction is accepted without a second one."""
+
+GROUND_BATCH_SIZES = (1, 8, 64, 512)
+"""Numbers of gaits that are read together. Each number is compiled once."""
+
+
+class UnilateralFinder(AbstractReturnMapFinder):
+    """Finder with unilateral contact, with first derivatives, including those with respect to
+    friction."""
+
+    model: UnilateralWheel
+    batch_sizes: tuple[int, ...] = eqx.field(static=True, default=GROUND_BATCH_SIZES)
+
+    cycle_measures: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
+    differentiable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    default_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    readable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
+    is_multistable: ClassVar[bool] = True
+
+    @classmethod
+    def from_options(
+        cls,
+        model: Any,
+        n_legs: int,
+        step_options: StepOptions,
+        period_n: int,
+        cycle_options: CycleOptions,
+    ) -> AbstractReturnMapFinder:
+        if model.restitution is not None:  # the batched engine has no restitution
+            return ReturnMapFinder(model, n_legs, step_options, period_n)
+        return cls(model, n_legs, step_options, period_n)
+
+    def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
+        """Return the cycle from the batched engine if all inputs are concrete, else from the step's
+        own derivatives."""
+        params, x, model, options = prepare_search(self, params, guess)
+        if is_traced(params, x, model):
+            return find_return_map_cycle(
+                params, x, model, options, self.period_n, uses_jvp_rule=True
+            )
+        return jax.tree.map(
+            lambda x: x[0], self.find_cycles_near(model.parameter_values(params)[None], x[None])
+        )
+
+    def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
+        if is_traced(params, guess):
+            return eqx.filter_vmap(self.find_cycle)(params, guess)
+        values = jax.vmap(self.model.parameter_values)(params)
+        return self.find_cycles_near(values, _full_section_states(self.model, params, guess))
+
+    def find_cycles_near(self, values: Any, states: Any) -> ReturnMapCycle:
+        """Return the gaits near section states, one per wheel, without derivatives."""
+        return self._solve_and_read(_make_cycle, values, states, with_parameter_derivatives=False)
+
+    def precompile_newton(self, values: np.ndarray, states: np.ndarray) -> None:
+        """Compile the programs of Newton's method while another thread walks towards its start."""
+        period_map = PeriodMap(self.model, self.n_legs, self.period_n, values)
+        period_map.evaluate_period(self.step_options, states, False)
+
+    def initial_guess(self, values: Values) -> Array:
+        return _remove_batch_axis(self.initial_guesses(_add_batch_axis(values)))
+
+    def initial_guesses(self, values: Array) -> Array:
+        """Return a slow attracting gait's section state for each wheel, NaN if there is none."""
+        gaits = find_slow_gaits(self, values)
+        is_found = np.asarray(gaits.outcome) == Outcome.STEPPED
+        return jax.device_put(np.where(is_found[:, None], gaits.section_state, np.nan))
+
+    def find_gait(self, values: Values, guess: Array) -> Gait:
+        return _remove_batch_axis(self.find_gaits(_add_batch_axis(values), _add_batch_axis(guess)))
+
+    def find_gaits(self, values: Array, guess: Any) -> Gait:
+        return self._solve_and_read(
+            _make_gait,
+            values,
+            getattr(guess, "section_state", guess),
+            with_parameter_derivatives=True,
+        )
+
+    def _solve_and_read(
+        self, read_wheel: Callable, values: Any, states: Any, with_parameter_derivatives: bool
+    ) -> Any:
+        arguments = np.asarray(values), np.asarray(states), with_parameter_derivatives
+        fixed_points = _find_fixed_points(
+            self.model, self.n_legs, self.step_options, self.period_n, *arguments
+        )
+        read_batch = functools.partial(_map_over_wheels, read_wheel, self.model, self.n_legs)
+        return map_in_batches(read_batch, self.batch_sizes, arguments[0], fixed_points)
+
+    def take_step(self, params: WheelParams, x: Array) -> AbstractStep:
+        value_columns, model = np.asarray(self.model.parameter_values(params))[:, None], self.model
+        arguments = value_columns, np.asarray(x)[None], model, self.step_options, self.n_legs
+        return _remove_batch_axis(step_batch_with_jacobian(*arguments, ())[0])
+
+    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
+        """Return measures and derivatives, as in the base class, from one Jacobian of the step."""
+        model, params = self.model.from_values(
+            tuple(jax.device_put(list(np.asarray(values)))), self.n_legs
+        )
+        start = guess.section_state if isinstance(guess, AbstractCycle) else guess
+        start = self.initial_guess(values) if start is None else start
+        _, x, _, _ = validate_arguments(params, start, model, self.step_options)
+        return measure_from_gait(self.find_gait(values, x), type(self).read_measure, names)
+
+
+def _add_batch_axis(x: Array) -> Array:
+    """Add a batch axis of length one, by numpy because JAX compiles a program for each shape."""
+    return jax.device_put(np.asarray(x)[None])
+
+
+def _remove_batch_axis(tree: Any) -> Any:
+    """Return the first row of every leaf: the inverse of `_add_batch_axis`."""
+    return jax.device_put(take_rows(tree, 0))
+
+
+def _full_section_states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
+    """Return full section states of each wheel from a user's guess."""
+    x = getattr(guess, "section_state", guess)
+    if x is None:
+        return jax.vmap(model.default_start)(params)
+    return jax.vmap(model.embed_section)(params, jnp.asarray(x))
+
+
+class _FixedPoints(NamedTuple):
+    """Result of Newton's method; with a leading axis for many wheels."""
+
+    x: Any  # section state
+    steps: Any  # from that state, (period_n, ...)
+    step_jacobians: Any  # derivatives with respect to values and section state
+    residual: Any
+    converged: Any
+    n_iterations: Any
+
+
+class PeriodMap(NamedTuple):
+    """Map over one period of each wheel for Newton's method, evaluated by the batched engine
+    outside jit."""
+
+    model: Any
+    n_legs: int
+    period_n: int
+    values: np.ndarray  # (wheels, n_values)
+
+    def select(self, indices: np.ndarray) -> "PeriodMap":
+        return self._replace(values=self.values[indices])
+
+    def evaluate_period(
+        self, options: StepOptions, x: np.ndarray, value_mask: Any = True, start_mask: bool = True
+    ) -> "PeriodEvaluation":
+        """Evaluate the period from `x`, with derivatives with respect to the masked values and the
+        section state."""
+        results, (n, m) = [], (self.values.shape[1], x.shape[1])
+        jacobian, is_valid = (
+            np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None],
+            np.ones(len(x), bool),
+        )
+        input_mask = np.concatenate(
+            [np.broadcast_to(value_mask, n), np.broadcast_to(start_mask, m)]
+        )
+        input_indices = np.flatnonzero(input_mask).tolist()
+        for _ in range(self.period_n):
+            arguments = self.values.T, x, self.model, options, self.n_legs, input_indices
+            results.append(step_batch_with_jacobian(*arguments))
+            step, step_jacobians = results[-1]
+            is_valid &= np.asarray(step.outcome) == Outcome.STEPPED
+            x = np.asarray(step.section_state)
+            step_jacobian = np.asarray(step_jacobians.section_state)
+            jacobian = step_jacobian[:, :, n:] @ jacobian
+            jacobian[:, :, :n] += step_jacobian[:, :, :n]
+        steps, stacked_jacobians = (
+            jax.tree.map(lambda *leaves: np.stack(leaves, 1), *pair)
+            for pair in zip(*results, strict=True)
+        )
+        return PeriodEvaluation(
+            steps, stacked_jacobians, x, jacobian[:, :, :n], jacobian[:, :, n:], is_valid
+        )
+
+
+class PeriodEvaluation(NamedTuple):
+    """Steps of one period, their Jacobians, the end state, its Jacobians, and which periods end."""
+
+    steps: Any
+    step_jacobians: Any
+    end_state: np.ndarray
+    value_jacobian: np.ndarray
+    return_jacobian: np.ndarray
+    is_valid: np.ndarray
+
+    def newton_correction(self, x: np.ndarray, return_jacobian: np.ndarray) -> np.ndarray:
+        """Return Newton's correction of x; zeros where no period ends."""
+        correction, is_valid = np.zeros_like(x), self.is_valid
+        matrix = np.eye(x.shape[1]) - return_jacobian[is_valid]
+        correction[is_valid] = solve_linear_systems(
+            matrix, (self.end_state - x)[is_valid][..., None]
+        )[..., 0]
+        return correction
+
+
+def solve_linear_systems(matrix: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
+    """Return `numpy.linalg.solve` of many systems. A singular one gives NaN instead of an error for
+    all."""
+    try:
+        return np.linalg.solve(matrix, right_sides)
+    except np.linalg.LinAlgError:
+        is_regular = np.abs(np.linalg.det(matrix)) > 0.0
+        regular_matrix = np.where(is_regular[:, None, None], matrix, np.eye(matrix.shape[-1]))
+        return np.where(
+            is_regular[:, None, None], np.linalg.solve(regular_matrix, right_sides), np.nan
+        )
+
+
+def _find_fixed_points(
+    model: Any,
+    n_legs: int,
+    options: StepOptions,
+    period_n: int,
+    values: np.ndarray,
+    start: np.ndarray,
+    with_parameter_derivatives: bool,
+) -> _FixedPoints:
+    """Return fixed points near `start`. Codes at the end of a section state are those of the image.
+
+    The iteration uses loose steps until corrections are small. Then a step at the tolerance of
+    `options` is taken with the same Jacobian. One more step, with all derivatives, yields the gait.
+    If loose steps move away from a state that an exact one hardly changes, all steps are exact.
+    """
+    period_map = PeriodMap(model, n_legs, period_n, values)
+    loose_tolerances = [
+        np.maximum(tolerance, FAR_STEP_TOLERANCE) for tolerance in (options.rtol, options.atol)
+    ]
+    loose_options = eqx.tree_at(
+        lambda o: (o.rtol, o.atol), options, jax.device_put(loose_tolerances)
+    )
+    tolerance, all_wheels = float(newton_tolerance(options)), np.ones(len(values), bool)
+    rough_solution, return_jacobian = _run_newton(
+        period_map, loose_options, start, False, NEAR_CORRECTION, all_wheels
+    )
+    x, is_near = (
+        np.where(rough_solution.converged[:, None], rough_solution.x, start),
+        rough_solution.converged,
+    )
+    exact_period = period_map.evaluate_period(options, x, False, False)
+    correction = exact_period.newton_correction(x, return_jacobian)
+    x[is_near] += correction[is_near] * (
+        np.abs(correction[is_near]).max(-1, keepdims=True) < NEAR_CORRECTION
+    )
+    is_near = is_near | (
+        exact_period.is_valid & (np.abs(exact_period.end_state - x).max(-1) < NEAR_CORRECTION)
+    )
+    solution, _ = _run_newton(
+        period_map,
+        options,
+        x,
+        with_parameter_derivatives,
+        tolerance,
+        is_near,
+        stops_at_small_correction=False,
+    )
+    return solution._replace(n_iterations=rough_solution.n_iterations + 1 + solution.n_iterations)
+
+
+def _run_newton(
+    period_map: PeriodMap,
+    options: StepOptions,
+    start: np.ndarray,
+    with_parameter_derivatives: bool,
+    tolerance: float,
+    is_wanted: np.ndarray,
+    stops_at_small_correction: bool = True,
+) -> tuple[_FixedPoints, np.ndarray]:
+    """Run Newton's method on the `is_wanted` wheels until corrections are small; return the last
+    Jacobians too.
+
+    A correction after which no period ends is halved. A small correction ends the iteration if
+    `stops_at_small_correction` is set. Otherwise another evaluation follows, which gives the gait
+    at the corrected state. It also requires a period that repeats, because the map may jump between
+    the two states where feet dip.
+    """
+    n_wheels, n_legs = len(start), period_map.n_legs
+    x, last_x = start.copy(), start.copy()
+    residual, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
+    is_small, is_found, n_halvings = (np.zeros(n_wheels, dtype) for dtype in (bool, bool, int))
+    return_jacobian = np.zeros((n_wheels, start.shape[1], start.shape[1]))
+    active, stored = np.arange(n_wheels), None
+    for _ in range(MAX_CONTACT_NEWTON_ITERATIONS + MAX_STEP_HALVINGS):
+        period = period_map.select(active).evaluate_period(
+            options, x[active], with_parameter_derivatives
+        )
+        if stored is None:
+            stored = jax.tree.map(np.array, (period.steps, period.step_jacobians))
+        for stored_leaf, new_leaf in zip(
+            jax.tree.leaves(stored), jax.tree.leaves(period[:2]), strict=True
+        ):
+            stored_leaf[active] = new_leaf
+        correction = period.newton_correction(x[active], period.return_jacobian)
+        correction_size, is_valid = (
+            np.abs(correction).max(-1),
+            period.is_valid & np.isfinite(correction).all(-1),
+        )
+        residual[active] = np.abs(period.end_state - x[active]).max(-1)
+        return_jacobian[active] = period.return_jacobian
+        n_iterations[active] += 1
+        is_small_now = is_valid & (correction_size <= tolerance)
+        is_done = (
+            is_small_now
+            & (is_small[active] | (correction_size <= CLEAR_CONVERGENCE_FACTOR * tolerance))
+            & (not stops_at_small_correction)
+        )
+        is_small[active] = is_small_now
+        moving_indices = active[is_valid & ~is_done]
+        last_x[moving_indices], n_halvings[moving_indices] = x[moving_indices], 0
+        x[moving_indices] += correction[is_valid & ~is_done]
+        bad_indices = active[~is_valid]
+        x[bad_indices], n_halvings[bad_indices] = (
+            0.5 * (x[bad_indices] + last_x[bad_indices]),
+            n_halvings[bad_indices] + 1,
+        )
+        x[bad_indices, -n_legs:] = last_x[bad_indices, -n_legs:]
+        is_found[active] = is_wanted[active] & (
+            is_small[active] if stops_at_small_correction else is_done
+        )
+        is_lost = (
+            (n_halvings > MAX_STEP_HALVINGS)
+            | (n_iterations > MAX_CONTACT_NEWTON_ITERATIONS)
+            | ~is_wanted
+        )
+        active = active[~is_found[active] & ~is_lost[active]]
+        if not len(active):
+            break
+    assert stored is not None
+    return _FixedPoints(x, stored[0], stored[1], residual, is_found, n_iterations), return_jacobian
+
+
+@eqx.filter_jit
+def _map_over_wheels(
+    read_wheel: Callable,
+    model: AbstractWheel,
+    n_legs: int,
+    values: Array,
+    fixed_points: _FixedPoints,
+) -> Any:
+    return eqx.filter_vmap(
+        lambda values, fixed_points: read_wheel(model, n_legs, values, fixed_points)
+    )(values, fixed_points)
+
+
+def _return_jacobian(fixed_points: _FixedPoints, n_values: int) -> Array:
+    return_jacobian = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
+    for jacobian in fixed_points.step_jacobians.section_state:
+        return_jacobian = jacobian[:, n_values:] @ return_jacobian
+    return return_jacobian
+
+
+def _make_cycle(
+    model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
+) -> ReturnMapCycle:
+    diagnostics = fixed_points.residual, fixed_points.converged, fixed_points.n_iterations
+    params = model.from_values(values, n_legs)[1]
+    fixed_point = FixedPointResult(
+        fixed_points.x, _return_jacobian(fixed_points, len(values)), *diagnostics
+    )
+    return make_cycle(params, fixed_point, fixed_points.steps)
+
+
+def _make_gait(
+    model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
+) -> Gait:
+    n_values, identity = (
+        values.shape[0],
+        jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype),
+    )
+    value_jacobian, return_jacobian = (
+        jnp.zeros((len(identity), n_values), identity.dtype),
+        _return_jacobian(fixed_points, n_values),
+    )
+    for jacobian in fixed_points.step_jacobians.section_state:
+        value_jacobian = jacobian[:, :n_values] + jacobian[:, n_values:] @ value_jacobian
+    newton_matrix = jnp.where(fixed_points.converged, identity - return_jacobian, identity)
+    d_section_state = jnp.linalg.solve(newton_matrix, value_jacobian)
+
+    d_state, d_steps = d_section_state, []
+    for step_index in range(len(fixed_points.step_jacobians.section_state)):
+        input_tangents = jnp.concatenate([jnp.eye(n_values, dtype=identity.dtype), d_state])
+        step_tangents = jax.tree.map(
+            lambda leaf, step_index=step_index, input_tangents=input_tangents: (
+                leaf[step_index] @ input_tangents
+            ),
+            fixed_points.step_jacobians,
+        )
+        d_steps.append(move_derivative_axis_first(step_tangents))
+        d_state = step_tangents.section_state
+    d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
+
+    cycle = _make_cycle(model, n_legs, values, fixed_points)
+    # The derivative of the Jacobian is unknown: measures of it are not in `differentiable`.
+    float_fields = eqx.filter(cycle, eqx.is_inexact_array)
+    zero_tangents = jax.tree.map(lambda x: jnp.zeros((n_values, *x.shape), x.dtype), float_fields)
+    d_cycle = eqx.tree_at(
+        lambda c: (c.section_state, c.steps, c.post_impact, c.durations, c.step_length),
+        zero_tangents,
+        (d_section_state.T, d_step, *jax.vmap(summarize_steps)(d_step)),
+    )
+    first_step = jax.tree.map(lambda leaf: leaf[0], fixed_points.steps)
+    d_first_step = jax.tree.map(lambda leaf: leaf[:, 0], d_step)
+    return make_gait(model, n_legs, cycle, first_step, d_cycle, d_first_step)

@@ -1,0 +1,489 @@
+"""Figures of walks: the paper's figures 6 to 10, and an animation of the walk."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from vrw_jax.figures.style import (
+    COLUMN_WIDTH_INCHES,
+    DARK_GRAY,
+    LEG_1_COLOR,
+    LEG_2_COLOR,
+    LIGHT_GRAY,
+    PAGE_WIDTH_INCHES,
+    SKY,
+    draw_marks,
+    figure_style,
+    format_axis_label,
+    format_value_label,
+    label_panel,
+    require_variables,
+    require_variables_of_all,
+)
+from vrw_jax.measures import MEASURES, PHASE_NAMES
+from vrw_jax.validation import check_type
+
+Coordinate = float | np.ndarray
+"""One coordinate of points, in m."""
+
+FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces on the feet of Leg 1 and Leg 2, in N."""
+
+
+GAIT_REMEDY = "give vrw.simulate(params)"
+"""Remedy that completes the message about a wrong dataset."""
+
+
+def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
+    """Return (begin, end, phase) of every phase of a trajectory, times in s."""
+    key = 3 * gait.step.values + gait.phase.values
+    cuts = np.flatnonzero(np.diff(key)) + 1
+    times = np.split(gait.time.values, cuts)
+    phases = gait.phase.values[np.r_[0, cuts]]
+    return [(t[0], t[-1], int(p)) for t, p in zip(times, phases, strict=True)]
+
+
+def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
+    """Return time and variables with a gap at each landing, where the labels of the legs change."""
+    cuts = np.flatnonzero(np.diff(gait.step.values)) + 1
+    return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
+
+
+def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
+    """Draw gray bands over double support and dotted lines at collision II."""
+    for begin, end, phase in find_phase_spans(gait):
+        if phase == 0:
+            axes.axvspan(begin, end, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
+        if phase == 2:
+            axes.axvline(begin, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
+
+
+@figure_style()
+def gait_panels(gait: xr.Dataset) -> Figure:
+    """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
+
+    Gray bands are double support, and dotted lines are collision II.
+
+    Args:
+        gait: dataset of `vrw.simulate` with the paper's model.
+
+    Returns:
+        Figure: panels over time in s, in SI units.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.draw_gait(gait)
+    """
+    require_variables("gait", gait, ("phase", *FORCE_NAMES), GAIT_REMEDY)
+    time, theta, L1, L2, z2, *forces = insert_landing_gaps(
+        gait, "theta", "L1", "L2", "foot_2_z", *FORCE_NAMES
+    )
+    load_share = 100.0 * forces[3] / (forces[1] + forces[3])
+    figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 7.4))
+    panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
+    for axes, letter in zip(panels, "abcde", strict=True):
+        _shade_double_support(axes, gait)
+        label_panel(axes, letter)
+    panels[0].plot(time, theta, color="black")
+    panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
+    for begin, end, phase in find_phase_spans(gait)[:3]:
+        panels[0].annotate(
+            PHASE_NAMES[phase],
+            (0.5 * (begin + end), 1.0),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="bottom",
+            fontsize=7.5,
+            rotation=90 if phase == 2 else 0,
+        )
+    panels[1].plot(time, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
+    panels[1].plot(time, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
+    panels[1].set_ylabel("$L_1,\\ L_2$ [m]")
+    panels[2].plot(time, 100.0 - load_share, color=LEG_1_COLOR, label="foot 1")
+    panels[2].plot(time, load_share, color=LEG_2_COLOR, linestyle="--", label="foot 2")
+    panels[2].set_ylabel("share of the\nnormal force [%]")
+    panels[3].plot(time, z2, color=LEG_2_COLOR, linestyle="--")
+    panels[3].set_ylabel("$z_2$ [m]")
+    for i, force in enumerate(forces):
+        color, line = (LEG_1_COLOR, "-") if i < 2 else (LEG_2_COLOR, "--")
+        name, width = f"${MEASURES[FORCE_NAMES[i]].mathtext}$", (0.7, 1.4)[i % 2]
+        panels[4].plot(time, force, color=color, linestyle=line, linewidth=width, label=name)
+    panels[4].axhline(0.0, color=DARK_GRAY, linewidth=0.4)
+    panels[4].set_ylabel("ground reaction\nforce [N]")
+    panels[4].set_xlabel("time [s]")
+    panels[4].set_xlim(time[0], time[-1])
+    for axes in panels[[1, 2, 4]]:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.align_ylabels(panels)
+    return figure
+
+
+@figure_style()
+def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
+    """Return a stick diagram in the X-Z plane (Fig. 7); Leg 1 is solid and Leg 2 dotted.
+
+    Args:
+        gait: dataset of `vrw.simulate` with the paper's model.
+        interval: time between two sticks, in s.
+
+    Returns:
+        Figure: one panel, in m.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.draw_sticks(gait, interval=0.1)
+    """
+    require_variables("gait", gait, ("phase", "foot_1_x"), GAIT_REMEDY)
+    tones = ("#A0A0A0", SKY, "#000000")
+    time = gait.time.values
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    axes = figure.subplots()
+    for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
+        instant = gait.isel(time=int(i))
+        for foot, line in ((1, "-"), (2, ":")):
+            axes.plot(
+                [float(instant[f"foot_{foot}_x"]), float(instant.hub_x)],
+                [float(instant[f"foot_{foot}_z"]), float(instant.hub_z)],
+                color=tones[int(instant.phase)],
+                linestyle=line,
+                linewidth=0.8,
+            )
+    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.annotate(
+        "downhill",
+        (float(gait.foot_1_x[-1]), -0.07),
+        (float(gait.foot_1_x[-1]) - 0.3, -0.07),
+        va="center",
+        ha="right",
+        arrowprops={"arrowstyle": "->", "linewidth": 0.6},
+    )
+    axes.set_ylim(-0.12, None)
+    axes.set_aspect("equal")
+    axes.set_xlabel("$X$ [m]")
+    axes.set_ylabel("$Z$ [m]")
+    for line, name in (("-", "Leg 1"), (":", "Leg 2")):
+        axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
+    axes.plot([], [], color=LEG_2_COLOR, label="hub")
+    for phase, tone in zip(PHASE_NAMES, tones, strict=True):
+        axes.plot([], [], color=tone, linewidth=3.0, label=phase)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
+"""Line styles of the gaits of one figure."""
+
+
+def _format_gait_label(gait: xr.Dataset, varied: str) -> str:
+    """Return the label of a gait by its varied parameter, as in "c = 50 N·s/m"."""
+    return format_value_label(varied, gait.attrs[f"parameter_{varied}"])
+
+
+@figure_style()
+def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
+    """Return a figure of the height of foot 2 over one step of each gait (Fig. 8).
+
+    A second panel shows the height around take-off, in mm.
+
+    Args:
+        gaits: datasets of `vrw.simulate` over one step, one per line.
+        varied: name of the parameter in which the gaits differ, used in the legend.
+
+    Returns:
+        Figure: two panels over the time since the landing, in s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.draw_foot_height([gait])
+    """
+    require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), GAIT_REMEDY)
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
+    step_axes, takeoff_axes = figure.subplots(1, 2)
+    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
+        name, lowest = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
+        clearance_text = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
+        step_axes.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
+        takeoff_axes.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=clearance_text)
+    for letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
+        label_panel(axes, letter)
+        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
+        axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
+        axes.set_xlabel("time since landing [s]")
+        axes.legend(loc="upper left")
+    lowest = min(float(gait.foot_2_z.min()) for gait in gaits)
+    take_off = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
+    highest = max(float(gait.foot_2_z.max()) for gait in gaits)
+    step_axes.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
+    step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
+    step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
+    takeoff_axes.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
+    takeoff_axes.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
+    takeoff_axes.set_ylabel("$z_2$ [mm]")
+    takeoff_axes.text(
+        0.98,
+        0.03,
+        "below the ground",
+        transform=takeoff_axes.transAxes,
+        ha="right",
+        color=DARK_GRAY,
+    )
+    return figure
+
+
+@figure_style()
+def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
+    """Return a figure of the normal force on foot 2 over double support of each gait (Fig. 9).
+
+    Args:
+        gaits: datasets of `vrw.simulate` over one step, one per line.
+        varied: name of the parameter in which the gaits differ, used in the legend.
+
+    Returns:
+        Figure: one panel over the time since the landing, in s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.draw_rear_force([gait])
+    """
+    require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), GAIT_REMEDY)
+    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 2.5))
+    axes = figure.subplots()
+    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
+        double_support = gait.isel(time=gait.phase.values == 0)
+        (force_line,) = axes.plot(
+            double_support.time,
+            double_support.lambda_4,
+            linestyle=line,
+            label=_format_gait_label(gait, vary),
+        )
+        axes.plot(
+            0.0,
+            double_support.lambda_4[0],
+            "o",
+            color=force_line.get_color(),
+            markersize=3.5,
+            clip_on=False,
+        )
+    axes.set_xlim(0.0, None)
+    axes.set_ylim(0.0, None)
+    axes.set_xlabel("time since landing [s]")
+    axes.set_ylabel("normal force on foot 2, $\\lambda_4$ [N]")
+    axes.legend(loc="upper right")
+    return figure
+
+
+@figure_style()
+def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
+    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10).
+
+    Symbols are filled if foot 2 stays clear of the ground, and open if it scuffs.
+
+    Args:
+        gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
+            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
+            `parameter_slope` is the slope in rad.
+        marker_interval: parameter values that are multiples of it have symbols, and so have both
+            ends.
+
+    Returns:
+        Figure: the impulse and the two forces over the parameter.
+
+    Examples:
+        >>> columns = {"lambda_I4": [5.0, 4.0], "lambda_2_plus": [90.0, 80.0]}
+        >>> columns |= {"lambda_4_plus": [50.0, 60.0], "settled": [True, True]}
+        >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
+        >>> over = {name: ("damping", values) for name, values in columns.items()}
+        >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
+        >>> figure = vrw.plot.draw_indicators(gaits)
+    """
+    require_variables(
+        "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
+    )
+    vary = str(gaits.settled.dims[0])
+    valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
+    is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
+    values = valid_gaits[vary].values
+    has_marker = (values % every == 0) | (values == values.min()) | (values == values.max())
+    rows = (
+        ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
+        ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
+    )
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.7))
+    panels = figure.subplots(1, 2)
+    for axes, letter, (series, axis_text) in zip(panels, "ab", rows, strict=True):
+        label_panel(axes, letter)
+        for name, color, marker in series:
+            data, symbol = valid_gaits[name].values, f"${MEASURES[name].mathtext}$"
+            axes.plot(values, data, color=color, linewidth=0.7)
+            for draws_scuffing, fill in ((False, color), (True, "white")):
+                is_selected = has_marker & (is_scuffing == draws_scuffing)
+                text = symbol + (", scuffing" if draws_scuffing else "")
+                x, y = values[is_selected], data[is_selected]
+                draw_marks(axes, x, y, marker, color, fill, label=text, clip_on=False)
+        axes.set_xlim(0.0, values.max() + 1.0)
+        axes.set_ylim(0.0, 1.18 * max(float(valid_gaits[name].max()) for name, *_ in series))
+        axes.set_xlabel(format_axis_label(vary, "{symbol}"))
+        axes.set_ylabel(axis_text)
+        axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
+    slope = gaits.attrs["parameter_slope"]  # the slope in the caption of the paper is a misprint
+    panels[0].text(0.02, 0.05, format_value_label("slope", slope), transform=panels[0].transAxes)
+    return figure
+
+
+def _rotate_to_vertical(
+    x: Coordinate, z: Coordinate, slope: float
+) -> tuple[Coordinate, Coordinate]:
+    """Return coordinates in a frame with vertical gravity, from those in the slope's frame."""
+    return (
+        x * np.cos(slope) + z * np.sin(slope),
+        z * np.cos(slope) - x * np.sin(slope),
+    )
+
+
+@figure_style()
+def walk_frames(
+    step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
+) -> tuple[list[Image.Image], int]:
+    """Return looping frames of one step of a steady gait, and the duration of a frame in ms.
+
+    The camera moves at the mean speed. Arrows are ground forces, 1 m for 300 N.
+
+    Args:
+        step: dataset of `vrw.simulate` over one step of a gait.
+        n_frames: number of frames of the step.
+        slowdown: factor of slow motion; 2 plays at half speed.
+
+    Returns:
+        tuple[list[Image], int]: images of Pillow, and the milliseconds per frame.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
+        >>> len(frames)
+        2
+    """
+    require_variables("step", step, ("parameter_slope", "phase", "foot_2_x"), GAIT_REMEDY)
+    slope, time = step.attrs["parameter_slope"], step.time.values
+    period = time[-1]
+    stride = float(step.hub_x[-1] - step.hub_x[0])
+    frames = []
+    for t in np.linspace(0.0, period, n_frames, endpoint=False):
+        figure = Figure(figsize=(3.6, 3.3), dpi=100)
+        figure.set_layout_engine("none")
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        center = float(step.hub_x[0]) + stride * t / period
+        _draw_ground(axes, slope, center, stride)
+        _draw_wheel(axes, step, t)
+        time_index = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
+        _draw_forces(axes, step.isel(time=time_index), np.interp(t, time, step.foot_2_x))
+        view_center = [float(v) for v in _rotate_to_vertical(center, 0.75, slope)]
+        axes.set_xlim(view_center[0] - 1.35, view_center[0] + 1.35)
+        axes.set_ylim(view_center[1] - 1.25, view_center[1] + 1.225)
+        axes.text(
+            0.02,
+            0.03,
+            PHASE_NAMES[int(step.phase[time_index])],
+            transform=axes.transAxes,
+            fontsize=14,
+        )
+        canvas.draw()
+        picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
+        frames.append(picture.convert("RGB"))
+    return frames, round(1e3 * slow * period / n_frames)
+
+
+def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
+    """Draw hub and legs of the wheel at the time t, in s."""
+    slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
+    names = ("theta", "L1", "L2", "hub_x", "hub_z")
+    theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
+    for j in range(1, n + 1):
+        angle = theta + (j - 1) * 2.0 * np.pi / n
+        leg_length = {1: L1, 2: L2}.get(j, step.attrs["parameter_locked_length"])
+        color, width = {1: (LEG_1_COLOR, 3.0), 2: (LEG_2_COLOR, 3.0)}.get(j, ("#999999", 1.5))
+        axes.plot(
+            *_rotate_to_vertical(
+                np.array([x, x - leg_length * np.sin(angle)]),
+                np.array([z, z - leg_length * np.cos(angle)]),
+                slope,
+            ),
+            color=color,
+            linewidth=width,
+            solid_capstyle="round",
+            zorder=5 if j < 3 else 3,
+        )
+    axes.plot(*_rotate_to_vertical(x, z, slope), "o", color="black", markersize=9, zorder=6)
+
+
+def _draw_forces(axes: Axes, instant: xr.Dataset, foot_2_x: float) -> None:
+    """Draw arrows of the ground forces on both feet."""
+    slope, forces = instant.attrs["parameter_slope"], [float(instant[name]) for name in FORCE_NAMES]
+    for foot, tangential, normal in ((0.0, *forces[:2]), (foot_2_x, *forces[2:])):
+        if normal != 0.0:
+            axes.annotate(
+                "",
+                _rotate_to_vertical(foot + tangential / 300.0, normal / 300.0, slope),
+                _rotate_to_vertical(foot, 0.0, slope),
+                zorder=7,
+                arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
+            )
+
+
+def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None:
+    """Draw the slope with marks that repeat every half stride, so that the animation loops."""
+    ends = np.array([center - 3.0, center + 3.0])
+    axes.plot(*_rotate_to_vertical(ends, 0.0 * ends, slope), color="black", linewidth=1.2)
+    spacing = 0.5 * stride
+    first_mark = np.ceil((center - 2.0) / spacing)
+    for k in range(int(4.0 / spacing)):
+        x = np.array([0.0, -0.06]) + (first_mark + k) * spacing
+        axes.plot(
+            *_rotate_to_vertical(x, np.array([0.0, -0.06]), slope), color="black", linewidth=0.7
+        )
+
+
+def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path) -> Path:
+    """Write frames as a looping GIF with one shared palette of 32 colors.
+
+    Args:
+        frames: images as `draw_walk_frames` returns them.
+        milliseconds: duration of a frame, in ms.
+        path: path of the GIF.
+
+    Returns:
+        Path: the path of the GIF.
+
+    Raises:
+        OSError: if the file cannot be written.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
+        >>> path = Path(tempfile.mkdtemp(), "walk.gif")
+        >>> vrw.plot.save_animation(frames, milliseconds, path).name
+        'walk.gif'
+    """
+    check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    palette = frames[0].quantize(32)
+    paletted_frames = [
+        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
+    ]
+    paletted_frames[0].save(
+        path,
+        save_all=True,
+        append_images=paletted_frames[1:],
+        duration=milliseconds,
+        loop=0,
+        optimize=True,
+    )
+    return path

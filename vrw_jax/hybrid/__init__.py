@@ -1,0 +1,27 @@
+"""Hybrid systems of any kind: modes, guards and resets, integrated by diffrax."""
+
+from vrw_jax.hybrid.complementarity import LCPStatus, enumerate_lcp_solutions
+from vrw_jax.hybrid.minima import (
+    GUARD_ROUNDOFF_EPS,
+    MINIMUM_LOCATION_TOLERANCE,
+    MonitoredFunctions,
+    StateVector,
+    find_cubic_minimum,
+)
+from vrw_jax.hybrid.phase_integration import (
+    PhaseEnd,
+    VectorField,
+    integrate_phase,
+    make_solver,
+    sample_phase,
+)
+from vrw_jax.hybrid.saltation import flow_jacobian_determinant
+from vrw_jax.hybrid.segments import product_multipliers, segment_maps
+from vrw_jax.hybrid.simulation import (
+    Guard,
+    HybridSolution,
+    Mode,
+    Termination,
+    simulate_hybrid,
+    time_errors,
+)

@@ -1,0 +1,88 @@
+"""Unilateral contacts: all solutions of a linear complementarity problem (LCP), by enumeration."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.numerics import StatusCode
+from vrw_jax.validation import is_traced
+
+MAX_LCP_CONTACTS = 10
+"""Most contacts of an LCP, chosen because two to the power of it combinations are solved."""
+
+
+class LCPStatus(StatusCode):
+    """Number of solutions of an LCP."""
+
+    NO_SOLUTION = 0, "No force fits: a rigid body would have to jump at once."
+    UNIQUE_SOLUTION = 1, "One answer."
+    MULTIPLE_SOLUTIONS = 2, "Several answers fit: the law of contact does not choose."
+
+
+class LCPSolutions(NamedTuple):
+    """Forces z >= 0 and gaps w = matrix z + free_gap >= 0, with z w = 0 in each contact."""
+
+    force: Float[Array, " n"]  # of the solution with most closed contacts; NaN if there is none
+    gap: Float[Array, " n"]
+    status: Int[Array, ""]  # an LCPStatus
+    is_solution: Bool[Array, " combinations"]  # which combinations of closed contacts are solutions
+    candidate_forces: Float[Array, "combinations n"]
+
+
+def enumerate_lcp_solutions(
+    matrix: ArrayLike | Sequence, free_gap: ArrayLike | Sequence, tolerance: float = 1e-12
+) -> LCPSolutions:
+    """Return all solutions of an LCP with any matrix, symmetric or not.
+
+    Signs hold to `tolerance` of the largest entry. Combinations that differ only by contacts
+    without force count once. The result is differentiable where one solution persists.
+    """
+    free_gap = jnp.asarray(free_gap, float)
+    matrix = jnp.asarray(matrix, free_gap.dtype)
+    n = free_gap.size
+    if free_gap.ndim != 1 or matrix.shape != (n, n) or not 0 < n <= MAX_LCP_CONTACTS:
+        raise ValueError(
+            f"matrix has shape {matrix.shape} and free {free_gap.shape}, but they must be (n, n) and "
+            f"(n,) with n from 1 to {MAX_LCP_CONTACTS}."
+        )
+    if not is_traced(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
+        raise ValueError("matrix or free holds a number that is not finite: give finite numbers.")
+    max_entry = jnp.max(jnp.abs(matrix))
+    scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
+    free_gap, matrix = free_gap / scale, matrix / scale
+    is_closed = np.array(list(itertools.product((True, False), repeat=n)))  # most closed first
+    is_closed = is_closed[np.argsort(-is_closed.sum(1), kind="stable")]
+
+    def solve_combination(is_closed: Array) -> tuple[Array, Array]:
+        closed_pair = is_closed[:, None] & is_closed[None]
+        system = jnp.where(closed_pair, matrix, jnp.eye(n, dtype=free_gap.dtype))
+        singular = jnp.abs(jnp.linalg.det(system)) <= tolerance
+        system = jnp.where(singular, jnp.eye(n, dtype=free_gap.dtype), system)
+        force = jnp.where(
+            is_closed, jnp.linalg.solve(system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
+        )
+        gap = jnp.where(is_closed, 0.0, matrix @ force + free_gap)
+        pushes_everywhere = jnp.all(force >= -tolerance * jnp.max(jnp.abs(force)))
+        opens_everywhere = jnp.all(
+            gap >= -tolerance * (jnp.max(jnp.abs(gap)) + jnp.max(jnp.abs(free_gap)))
+        )
+        return force, pushes_everywhere & opens_everywhere & ~singular
+
+    candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
+    match_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))
+    is_same = (
+        jnp.max(jnp.abs(candidate_forces[:, None] - candidate_forces[None]), -1) <= match_tolerance
+    )
+    is_duplicate = jnp.any(jnp.tril(is_same & is_solution[None], -1), 1)
+    is_solution = is_solution & ~is_duplicate
+    force = jnp.where(jnp.any(is_solution), candidate_forces[jnp.argmax(is_solution)], jnp.nan)
+    status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS)).astype(jnp.int32)
+    return LCPSolutions(
+        force, scale * (matrix @ force + free_gap), status, is_solution, candidate_forces
+    )

@@ -1,0 +1,586 @@
+"""Integration of one phase from its start to its earliest event; the only module that uses diffrax.
+
+diffrax's solvers and step-size controller are called step by step, so that an event's state has the
+accuracy of the integrator and not of an interpolant. An accepted step that brackets an event is
+repeated with a length that Newton's method shortens until it ends on the event. These last steps
+are differentiated, so first and second derivatives of the event's state and time are accurate as
+well.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.hybrid.minima import (
+    AcceptedPhaseStep,
+    InteriorMinimum,
+    MinimumRefinement,
+    MonitoredFunctions,
+    StateVector,
+    empty_minimum,
+    evaluate_cubic,
+    find_cubic_minimum,
+    is_at_roundoff,
+    refine_minimum,
+    select_row,
+    update_minimum,
+)
+from vrw_jax.numerics import Scalar, StepOptions, opaque_condition, tree_where
+from vrw_jax.runtime import lazy_import
+
+if TYPE_CHECKING:
+    import diffrax
+else:
+    diffrax = lazy_import("diffrax")
+
+VectorField = Callable[[StateVector], StateVector]
+"""Autonomous vector field of a phase."""
+
+
+class PhaseEnd(NamedTuple):
+    """End of a phase: state, duration, the guard that ended it and failure flags."""
+
+    state: StateVector
+    duration: Scalar  # s
+    guard: Int[Array, ""]  # index of the guard that ended it; -1 if none did
+    timed_out: Bool[Array, ""]
+    gave_up: Bool[Array, ""]
+    solver_steps: Int[Array, ""]  # tried, accepted or not
+    minima: Float[Array, " n_monitors"]  # of the margins, empty if there are none
+
+
+STARTING_MODE, INTEGRATING_MODE, EVENT_SEARCH_MODE, REFINEMENT_MODE, DONE_MODE = range(5)
+"""Purposes of the next solver step, in order: to evaluate the start; to integrate; to locate a
+bracketed event; to find the minimum of a margin; none."""
+
+
+class _EventSearch(NamedTuple):
+    """State of Newton's search for the earliest event inside a step that brackets one."""
+
+    is_crossing: Bool[Array, " n_guards"]
+    lower_bound: Scalar  # bracket of the event, s from the step's start
+    upper_bound: Scalar
+    time_tolerance: Scalar  # of the event's time, s
+    n_iterations: Int[Array, ""]
+    n_confirmed: Int[Array, ""]  # consecutive tries that left the event unchanged
+
+
+class _PhaseState(NamedTuple):
+    """State of the integration of a phase."""
+
+    mode: Int[Array, ""]
+    accepted_step: AcceptedPhaseStep  # the last accepted step
+    next_length: Scalar  # of the next step to try, s
+    controller_state: Any
+    search: _EventSearch
+    minimum: InteriorMinimum
+    refinement: MinimumRefinement
+    guard: Int[Array, ""]
+    timed_out: Bool[Array, ""]
+    gave_up: Bool[Array, ""]
+    n_tried_steps: Int[Array, ""]
+
+
+class _SolverStepper(NamedTuple):
+    """A diffrax solver with its controller, as a function from state and length to state."""
+
+    field: VectorField
+    solver: diffrax.AbstractAdaptiveSolver
+    controller: diffrax.PIDController
+    term: diffrax.ODETerm
+
+    def init_states(self, state: StateVector, options: StepOptions) -> tuple[Any, Any]:
+        """Return the solver state and the controller state at the start of a phase."""
+        zero = jnp.zeros((), state.dtype)
+        _, controller_state = self.controller.init(
+            self.term,
+            zero,
+            options.dt0,
+            lax.stop_gradient(state),
+            options.dt0,
+            None,
+            lambda terms, t, y, args: terms.vf(t, y, args),
+            self.solver.error_order(self.term),
+        )
+        return self.init_solver_state(state, options), controller_state
+
+    def init_solver_state(self, state: StateVector, options: StepOptions) -> Any:
+        """Return the solver's internal state at a state of the system."""
+        zero = jnp.zeros((), state.dtype)
+        return self.solver.init(self.term, zero, options.dt0, state, None)
+
+    def advance_state(
+        self, state: StateVector, solver_state: Any, length: Scalar
+    ) -> tuple[StateVector, StateVector, Any]:
+        """Return the state after `length`, its error estimate and the solver state there."""
+        zero = jnp.zeros_like(length)
+        end, error, _, solver_state, result = self.solver.step(
+            self.term, zero, length, state, None, solver_state, jnp.asarray(False)
+        )
+        if error is None:
+            raise ValueError(f"{type(self.solver).__name__} gives no error estimate.")
+        error = jnp.where(result == diffrax.RESULTS.successful, error, jnp.inf)
+        return end, error, solver_state
+
+    def control_step(
+        self,
+        start: StateVector,
+        end: StateVector,
+        error: StateVector,
+        length: Scalar,
+        controller_state: Any,
+    ) -> tuple[Bool[Array, ""], Scalar, Any]:
+        """Return whether the step is kept, the length of the next step, and the controller's state.
+
+        Nothing here is differentiated: derivatives are those of the steps taken.
+        """
+        start, end, error = lax.stop_gradient((start, end, error))
+        is_finite = jnp.all(jnp.isfinite(end))
+        is_kept, next_start, next_end, _, controller_state, _ = self.controller.adapt_step_size(
+            jnp.zeros_like(length),
+            length,
+            start,
+            jnp.where(is_finite, end, start),
+            None,
+            jnp.where(is_finite, error, jnp.inf),
+            self.solver.error_order(self.term),  # type: ignore[arg-type]
+            controller_state,
+        )
+        return jnp.asarray(is_kept), jnp.asarray(next_end - next_start), controller_state
+
+
+def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
+    """Return the diffrax solver with this name, configured for forward-mode derivatives."""
+    solver_class = getattr(diffrax, name, None)
+    if not (
+        isinstance(solver_class, type) and issubclass(solver_class, diffrax.AbstractAdaptiveSolver)
+    ):
+        raise ValueError(
+            f"solver is {name!r}, but it must name a diffrax solver with an error estimate: "
+            "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
+        )
+    fields = getattr(solver_class, "__dataclass_fields__", {})
+    keywords: dict[str, Any] = {}
+    if "scan_kind" in fields:
+        keywords["scan_kind"] = "lax"
+    if "root_finder" in fields:
+        tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
+        keywords["root_finder"] = diffrax.VeryChord(**tolerances)
+    return solver_class(**keywords)
+
+
+def _make_stepper(field: VectorField, options: StepOptions) -> _SolverStepper:
+    return _SolverStepper(
+        field=field,
+        solver=make_solver(options.solver, options),
+        controller=diffrax.PIDController(
+            rtol=options.rtol, atol=options.atol, factormax=MAX_STEP_GROWTH_FACTOR
+        ),
+        term=diffrax.ODETerm(lambda t, y, args: field(y)),
+    )
+
+
+def integrate_phase(
+    field: VectorField,
+    monitored_functions: MonitoredFunctions,
+    start: StateVector,
+    active: Bool[Array, ""],
+    options: StepOptions,
+) -> PhaseEnd:
+    """Integrate `field` from `start` until the earliest guard reaches zero from above.
+
+    A guard that is negative at the start, or zero and not rising, ends the phase immediately with
+    duration 0; a guard that is zero and rising does not fire. A guard that dips below zero and
+    returns within one step is detected: where the step's cubic through values and rates dips, the
+    step is repeated up to the dip. With `active` False nothing is integrated. If two guards vanish
+    together, the first in the list counts. Errors are those of the solver at the tolerances in
+    `options`.
+    """
+    context = _PhaseContext(_make_stepper(field, options), monitored_functions, options)
+    loop = lax.while_loop(
+        lambda loop: opaque_condition(loop.mode != DONE_MODE, loop.n_tried_steps),
+        functools.partial(_advance_phase, context),
+        _init_phase(context, start, active),
+    )
+    minima = jnp.minimum(
+        loop.refinement.lowest_values, loop.accepted_step.values[monitored_functions.n_guards :]
+    )
+    return PhaseEnd(
+        state=loop.accepted_step.state,
+        duration=loop.accepted_step.time,
+        guard=loop.guard,
+        timed_out=loop.timed_out,
+        gave_up=loop.gave_up,
+        solver_steps=loop.n_tried_steps,
+        minima=minima,
+    )
+
+
+class _PhaseContext(NamedTuple):
+    """Constants of a phase's loop."""
+
+    stepper: _SolverStepper
+    monitored_functions: MonitoredFunctions
+    options: StepOptions
+
+
+def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, ""]) -> _PhaseState:
+    """Return the state of the loop before the first step.
+
+    Every number of the loop's state is batched, and perturbed where it will be, from the start.
+    Otherwise JAX would trace the loop again for each round in which these properties spread.
+    """
+    stepper, monitored_functions, options = context
+    zero_time = 0.0 * start[0]
+    zero_count = jnp.where(active, 0, 0).astype(jnp.int32)
+    zero_values = (
+        jnp.zeros(jax.eval_shape(monitored_functions.values, start).shape, start.dtype) + zero_time
+    )
+    false = active & False
+    constant_zero = lax.stop_gradient(zero_time)
+    solver_state, controller_state = stepper.init_states(start, options)
+    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false
+    return _PhaseState(
+        mode=jnp.where(active, STARTING_MODE, DONE_MODE).astype(jnp.int32),
+        accepted_step=AcceptedPhaseStep(zero_time, start, solver_state, zero_values, zero_values),
+        next_length=zero_time,  # the first step has length zero: it evaluates the start
+        controller_state=jax.tree.map(lambda x: x + constant_zero, controller_state),
+        search=_EventSearch(
+            is_crossing, constant_zero, constant_zero, constant_zero, zero_count, zero_count
+        ),
+        minimum=empty_minimum(monitored_functions, start),
+        refinement=MinimumRefinement(
+            zero_count,
+            zero_count,
+            constant_zero,
+            constant_zero,
+            zero_values[monitored_functions.n_guards :] + jnp.inf,
+        ),
+        guard=zero_count - 1,
+        timed_out=false,
+        gave_up=false,
+        n_tried_steps=zero_count,
+    )
+
+
+def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
+    """Take one solver step, and update the search for the event and for minima."""
+    _, monitored_functions, options = context
+    n, previous_step, length, search = (
+        monitored_functions.n_guards,
+        loop.accepted_step,
+        loop.next_length,
+        loop.search,
+    )
+    is_starting, is_searching = loop.mode == STARTING_MODE, loop.mode == EVENT_SEARCH_MODE
+    step, error = _try_step(context, loop)
+    guards, rates = step.values[:n], step.rates[:n]
+    is_past = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
+    has_immediate_event = is_starting & jnp.any(is_past)
+    assessment = _assess_step(context, loop, step, error)
+    proposal = _propose_event(search, guards, rates, length)
+    is_close = jnp.abs(proposal.length - length) <= search.time_tolerance
+    is_at_zero, lowest_guard = is_at_roundoff(monitored_functions, search.is_crossing, guards)
+    proposal = proposal._replace(guard=jnp.where(is_at_zero, lowest_guard, proposal.guard))
+    n_confirmed = search.n_confirmed + (is_searching & (is_close | is_at_zero))
+    has_arrived = is_searching & (n_confirmed >= N_EVENT_CONFIRMATIONS)
+
+    timed_out = assessment.is_accepted & (step.time >= options.max_phase_time)
+    timed_out = timed_out | (has_arrived & (step.time > options.max_phase_time))
+    is_stuck = assessment.is_stuck | (
+        is_searching & ~has_arrived & (search.n_iterations >= options.max_event_iterations)
+    )
+    is_phase_end = has_immediate_event | has_arrived | timed_out | is_stuck
+    mode = jnp.where(is_starting, INTEGRATING_MODE, loop.mode)
+    mode = jnp.where(
+        is_phase_end, DONE_MODE, jnp.where(assessment.has_crossed, EVENT_SEARCH_MODE, mode)
+    ).astype(jnp.int32)
+    following_length = jnp.where(
+        is_searching, proposal.length, lax.stop_gradient(assessment.following_length)
+    )
+    is_counted = (assessment.is_accepted & ~is_starting) | has_arrived
+    minimum = update_minimum(
+        monitored_functions, loop.minimum, previous_step, step, length, is_counted
+    )
+    refinement = loop.refinement
+    if monitored_functions.includes_start:
+        was_refining = loop.mode == REFINEMENT_MODE
+        refinement, is_refining, length_to_minimum = refine_minimum(
+            refinement,
+            monitored_functions,
+            minimum,
+            step,
+            length,
+            was_refining,
+            is_starting,
+            is_phase_end,
+            options.max_margin_search_iterations,
+        )
+        mode = jnp.where(is_refining, REFINEMENT_MODE, jnp.where(was_refining, DONE_MODE, mode))
+        following_length = jnp.where(is_refining, length_to_minimum, following_length)
+    return _PhaseState(
+        mode=mode,
+        accepted_step=tree_where(assessment.is_accepted | has_arrived, step, previous_step),
+        next_length=following_length,
+        controller_state=assessment.controller_state,
+        search=_EventSearch(
+            is_crossing=jnp.where(
+                assessment.has_crossed, assessment.is_crossing, search.is_crossing
+            ),
+            lower_bound=jnp.where(assessment.has_crossed, 0.0, proposal.lower_bound),
+            upper_bound=jnp.where(
+                assessment.has_crossed, lax.stop_gradient(length), proposal.upper_bound
+            ),
+            time_tolerance=jnp.where(
+                assessment.has_crossed, assessment.time_tolerance, search.time_tolerance
+            ),
+            n_iterations=search.n_iterations + is_searching,
+            n_confirmed=n_confirmed,
+        ),
+        minimum=minimum,
+        refinement=refinement,
+        guard=jnp.where(
+            has_immediate_event,
+            jnp.argmax(is_past).astype(jnp.int32),
+            jnp.where(has_arrived & ~timed_out, proposal.guard, loop.guard),
+        ),
+        timed_out=timed_out | loop.timed_out,
+        gave_up=is_stuck | loop.gave_up,
+        n_tried_steps=assessment.n_tried_steps,
+    )
+
+
+def _try_step(context: _PhaseContext, loop: _PhaseState) -> tuple[AcceptedPhaseStep, Array]:
+    """Return the step to try, with the monitored functions at its end, and its error.
+
+    One call of the solver and of the monitored functions serves every mode, so that the code is
+    compiled once.
+    """
+    stepper, monitored_functions, options = context
+    start = loop.accepted_step.state, loop.accepted_step.solver_state
+    if monitored_functions.includes_start:
+        minimum_start = select_row(loop.refinement.monitor, loop.minimum.start_state)
+        restart = minimum_start, stepper.init_solver_state(minimum_start, options)
+        start = tree_where(loop.mode == REFINEMENT_MODE, restart, start)
+    end, error, solver_state = stepper.advance_state(*start, loop.next_length)
+    values, rates = jax.jvp(monitored_functions.values, (end,), (stepper.field(end),))
+    error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
+    return AcceptedPhaseStep(
+        loop.accepted_step.time + loop.next_length, end, solver_state, values, rates
+    ), error
+
+
+class _StepAssessment(NamedTuple):
+    """Assessment of a tried solver step."""
+
+    is_accepted: Bool[Array, ""]  # the start counts as accepted
+    has_crossed: Bool[Array, ""]  # it brackets an event
+    is_crossing: Bool[Array, " n_guards"]  # of which guards
+    is_stuck: Bool[Array, ""]
+    following_length: Scalar  # length of the next step, s
+    time_tolerance: Scalar  # of the event's time, s
+    controller_state: Any
+    n_tried_steps: Int[Array, ""]
+
+
+def _assess_step(
+    context: _PhaseContext, loop: _PhaseState, step: AcceptedPhaseStep, error: Array
+) -> _StepAssessment:
+    """Accept or reject the step, and detect crossings and dips within it."""
+    stepper, monitored_functions, options = context
+    n, previous_step, length = monitored_functions.n_guards, loop.accepted_step, loop.next_length
+    is_starting, is_integrating = loop.mode == STARTING_MODE, loop.mode == INTEGRATING_MODE
+    nominal_length = jnp.where(is_starting, options.dt0, length)
+    is_kept, next_length, controller_state = stepper.control_step(
+        previous_step.state, step.state, error, nominal_length, loop.controller_state
+    )
+    is_kept = is_kept & is_integrating
+    is_crossing = step.values[:n] <= 0.0
+    dip_fractions, has_dip = _find_dips(previous_step, step.values, step.rates, length, n)
+    length_to_dip = length * jnp.min(jnp.where(has_dip & ~is_crossing, dip_fractions, 1.0))
+    must_retry = is_kept & (length_to_dip < length)
+    has_crossed = is_kept & jnp.any(is_crossing) & ~must_retry
+    n_tried_steps = loop.n_tried_steps + (loop.mode != REFINEMENT_MODE)
+    cannot_continue = (n_tried_steps >= options.max_solver_steps) | (
+        previous_step.time + next_length == previous_step.time
+    )
+    following_length = jnp.where(is_starting, options.dt0, next_length)
+    following_length = jnp.where(must_retry, length_to_dip, following_length)
+    guess = _guess_event_length(previous_step, step.values, step.rates, length, n, is_crossing)
+    resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
+    return _StepAssessment(
+        is_accepted=is_starting | (is_kept & ~has_crossed & ~must_retry),
+        has_crossed=has_crossed,
+        is_crossing=is_crossing,
+        is_stuck=is_integrating & ~has_crossed & cannot_continue,
+        following_length=jnp.where(has_crossed, guess, following_length),
+        time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
+        controller_state=tree_where(
+            is_integrating & ~must_retry, controller_state, loop.controller_state
+        ),
+        n_tried_steps=n_tried_steps,
+    )
+
+
+MAX_STEP_GROWTH_FACTOR = 2.0
+"""Largest factor by which a step may exceed the one before it.
+
+It is chosen because the error estimate of a step far shorter than needed is round-off, and so would
+be a length grown from it without bound. A batch element would then differ from the same element
+alone by 1e-12, more than a hundred times its round-off.
+"""
+N_EVENT_CONFIRMATIONS = 3
+"""Number of tries at the located event before it counts.
+
+It is chosen because the first try makes the event's time accurate to first order in its derivatives
+and the second to third order; the last evaluates the state there.
+"""
+
+
+def _find_dips(
+    previous_step: AcceptedPhaseStep, values: Array, rates: Array, length: Scalar, n_guards: int
+) -> tuple[Array, Array]:
+    """Return fractions in (0, 1) to step to first for guards that may dip, and whether they may
+    dip.
+
+    The cubic through values and rates does not fall below the least of its Bernstein coefficients,
+    so a guard with positive coefficients does not dip. Otherwise the step is repeated up to the
+    cubic's minimum, at most nine tenths of it. Shorter steps have coefficients closer to the guard,
+    until these are positive or a step ends in the dip.
+    """
+    v0, r0, v1, r1 = lax.stop_gradient((previous_step.values, previous_step.rates, values, rates))
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    length = lax.stop_gradient(length)
+    first_coefficient, second_coefficient = v0 + r0 * length / 3.0, v1 - r1 * length / 3.0
+    dip_fractions = jnp.clip(find_cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
+    advances_time = previous_step.time + dip_fractions * length > previous_step.time
+    return dip_fractions, (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (
+        r1 >= 0.0
+    ) & advances_time
+
+
+def _guess_event_length(
+    previous_step: AcceptedPhaseStep,
+    values: Array,
+    rates: Array,
+    length: Scalar,
+    n_guards: int,
+    is_crossing: Array,
+) -> Scalar:
+    """Return the length to the earliest crossing of the guards' cubics: secant, then Newton's
+    method.
+    """
+    v0, r0, v1, r1 = lax.stop_gradient(
+        (previous_step.values, previous_step.rates * length, values, rates * length)
+    )
+    v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
+    fall = jnp.where(is_crossing & (v0 > v1), v0 - v1, 1.0)
+    fraction = jnp.where(is_crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
+    # A guard that rises from zero, or from round-off above it: the cubic over x has the root.
+    linear, square = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
+    root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * r0 * square, 0.0)) - linear
+    other_root = jnp.clip(2.0 * r0 / jnp.where(root > 0.0, root, 1.0), 0.0, 1.0)
+    cubic_rate = lambda fraction: (
+        6.0 * fraction * (fraction - 1.0) * (v0 - v1)
+        + (1.0 - fraction) * (1.0 - 3.0 * fraction) * r0
+        + fraction * (3.0 * fraction - 2.0) * r1
+    )
+    starts_rising = is_crossing & (r0 > 0.0) & ((v0 == 0.0) | (cubic_rate(fraction) >= 0.0))
+    fraction = jnp.where(starts_rising, other_root, fraction)
+    for _ in range(3):
+        is_falling = (rate := cubic_rate(fraction)) < 0.0
+        change = evaluate_cubic(fraction, v0, r0, v1, r1) / jnp.where(is_falling, rate, 1.0)
+        fraction = jnp.where(
+            is_crossing & is_falling, jnp.clip(fraction - change, 0.0, 1.0), fraction
+        )
+    return lax.stop_gradient(length) * jnp.min(jnp.where(is_crossing, fraction, 1.0))
+
+
+class _EventProposal(NamedTuple):
+    """Newton's next proposal for an event's time, and the remaining bracket."""
+
+    length: Scalar
+    guard: Int[Array, ""]
+    lower_bound: Scalar
+    upper_bound: Scalar
+
+
+def _propose_event(
+    search: _EventSearch, guards: Array, rates: Array, length: Scalar
+) -> _EventProposal:
+    """Return the earliest of the times that the crossing guards propose.
+
+    Bisection keeps the proposal inside the shrinking bracket. The proposal carries derivatives:
+    after k proposals in the quadratic regime, derivatives are accurate to order 2^k - 1.
+    """
+    is_falling = search.is_crossing & (rates < 0.0)
+    change = -guards / jnp.where(is_falling, rates, -1.0)
+    # A guard that rises below zero has crossed at an unknown earlier time.
+    missed_time = jnp.where(search.is_crossing & (guards < 0.0), -jnp.inf, jnp.inf)
+    proposals = jnp.where(is_falling, length + change, missed_time)
+    guard = jnp.argmin(proposals).astype(jnp.int32)
+    is_rising = (guards == 0.0) & (rates > 0.0)  # at the start of the step
+    is_before_event = jnp.all(jnp.where(search.is_crossing, (guards > 0.0) | is_rising, True))
+    lower_bound = jnp.where(is_before_event, lax.stop_gradient(length), search.lower_bound)
+    upper_bound = jnp.where(is_before_event, search.upper_bound, lax.stop_gradient(length))
+    proposal = proposals[guard]
+    # A proposal within round-off of a collapsed bracket counts as inside.
+    is_inside = (proposal >= lower_bound - search.time_tolerance) & (
+        proposal <= upper_bound + search.time_tolerance
+    )
+    # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
+    finite_proposal = jnp.where(jnp.isfinite(proposal), proposal, 0.0)
+    bisected_length = 0.5 * (lower_bound + upper_bound) + (
+        finite_proposal - lax.stop_gradient(finite_proposal)
+    )
+    next_length = jnp.where(is_inside, finite_proposal, bisected_length)
+    return _EventProposal(next_length, guard, lower_bound, upper_bound)
+
+
+def sample_phase(
+    field: VectorField, start: StateVector, duration: Scalar, n_samples: int, options: StepOptions
+) -> Float[Array, "n_samples dim"]:
+    """Return the states at `n_samples` equal times of a phase, both ends included, at solver
+    accuracy.
+    """
+    stepper = _make_stepper(field, options)
+    interval = duration / (n_samples - 1)
+
+    def integrate_to_next(state: StateVector, _sample: None) -> tuple[StateVector, StateVector]:
+        next_state = _integrate_interval(stepper, state, interval, options)
+        return next_state, next_state
+
+    _, states = lax.scan(integrate_to_next, start, None, length=n_samples - 1)
+    return jnp.concatenate([start[None], states])
+
+
+def _integrate_interval(
+    stepper: _SolverStepper, state: StateVector, interval: Scalar, options: StepOptions
+) -> StateVector:
+    """Return the state after `interval`, by adaptive steps of which the last ends exactly there."""
+
+    def advance_interval(carry: tuple) -> tuple:
+        time, state, solver_state, length, controller_state, n_tried_steps = carry
+        step_length = jnp.minimum(length, interval - time)
+        end, error, end_solver_state = stepper.advance_state(state, solver_state, step_length)
+        is_kept, next_length, controller_state = stepper.control_step(
+            state, end, error, step_length, controller_state
+        )
+        is_last = is_kept & (step_length >= interval - time)
+        time = jnp.where(is_last, interval, jnp.where(is_kept, time + step_length, time))
+        state, solver_state = tree_where(is_kept, (end, end_solver_state), (state, solver_state))
+        return time, state, solver_state, next_length, controller_state, n_tried_steps + 1
+
+    needs_step = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
+    zero_count = jnp.zeros((), jnp.int32)
+    solver_state, controller_state = stepper.init_states(state, options)
+    zero = jnp.zeros_like(interval)
+    carry = (zero, state, solver_state, zero + options.dt0, controller_state, zero_count)
+    return lax.while_loop(needs_step, advance_interval, carry)[1]

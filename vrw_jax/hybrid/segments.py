@@ -1,0 +1,191 @@
+"""Multipliers of a periodic orbit from its segments, without forming their product.
+
+A product of matrices keeps what grows and loses what decays: a multiplier of 1e-20 beside one of 1
+has no correct digit in it. Orthogonal iteration around the period makes every factor triangular
+instead (a periodic Schur form). A multiplier is then a product of diagonal entries, each correct.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
+from vrw_jax.numerics import Scalar, StepOptions
+
+
+class FlowSegments(NamedTuple):
+    """A flow in segments of equal time."""
+
+    states: Float[Array, "n_ends dim"]  # at the segments' ends, the start first
+    jacobians: Float[
+        Array, "n_segments n n"
+    ]  # Jacobian of each segment's end with respect to its start
+    divergence: Scalar  # integrated over all segments: logarithm of the determinant
+
+
+def segment_maps(
+    field: VectorField,
+    start: ArrayLike | Sequence,
+    duration: ArrayLike,
+    n_segments: int,
+    options: StepOptions,
+    n_directions: int | None = None,
+) -> FlowSegments:
+    """Return the flow of `field` with its Jacobians by the first `n_directions` coordinates
+    (default all).
+
+    Derivatives take part in the step-size control. Each tangent is a direction of about constant
+    length and the logarithm of its growth, so that decaying directions keep their digits. A segment
+    whose solver steps are spent is NaN. A clock among the coordinates is no direction and must
+    follow those that are.
+    """
+    start = jnp.asarray(start, float)
+    output_shape = jax.eval_shape(field, start)
+    n_tangents = start.size if n_directions is None else n_directions
+    if start.ndim != 1 or output_shape.shape != start.shape:
+        raise ValueError(
+            f"the field gives shape {output_shape.shape} for a start of shape {start.shape}, but both must "
+            "be one row of the same length."
+        )
+    if not (0 < n_tangents <= start.size and n_segments > 0):
+        raise ValueError(
+            f"directions is {n_tangents} and n_segments {n_segments}, but the first must be from 1 to "
+            f"{start.size} and the other positive."
+        )
+    dim, size = start.size, start.size * (1 + n_tangents)
+    length = jnp.asarray(duration, start.dtype) / n_segments
+
+    def flow_with_tangents(z: Array) -> Array:
+        y, tangents = z[:dim], z[dim:size].reshape(n_tangents, dim)
+        jvp_of_field = lambda tangent: jax.jvp(field, (y,), (tangent,))[1]
+        tangent_rates = jax.vmap(jvp_of_field)(tangents)
+        growth = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(tangents * tangents, axis=1)
+        normalized_rates = tangent_rates - growth[:, None] * tangents
+        unit_rates = jax.vmap(jvp_of_field)(jnp.eye(n_tangents, dim, dtype=z.dtype))
+        clock = jnp.ones_like(y[:1])
+        return jnp.concatenate(
+            [field(y), normalized_rates.ravel(), growth, jnp.trace(unit_rates)[None], clock]
+        )
+
+    def integrate_segment(state: Array, _: None) -> tuple[Array, tuple]:
+        start_state = jnp.concatenate(
+            [state, jnp.eye(n_tangents, dim).ravel(), jnp.zeros(n_tangents + 2)]
+        )
+        end_state = sample_phase(flow_with_tangents, start_state, length, 2, options)[-1]
+        is_reached = (
+            jnp.abs(end_state[-1] - length) <= 1e-9 * length
+        )  # otherwise the solver steps were spent
+        tangents, growth_factors = (
+            end_state[dim:size].reshape(n_tangents, dim),
+            jnp.exp(end_state[size : size + n_tangents]),
+        )
+        jacobian = jnp.where(is_reached, tangents[:, :n_tangents].T * growth_factors, jnp.nan)
+        return end_state[:dim], (end_state[:dim], jacobian, end_state[-2])
+
+    _, (states, maps, divergences) = lax.scan(integrate_segment, start, None, length=n_segments)
+    return FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
+
+
+class ProductMultipliers(NamedTuple):
+    """Eigenvalues of a product of matrices, the largest first."""
+
+    values: np.ndarray  # complex; NaN where `is_known` is False
+    logarithms: np.ndarray  # of their moduli, finite even if the value underflows
+    relative_error: np.ndarray  # estimated
+    is_known: np.ndarray  # whether the relative error is within `accuracy`
+
+
+N_SCHUR_SWEEPS = 60
+"""Number of sweeps around the period.
+
+It is chosen because moduli that differ by a factor of two are then separated to the last digit.
+Closer moduli stay together in one block, whose product loses few digits.
+"""
+
+
+def product_multipliers(
+    jacobians: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
+) -> ProductMultipliers:
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0] and whether each has `accuracy`.
+
+    `tolerance` is the error of each Jacobian relative to its norm. The function accepts concrete
+    matrices only.
+    """
+    jacobians = np.asarray(jacobians, float)
+    if jacobians.ndim != 3 or jacobians.shape[1] != jacobians.shape[2] or not jacobians.size:
+        raise ValueError(f"maps has shape {jacobians.shape}, but it must be (n_segments, n, n).")
+    if not np.all(np.isfinite(jacobians)):
+        raise ValueError(
+            "maps holds a number that is not finite: the flow left its domain, or its steps were "
+            "spent; take more segments, or raise StepOptions.max_solver_steps."
+        )
+    n, basis, closing_matrix = (
+        jacobians.shape[1],
+        np.eye(jacobians.shape[1]),
+        np.eye(jacobians.shape[1]),
+    )
+    triangles = np.zeros_like(jacobians)
+    for _ in range(N_SCHUR_SWEEPS):
+        next_basis = basis
+        for i, jacobian in enumerate(jacobians):
+            next_basis, triangles[i] = np.linalg.qr(jacobian @ next_basis)
+        closing_matrix, basis = basis.T @ next_basis, next_basis
+        is_coupled = np.abs(np.tril(closing_matrix, -1)) > 1e-14
+        if not is_coupled.any():
+            break
+    blocks, block_start = [], 0
+    for block_end in range(1, n + 1):
+        if not is_coupled[block_end:, :block_end].any():
+            blocks.append(slice(block_start, block_end))
+            block_start = block_end
+    norms = np.linalg.norm(jacobians, axis=(1, 2))
+    block_results = [
+        _block_multipliers(triangles, closing_matrix, block, norms, tolerance) for block in blocks
+    ]
+    values, logarithms, relative_error = (
+        np.concatenate(x) for x in zip(*block_results, strict=True)
+    )
+    is_known = relative_error <= accuracy
+    order = np.argsort(-logarithms, kind="stable")
+    output_shape = np.where(is_known, values, np.nan)
+    return ProductMultipliers(
+        output_shape[order], logarithms[order], relative_error[order], is_known[order]
+    )
+
+
+def _block_multipliers(
+    triangles: np.ndarray,
+    closing_matrix: np.ndarray,
+    block: slice,
+    norms: np.ndarray,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the multipliers of one diagonal block, their logarithms and relative errors."""
+    diagonal_blocks, size = triangles[:, block, block], block.stop - block.start
+    diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_diagonal = np.log(diagonal)
+        error_amplification = np.where(diagonal > 0.0, norms[:, None] / diagonal, 0.0)
+        error = tolerance * np.max(np.sum(error_amplification, axis=0))
+        scaled_product, log_scale, spread = (
+            np.eye(size),
+            0.0,
+            np.ptp(np.sum(log_diagonal, axis=0)) if size > 1 else 0.0,
+        )
+        for factor in diagonal_blocks:
+            scaled_product = factor @ scaled_product
+            largest = np.max(np.abs(scaled_product)) or 1.0
+            scaled_product, log_scale = scaled_product / largest, log_scale + np.log(largest)
+        values = np.linalg.eigvals(closing_matrix[block, block] @ scaled_product)
+        logarithms = np.log(np.abs(values)) + log_scale
+        if size == 1:
+            logarithms = np.sum(log_diagonal, axis=0)
+        phases = np.where(values == 0.0, 1.0, values / np.abs(values))
+        output_shape = phases * np.exp(logarithms)
+    return output_shape, logarithms, np.full(size, error * np.exp(spread))

@@ -1,0 +1,339 @@
+"""Simulation of hybrid systems: any vector fields, the guards that end modes, and the resets.
+
+    ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
+    simulate_hybrid((ball,), start, events=10)
+
+A mode with wrong shapes raises an error of one sentence. A failure during the simulation is one
+code, `Termination`, and the result keeps all events before it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
+from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
+from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition
+from vrw_jax.validation import check_callable, check_int, check_reals, check_type
+
+MAX_STORED_NUMBERS = 100_000_000
+"""Most numbers stored in all events of a simulation, chosen because times, states before and states
+after then take 2.4 GB."""
+
+
+class Guard(NamedTuple):
+    """A function that ends its mode where `value`, positive inside, falls to zero.
+
+    Then `reset` is applied, and `target_mode` follows.
+    """
+
+    value: Callable[[StateVector], Scalar]
+    reset: Callable[[StateVector], StateVector] = lambda y: y
+    target_mode: int | None = None  # index of the next mode; None: the same mode
+
+
+class Mode(NamedTuple):
+    """An autonomous vector field, shape (dim,) to (dim,), and its guards; time is a coordinate if
+    needed.
+    """
+
+    field: VectorField
+    guards: tuple[Guard, ...]
+
+    def guard_values(self, y: StateVector) -> Array:
+        """Return the values of all guards at a state."""
+        return jnp.stack([guard.value(y) for guard in self.guards])
+
+
+class Termination(StatusCode):
+    """Reason why a simulation ended."""
+
+    MAX_EVENTS_REACHED = 0, "It has as many events as were asked for."
+    MAX_TIME_REACHED = 1, "No guard ended the mode within StepOptions.max_phase_time."
+    ZENO = 2, "Events follow each other so fast that the clock no longer moves (Zeno)."
+    GUARD_VIOLATED_AT_ENTRY = (
+        3,
+        "A mode begins with a guard below zero: begin on it or inside, or elsewhere.",
+    )
+    MAX_STEPS_REACHED = 4, "The solver's steps are spent: raise StepOptions.max_solver_steps."
+    STEP_SIZE_UNDERFLOW = (
+        5,
+        "Steps too short, or no event settled: a singular field or a guard lost in rounding.",
+    )
+
+
+class HybridSolution(NamedTuple):
+    """Events of a simulation in order of time; rows past `n_events` are zero."""
+
+    times: Float[Array, " events"]
+    time_tolerance: Float[
+        Array, " events"
+    ]  # the state's tolerances as an error of each time, no bound
+    time_roundoff: Float[Array, " events"]  # the state's round-off as an error of each time
+    states_before: Float[Array, "events dim"]  # states on the guard
+    states_after: Float[Array, "events dim"]  # states after the reset
+    modes: Int[Array, " events"]  # modes that ended
+    guards: Int[Array, " events"]  # guards that ended them
+    n_events: Int[Array, ""]
+    time: Scalar  # of the last state
+    state: StateVector  # at the end of the simulation
+    mode: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    termination: Int[Array, ""]  # a Termination
+
+
+def simulate_hybrid(
+    modes: Sequence[Mode],
+    start: ArrayLike | Sequence,
+    *,
+    events: int,
+    mode: int = 0,
+    options: StepOptions | None = None,
+) -> HybridSolution:
+    """Simulate `modes` from `start` through at most `events` events.
+
+    Guards are treated as in `integrate_phase`: the earliest first, at the integrator's accuracy,
+    with derivatives of event times and states. A guard within the clock's round-off of zero at the
+    start of its mode counts as zero. A guard that is zero at rest there fires only if it will not
+    rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`) apply.
+    """
+    options = StepOptions() if options is None else options
+    check_type("options", options, StepOptions, "give vrw.StepOptions()")
+    start, events = check_reals("start", start), check_int("events", events)
+    _check_arguments(modes, start, events, mode)
+    options.check_tolerances(start.dtype)
+    return _simulate(tuple(modes), events, options, start, mode)
+
+
+ERROR_CHECK_TIGHTENINGS = (0.1, 0.01)
+"""Factors by which the tolerances are divided in the simulations that `estimate_event_time_errors`
+compares with."""
+
+
+def time_errors(
+    modes: Sequence[Mode],
+    start: ArrayLike | Sequence,
+    solution: HybridSolution,
+    options: StepOptions | None = None,
+) -> Float[Array, " events"]:
+    """Return estimated errors of the event times, s, from simulations at two looser tolerances.
+
+    The same events are computed again with tolerances ten and a hundred times as large. Each error
+    is twice the largest change of any event so far, in units of its `time_tolerance`, and at least
+    twice its `time_tolerance`. It includes what `time_tolerance` alone omits: accumulated errors of
+    steps and errors that earlier events transfer to later ones. It also includes the part that an
+    implicit solver's own estimate omits in a stiff field. It is infinite from the first event that
+    the simulation at ten times the tolerance does not reach. The estimate is measured, not proved;
+    `options` are those of the simulation.
+    """
+    options = StepOptions() if options is None else options
+    start, solution = lax.stop_gradient((check_reals("start", start), solution))
+    count = jnp.arange(len(solution.times))
+
+    def time_change(factor: Array) -> Array:
+        looser_solution = _simulate(
+            tuple(modes),
+            len(count),
+            options.with_tightened_tolerances(factor),
+            start,
+            solution.modes[0],
+        )
+        is_same_event = (looser_solution.guards == solution.guards) & (
+            looser_solution.modes == solution.modes
+        )
+        is_same_event = jnp.cumprod(is_same_event & (count < looser_solution.n_events)) > 0
+        return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
+
+    changes_at_ten, changes_at_hundred = lax.stop_gradient(
+        lax.map(time_change, jnp.asarray(ERROR_CHECK_TIGHTENINGS, start.dtype))
+    )
+    max_change = (
+        jnp.maximum(
+            changes_at_ten, jnp.where(jnp.isinf(changes_at_hundred), 0.0, changes_at_hundred)
+        )
+        / solution.time_tolerance
+    )
+    max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
+    return jnp.where(count < solution.n_events, 2.0 * max_change * solution.time_tolerance, 0.0)
+
+
+def _check_arguments(modes: Sequence[Mode], start: Array, events: int, mode: int) -> None:
+    if start.ndim != 1 or not start.size:
+        raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
+    if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
+        raise ValueError("start holds a number that is not finite.")
+    if events * start.size > MAX_STORED_NUMBERS:
+        raise ValueError(f"events is {events}, but so many states don't fit: ask for fewer.")
+    check_type("modes", modes, (list, tuple), "give Modes in a list")
+    for candidate_mode in modes:
+        check_type("a mode", candidate_mode, Mode, "give Mode(field, guards)")
+        check_type("guards", candidate_mode.guards, (list, tuple), "give Guards in a tuple")
+        for guard in candidate_mode.guards:
+            check_type("a guard", guard, Guard, "give Guard(value, reset, to)")
+    if not 0 <= mode < len(modes):
+        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
+    for i, (field, guards) in enumerate(modes):
+        if not guards:
+            raise ValueError(f"mode {i} has no guard, but only a guard can end it: give one.")
+        _check_output_shape(f"the field of mode {i}", field, start, start.shape)
+        for k, guard in enumerate(guards):
+            name = f"guard {k} of mode {i}"
+            _check_output_shape(name, guard.value, start, ())
+            _check_output_shape(f"the reset of {name}", guard.reset, start, start.shape)
+            if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
+                raise ValueError(
+                    f"{name} leads to mode {guard.target_mode}, but there are {len(modes)}: count from 0."
+                )
+
+
+def _check_output_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
+    check_callable(name, function, "of the state")
+    output: Any = jax.eval_shape(function, start)
+    output_shape = getattr(output, "shape", None)
+    if output_shape != shape or not jnp.issubdtype(output.dtype, jnp.floating):
+        description = (
+            f"{output.dtype} of shape {output_shape}"
+            if output_shape is not None
+            else type(output).__name__
+        )
+        raise ValueError(
+            f"{name} gives {description} for a state of shape {start.shape}, but it must give floats of "
+            f"shape {shape}: fields and resets give the state's shape, guards one number."
+        )
+
+
+def _integrate_mode(
+    mode: Mode, state: Array, time: Array, options: StepOptions
+) -> tuple[PhaseEnd, Array]:
+    """Integrate a mode, and return its end and whether a guard is violated at its start."""
+    guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
+    values, (rates, curvatures) = (
+        mode.guard_values(state),
+        jax.jvp(guard_rates, (state,), (mode.field(state),)),
+    )
+    values, rates, curvatures = lax.stop_gradient((values, rates, curvatures))
+    clock = lax.stop_gradient(time + options.dt0)
+    time_resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
+    is_near_zero = -values <= jnp.abs(rates) * time_resolution
+    is_violated = jnp.any((values < 0.0) & ~is_near_zero)
+    guard_offset = jnp.where((values < 0.0) & is_near_zero & (rates > 0.0), -values, 0.0)
+    # For a guard at rest the second derivative decides: it does not fire if it will rise.
+    is_rising = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
+    guard_offset = jnp.where(is_rising, jnp.finfo(state.dtype).tiny, guard_offset)
+    monitored_functions = MonitoredFunctions(
+        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards)
+    )
+    return integrate_phase(
+        mode.field, monitored_functions, state, ~is_violated, options
+    ), is_violated
+
+
+def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple[Array, Array]:
+    """Return tolerance and round-off of the state as times of the event, large where a guard is
+    grazed.
+    """
+    state = lax.stop_gradient(end.state)
+    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(end.guard, 0)]
+    state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(state)
+    state_tolerance = options.atol + options.rtol * jnp.abs(state)
+    rate = jnp.abs(guard_gradient @ mode.field(state))
+    time_scales = [
+        jnp.abs(guard_gradient) @ error / rate for error in (state_tolerance, state_roundoff)
+    ]
+    return lax.stop_gradient((time_scales[0], time_scales[1]))
+
+
+def _apply_reset(mode: Mode, guard: Array, state: Array, mode_index: int) -> tuple[Array, Array]:
+    """Return the state after the reset of the guard that ended the mode, and the next mode."""
+    index = jnp.maximum(guard, 0)
+    next_state = lax.switch(index, [g.reset for g in mode.guards], state)
+    return next_state, jnp.asarray(
+        [mode_index if g.target_mode is None else g.target_mode for g in mode.guards], jnp.int32
+    )[index]
+
+
+def _simulate(
+    modes: tuple[Mode, ...], events: int, options: StepOptions, start: Array, mode: int | Array
+) -> HybridSolution:
+    def make_mode_branch(mode_index: int) -> Callable:
+        def run_mode(state: Array, time: Array) -> tuple:
+            end, is_violated = _integrate_mode(modes[mode_index], state, time, options)
+            time_scales = _event_time_scales(modes[mode_index], end, options)
+            return (
+                end,
+                is_violated,
+                time_scales,
+                *_apply_reset(modes[mode_index], end.guard, end.state, mode_index),
+            )
+
+        return run_mode
+
+    mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
+
+    def advance_event(carry: tuple) -> tuple:
+        solution, n_stationary = carry
+        end, is_violated, time_scales, next_state, next_mode = lax.switch(
+            solution.mode, mode_branches, solution.state, solution.time
+        )
+        has_event = ~is_violated & (end.guard >= 0)
+        time = solution.time + end.duration
+        n_stationary = jnp.where(time > solution.time, 0, n_stationary + 1)
+        has_spent_steps = end.solver_steps >= options.max_solver_steps
+        termination = jnp.where(
+            solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), _STILL_RUNNING
+        )
+        termination = jnp.where(n_stationary > len(modes), int(Termination.ZENO), termination)
+        failure = jnp.where(
+            end.timed_out, int(Termination.MAX_TIME_REACHED), int(Termination.STEP_SIZE_UNDERFLOW)
+        )
+        failure = jnp.where(
+            end.gave_up & has_spent_steps, int(Termination.MAX_STEPS_REACHED), failure
+        )
+        termination = jnp.where(
+            has_event,
+            termination,
+            jnp.where(is_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure),
+        )
+        row_index = jnp.where(has_event, solution.n_events, events)
+        write_row = lambda row, value: row.at[row_index].set(value, mode="drop")
+        return (
+            HybridSolution(
+                times=write_row(solution.times, time),
+                time_tolerance=write_row(solution.time_tolerance, time_scales[0]),
+                time_roundoff=write_row(solution.time_roundoff, time_scales[1]),
+                states_before=write_row(solution.states_before, end.state),
+                states_after=write_row(solution.states_after, next_state),
+                modes=write_row(solution.modes, solution.mode),
+                guards=write_row(solution.guards, end.guard),
+                n_events=solution.n_events + has_event,
+                time=time,
+                state=jnp.where(has_event, next_state, end.state),
+                mode=jnp.where(has_event, next_mode, solution.mode).astype(jnp.int32),
+                solver_steps=solution.solver_steps + end.solver_steps,
+                termination=termination.astype(jnp.int32),
+            ),
+            n_stationary,
+        )
+
+    zero_count, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    rows, zero_indices = jnp.zeros((events, start.size)) + zero, jnp.zeros((events,), jnp.int32)
+    zero_times = jnp.zeros(events) + zero
+    constant_zeros = lax.stop_gradient(zero_times)
+    initial_solution = HybridSolution(
+        times=zero_times, time_tolerance=constant_zeros, time_roundoff=constant_zeros, states_before=rows, states_after=rows,
+        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=zero, state=start, mode=zero_count + mode,
+        solver_steps=zero_count, termination=zero_count + _STILL_RUNNING,
+    )  # fmt: skip
+    is_running = lambda carry: opaque_condition(
+        carry[0].termination == _STILL_RUNNING, carry[0].n_events
+    )
+    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count))[0]
+
+
+_STILL_RUNNING = -1

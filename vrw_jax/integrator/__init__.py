@@ -1,0 +1,21 @@
+"""A batched Runge-Kutta integrator with event location, dense minima and tangents."""
+
+from vrw_jax.integrator import tableaus
+from vrw_jax.integrator.integrate import (
+    BatchPhase,
+    integrate_batch_phase,
+    sample_at_equal_times,
+    sample_batch_phase,
+)
+from vrw_jax.integrator.minima import MarginFunctions
+from vrw_jax.integrator.tableaus import (
+    ButcherTableau,
+    StageAcceleration,
+    StageState,
+    find_dip,
+    fit_guard_parabola,
+    load_explicit_tableau,
+    real_stability_limit,
+    step_size_factor,
+)
+from vrw_jax.integrator.tangents import ImplicitDynamics, with_batched_jvp

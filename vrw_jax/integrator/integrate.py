@@ -1,0 +1,653 @@
+"""Integration of one phase for a batch, each element with its own step size, to the earliest event.
+
+The elements are integrated together until each has ended or holds a step that crosses a guard. Then
+they locate their events together: that step is repeated with its length corrected by Newton's
+method. The result of an element never depends on the other elements, because an element that has
+ended does not change.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.integrator.event_location import CrossingStep, locate_event
+from vrw_jax.integrator.minima import (
+    AcceptedStep,
+    MarginFunctions,
+    MinimaResult,
+    MinimaState,
+    init_minima,
+    refine_minima,
+    update_minima,
+    values_and_rates,
+)
+from vrw_jax.integrator.minima import minima_jvp as moved_minima
+from vrw_jax.integrator.tableaus import (
+    AccelerationFn,
+    ButcherTableau,
+    RKStep,
+    StageState,
+    StepFn,
+    earliest_dip_fraction,
+    rk_step,
+    step_size_factor,
+)
+from vrw_jax.integrator.tangents import (
+    ImplicitDynamics,
+    PhaseTangents,
+    batched_jvp_rule,
+    stack_directions,
+)
+from vrw_jax.numerics import StepOptions, Vector, tree_where, zero_tangent
+from vrw_jax.simd import noinline
+
+
+class BatchPhase(NamedTuple):
+    """A phase as data, whose functions are elementwise over the batch.
+
+    `guards` are positive inside the phase, and an event is a zero from above. The earliest event
+    counts; of two at the same time, the first in the list.
+    """
+
+    evaluate: AccelerationFn
+    guards: Callable[[StageState], Vector]
+    margins: MarginFunctions | None = None  # margins whose minima are searched
+    implicit_dynamics: ImplicitDynamics | None = None  # for derivatives
+    is_noinline: bool = False
+    """Whether machine code calls the phase's functions instead of inlining them at each use; it
+    then compiles in half of the time and runs a sixth slower."""
+
+
+class BatchPhaseEnd(NamedTuple):
+    """End of a phase for each batch element."""
+
+    state: StageState
+    duration: Array  # s
+    guard: Array  # index of the guard that ended it; -1 if none did
+    timed_out: Array
+    is_unfinished: Array  # cut off as a straggler, see `integrate_batch_phase`
+    n_tried_steps: Array  # steps, accepted or not
+    next_dt: Array  # next length of the controller, s
+    minima: Array | None  # of the margins, (margins, batch)
+
+
+class _IntegratorState(NamedTuple):
+    """State of the integrator."""
+
+    state: StageState
+    guard_values: Vector  # guards at the state
+    dt: Array
+    time: Array
+    status: Array  # after the last tried step
+    crossing_bits: Array  # bits of the guards that crossed in that step
+    middle_values: Vector  # guards within the crossing step
+    end_values: Vector
+    n_tried_steps: Array
+    half_iterations: Array  # iterations after which half of the batch had finished
+    iterations: Array
+    minima: MinimaState | None
+    tangents: Array | None  # of the state, (directions, ., batch), see `tangents`
+
+
+RUNNING_STATUS, TIMED_OUT_STATUS, FAILED_STATUS, CROSSED_STATUS, IDLE_STATUS = range(5)
+"""Status codes of a batch element in the integration."""
+
+STRAGGLER_FACTOR = 2
+"""Ratio of iterations at which stragglers are cut off to the iterations after which half of the
+batch had finished."""
+
+
+BatchPhaseFn = Callable[[Any, Vector], BatchPhase]
+"""A function that returns a phase for its constants, see `tangents.ImplicitDynamicsFn`."""
+
+
+def integrate_batch_phase(
+    phase_of: BatchPhaseFn,
+    constants: Any,
+    held_constants: Vector,
+    tableau: ButcherTableau,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None = None,
+) -> BatchPhaseEnd:
+    """Integrate every active element from (q, v) to the earliest of its guards.
+
+    Errors are those of `integrate_phase`. In a large batch, as on a GPU, the last `straggler_count`
+    elements are cut off if they take `STRAGGLER_FACTOR` times as long as half of the batch. They
+    are marked unfinished, to be run again from their start together with other stragglers.
+    Derivatives: with respect to `constants`, `held_constants`, `q` and `v`, see `tangents`.
+    """
+    integrate = jax.custom_jvp(
+        lambda *arguments: _integrate_to_event(phase_of, tableau, None, *arguments).phase_end
+    )
+
+    @integrate.defjvp
+    def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
+        def implicit_dynamics_of(*constants: Any) -> ImplicitDynamics:
+            implicit_dynamics = phase_of(*constants).implicit_dynamics
+            assert implicit_dynamics is not None
+            return implicit_dynamics
+
+        def evaluate_with_tangents(
+            primals: tuple, directions: tuple
+        ) -> tuple[BatchPhaseEnd, tuple]:
+            constants_tangents, held_constants, q, v = directions
+            start_tangents = stack_directions((*q, *v, *held_constants))
+            phase_tangents = PhaseTangents(
+                implicit_dynamics_of, primals[0], primals[1], constants_tangents, start_tangents
+            )
+            phase_run = _integrate_to_event(phase_of, tableau, phase_tangents, *primals)
+            return phase_run.phase_end, _phase_end_jvp(phase_of, tableau, phase_tangents, phase_run)
+
+        end, (q, v, event_time_tangent, minima) = batched_jvp_rule(
+            evaluate_with_tangents, primals, tangents[:4]
+        )
+        zero_end = zero_tangent(end)
+        state_tangent = zero_end.state._replace(q=q, v=v)
+        return end, zero_end._replace(
+            state=state_tangent, duration=event_time_tangent, minima=minima
+        )
+
+    return integrate(constants, held_constants, q, v, active, initial_dt, options, straggler_count)
+
+
+class _PhaseRun(NamedTuple):
+    """Steps and end of a phase, and the intermediate results."""
+
+    step_function: StepFn
+    start: StageState
+    phase_end: BatchPhaseEnd
+    integrator_state: _IntegratorState
+    minima: MinimaState | None
+    minima_result: MinimaResult | None
+
+
+def _phase_end_jvp(
+    phase_of: BatchPhaseFn,
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents,
+    phase_run: _PhaseRun,
+) -> tuple[Vector, Vector, Array, Array | None]:
+    """Return the tangents of a phase's end for tangents of its start and constants.
+
+    They are those of the positions, the rates, the duration, and the minima of the margins.
+    """
+    step_function, start, phase_end, integrator_state, minima, minima_result = phase_run
+    n, last_length = (
+        len(start.q),
+        jnp.where(
+            integrator_state.status == CROSSED_STATUS,
+            phase_end.duration - integrator_state.time,
+            0.0,
+        ),
+    )
+    rk_step = step_function(integrator_state.state, last_length)
+    assert integrator_state.tangents is not None
+    tangents = phase_tangents.propagate(
+        tableau, rk_step.stage_states, integrator_state.tangents, last_length
+    )
+
+    end_state, tangent_rows = rk_step.end, tuple(jnp.moveaxis(tangents, 1, 0))
+    event_time_tangent = _event_time_jvp(
+        phase_of, phase_tangents, end_state, tangents, integrator_state, phase_end.guard
+    )
+    motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
+    state_tangents = tuple(
+        x + event_time_tangent * y for x, y in zip(tangent_rows[: 2 * n], motion_rates, strict=True)
+    )
+    minima_tangents = None
+    if minima is not None and minima_result is not None:
+
+        def margins_of(*constants: Any) -> tuple[MarginFunctions, AccelerationFn]:
+            phase = phase_of(*constants)
+            assert phase.margins is not None
+            return phase.margins, phase.evaluate
+
+        phase_ends, end_tangents = (
+            (start, phase_end.state),
+            jnp.stack([*state_tangents, *tangent_rows[2 * n :]], 1),
+        )
+        minima_tangents = moved_minima(
+            margins_of,
+            step_function,
+            tableau,
+            phase_tangents,
+            minima,
+            minima_result,
+            phase_ends,
+            end_tangents,
+        )
+    return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
+
+
+def _event_time_jvp(
+    phase_of: BatchPhaseFn,
+    phase_tangents: PhaseTangents,
+    end_state: StageState,
+    tangents: Array,
+    integrator_state: _IntegratorState,
+    guard: Array,
+) -> Array:
+    """Return the tangent of the event's time, s: the guard vanishes along the perturbed motion."""
+
+    def evaluate_guards(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Vector:
+        phase = phase_of(constants, held_constants)
+        return phase.guards(StageState(q, v, phase.evaluate(q, v)))
+
+    phase = phase_of(phase_tangents.constants, phase_tangents.held_constants)
+    _, rates = values_and_rates(phase.guards, phase.evaluate, end_state)
+    guard_tangents = phase_tangents.value_tangents(evaluate_guards, end_state, tangents)
+    has_crossed, time_tangent = (
+        integrator_state.status == CROSSED_STATUS,
+        jnp.zeros_like(integrator_state.dt),
+    )
+    for index, (rate, guard_tangent) in enumerate(zip(rates, guard_tangents, strict=True)):
+        is_event_guard = has_crossed & (guard == index) & (rate < 0.0)
+        time_tangent = jnp.where(
+            is_event_guard, -guard_tangent / jnp.where(is_event_guard, rate, -1.0), time_tangent
+        )
+    return time_tangent
+
+
+def _integrate_to_event(
+    phase_of: BatchPhaseFn,
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents | None,
+    constants: Any,
+    held_constants: Vector,
+    q: Vector,
+    v: Vector,
+    active: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None,
+) -> _PhaseRun:
+    """Integrate a phase and locate its event and the minima of its margins."""
+    phase = phase_of(constants, held_constants)
+    phase = _wrap_phase_functions(phase, noinline if phase.is_noinline else jax.jit)
+    step_function = _make_step_function(phase, tableau)
+    start = StageState(q, v, phase.evaluate(q, v))
+    values, rates = values_and_rates(phase.guards, phase.evaluate, start)
+    is_past = tuple(
+        (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
+        for guard_value, guard_rate in zip(values, rates, strict=True)
+    )
+    immediate_guard = _first_true(is_past)
+    is_started = active & (immediate_guard < 0)
+
+    integrator_state = _integrate_until_crossing(
+        phase,
+        step_function,
+        tableau,
+        start,
+        values,
+        is_started,
+        initial_dt,
+        options,
+        straggler_count,
+        phase_tangents,
+    )
+    has_crossed = integrator_state.status == CROSSED_STATUS
+    if phase.margins is not None or phase_tangents is not None:
+        phase = _wrap_phase_functions(
+            phase, noinline
+        )  # a long program, which the search for minima makes longer
+        step_function = _make_step_function(phase, tableau)
+    crossing_step = CrossingStep(
+        *integrator_state[:2],
+        integrator_state.middle_values,
+        integrator_state.end_values,
+        integrator_state.dt,
+        integrator_state.crossing_bits,
+        has_crossed,
+    )
+    search = locate_event(
+        phase.guards, phase.evaluate, step_function, tableau, crossing_step, options
+    )
+    is_lost = has_crossed & search.is_unresolved
+    duration = integrator_state.time + jnp.where(has_crossed, search.length, 0.0)
+    end_state = tree_where(has_crossed, search.end, integrator_state.state)
+    minima, minima_result = integrator_state.minima, None
+    if phase.margins is not None and minima is not None:
+        margin_arguments = phase.margins, phase.evaluate
+        accepted_step = AcceptedStep(
+            integrator_state.state, end_state, search.length, has_crossed, integrator_state.tangents
+        )
+        minima = update_minima(*margin_arguments, minima, accepted_step)
+        start_margins = jnp.stack(phase.margins.evaluate_margins(start))
+        minima_result = refine_minima(
+            phase.margins, step_function, phase.evaluate, minima, start_margins, options
+        )
+    is_late = has_crossed & ~search.is_unresolved & (duration > options.max_phase_time)
+    guard = jnp.where(
+        active & (immediate_guard >= 0), immediate_guard, jnp.where(has_crossed, search.guard, -1)
+    )
+    phase_end = BatchPhaseEnd(
+        state=end_state,
+        duration=duration,
+        guard=jnp.where(is_lost | is_late, -1, guard),
+        timed_out=(integrator_state.status == TIMED_OUT_STATUS) | is_late,
+        is_unfinished=integrator_state.status == RUNNING_STATUS,
+        n_tried_steps=integrator_state.n_tried_steps
+        + jnp.where(has_crossed, search.n_tried_steps, 0),
+        next_dt=integrator_state.dt,
+        minima=None if minima_result is None else minima_result.phase_minima,
+    )
+    return _PhaseRun(step_function, start, phase_end, integrator_state, minima, minima_result)
+
+
+def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> StepFn:
+    """Return the phase's step function, which is traced once for all its calls."""
+    return jax.jit(lambda state, h: rk_step(tableau, phase.evaluate, state, h))
+
+
+def _wrap_phase_functions(phase: BatchPhase, wrap: Callable) -> BatchPhase:
+    """Return the phase with wrapped functions, each of which is traced once for all its calls."""
+    margins = phase.margins
+    if margins is not None:
+        margins = margins._replace(evaluate_margins=wrap(margins.evaluate_margins))
+    return phase._replace(evaluate=wrap(phase.evaluate), guards=wrap(phase.guards), margins=margins)
+
+
+def _integrate_until_crossing(
+    phase: BatchPhase,
+    step_function: StepFn,
+    tableau: ButcherTableau,
+    start: StageState,
+    guard_values: Vector,
+    is_started: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None,
+    phase_tangents: PhaseTangents | None,
+) -> _IntegratorState:
+    """Take adaptive steps until each element has crossed a guard, run out of time or failed."""
+
+    def assess_step(
+        integrator_state: _IntegratorState,
+        rk_step: RKStep,
+        stage_values: list[Vector],
+        end_values: Vector,
+    ) -> tuple:
+        """Return the length to try next, in units of this one, and the decision on the step."""
+        squared_error = _mean_squared_error(
+            rk_step, integrator_state.state, end_values, options.rtol, options.atol
+        )
+        dip_fraction = earliest_dip_fraction(
+            tableau, [integrator_state.guard_values, *stage_values, end_values]
+        )
+        return _step_size_change(tableau, squared_error, dip_fraction)
+
+    def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
+        rk_step = step_function(integrator_state.state, integrator_state.dt)
+        stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
+        end_values = phase.guards(rk_step.end)
+        length_factor, decision = assess_step(integrator_state, rk_step, stage_values, end_values)
+        status, crossing_bits, is_accepted, time, length = _classify_step(
+            options, integrator_state, length_factor, decision, end_values
+        )
+        state, guard_values = tree_where(
+            is_accepted,
+            (rk_step.end, end_values),
+            (integrator_state.state, integrator_state.guard_values),
+        )
+        was_running = integrator_state.status == RUNNING_STATUS
+        middle_values = (
+            stage_values[tableau.guard_stages.index(tableau.middle_stage)]
+            if stage_values
+            else integrator_state.guard_values
+        )
+        new_middle_values, new_end_values = tree_where(
+            was_running,
+            (middle_values, end_values),
+            (integrator_state.middle_values, integrator_state.end_values),
+        )
+        minima, half_iterations, tangents = (
+            integrator_state.minima,
+            integrator_state.half_iterations,
+            integrator_state.tangents,
+        )
+        if phase.margins is not None and minima is not None:
+            margin_arguments = phase.margins, phase.evaluate
+            accepted_step = AcceptedStep(
+                integrator_state.state,
+                rk_step.end,
+                integrator_state.dt,
+                is_accepted,
+                integrator_state.tangents,
+            )
+            minima = update_minima(*margin_arguments, minima, accepted_step)
+        if phase_tangents is not None and tangents is not None:
+            tangents = phase_tangents.propagate_if_accepted(
+                tableau, rk_step.stage_states, tangents, integrator_state.dt, is_accepted
+            )
+        if straggler_count is not None:
+            n_running = jnp.sum(status == RUNNING_STATUS, dtype=jnp.int32)
+            half_iterations = jnp.where(
+                2 * n_running > status.size, integrator_state.iterations + 1, half_iterations
+            )
+        return _IntegratorState(
+            state=state,
+            guard_values=guard_values,
+            dt=length,
+            time=time,
+            status=status,
+            crossing_bits=crossing_bits,
+            middle_values=new_middle_values,
+            end_values=new_end_values,
+            n_tried_steps=integrator_state.n_tried_steps + was_running,
+            half_iterations=half_iterations,
+            iterations=integrator_state.iterations + 1,
+            minima=minima,
+            tangents=tangents,
+        )
+
+    initial_minima = phase.margins and init_minima(
+        phase.margins, phase.evaluate, start, phase_tangents
+    )
+    initial_state = _init_integrator(
+        start, guard_values, is_started, initial_dt, initial_minima, phase_tangents
+    )
+    return lax.while_loop(
+        lambda integrator_state: _needs_more_steps(integrator_state, straggler_count),
+        take_one_step,
+        initial_state,
+    )
+
+
+def _init_integrator(
+    start: StageState,
+    guard_values: Vector,
+    is_started: Array,
+    initial_dt: Array,
+    minima: MinimaState | None,
+    phase_tangents: PhaseTangents | None,
+) -> _IntegratorState:
+    """Return the state of the integrator before the first step."""
+    zero_counts, zero_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    return _IntegratorState(
+        state=start,
+        guard_values=guard_values,
+        dt=initial_dt,
+        time=jnp.zeros_like(initial_dt),
+        status=jnp.where(is_started, RUNNING_STATUS, IDLE_STATUS).astype(jnp.int32),
+        crossing_bits=zero_counts,
+        middle_values=guard_values,
+        end_values=guard_values,
+        n_tried_steps=zero_counts,
+        half_iterations=zero_count,
+        iterations=zero_count,
+        minima=minima,
+        tangents=None if phase_tangents is None else phase_tangents.start_tangents,
+    )
+
+
+def _needs_more_steps(integrator_state: _IntegratorState, straggler_count: Array | None) -> Array:
+    """Return whether enough elements still run to continue the loop."""
+    is_running = integrator_state.status == RUNNING_STATUS
+    if straggler_count is None:
+        return jnp.any(is_running)
+    n_running = jnp.sum(is_running, dtype=jnp.int32)
+    is_late = integrator_state.iterations > STRAGGLER_FACTOR * integrator_state.half_iterations + 8
+    return (n_running > 0) & ~((n_running <= straggler_count) & is_late)
+
+
+def _step_size_change(
+    tableau: ButcherTableau, squared_error: Array, dip_fraction: Array
+) -> tuple[Array, Array]:
+    """Return the length of the next try over this one's, and the decision: keep (1) or
+    retry (2).
+    """
+    is_kept = squared_error <= 1.0
+    must_retry = is_kept & (dip_fraction < 1.0)
+    decision = jnp.where(must_retry, 2, jnp.where(is_kept, 1, 0)).astype(jnp.int32)
+    return jnp.where(
+        must_retry, dip_fraction, step_size_factor(tableau, squared_error, dip_fraction.dtype)
+    ), decision
+
+
+def _classify_step(
+    options: StepOptions,
+    integrator_state: _IntegratorState,
+    length_factor: Array,
+    decision: Array,
+    end_values: Vector,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return status, crossing guards, acceptance, time and next length of each element.
+
+    A dip that would not advance the time does not delay the element.
+    """
+    is_running = integrator_state.status == RUNNING_STATUS
+    is_kept = is_running & (decision == 1)
+    crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
+    for index, value in enumerate(end_values):
+        crossing_bits = crossing_bits | jnp.where(value <= 0.0, 1 << index, 0)
+    has_crossed = is_kept & (crossing_bits > 0)
+    is_accepted = is_kept & ~has_crossed
+    time = jnp.where(
+        is_accepted, integrator_state.time + integrator_state.dt, integrator_state.time
+    )
+    next_length = integrator_state.dt * length_factor
+    has_timed_out = is_accepted & (time >= options.max_phase_time)
+    is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
+        time + next_length == time
+    )
+    status = jnp.where(is_stuck, FAILED_STATUS, RUNNING_STATUS)
+    status = jnp.where(
+        has_timed_out, TIMED_OUT_STATUS, jnp.where(has_crossed, CROSSED_STATUS, status)
+    )
+    return (
+        jnp.where(is_running, status, integrator_state.status).astype(jnp.int32),
+        jnp.where(is_running, crossing_bits, integrator_state.crossing_bits),
+        is_accepted,
+        time,
+        jnp.where(is_running & ~has_crossed, next_length, integrator_state.dt),
+    )
+
+
+def _mean_squared_error(
+    rk_step: RKStep, start: StageState, guards: Vector, rtol: Array, atol: Array
+) -> Array:
+    """Return the mean square of the error over its tolerance, infinite where the step is not
+    finite.
+
+    float32 is precise enough for an error estimate.
+    """
+    start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
+    to_float32 = lambda x: x.astype(jnp.float32)
+    total: Any = 0.0
+    for error, a, b in zip(rk_step.error, start_numbers, end_numbers, strict=True):
+        tolerance = atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        ratio = to_float32(error) / to_float32(tolerance)
+        total = total + ratio * ratio
+    for value in guards:
+        total = total + to_float32(0.0 * value)
+    return jnp.where(jnp.isfinite(total), total / len(start_numbers), jnp.inf)
+
+
+def _first_true(conditions: tuple[Array, ...]) -> Array:
+    """Return the index of the first condition that holds, -1 if none does."""
+    index = jnp.full(conditions[0].shape, -1, jnp.int32)
+    for i in range(len(conditions) - 1, -1, -1):
+        index = jnp.where(conditions[i], i, index)
+    return index
+
+
+def sample_batch_phase(
+    phase: BatchPhase,
+    tableau: ButcherTableau,
+    q: Vector,
+    v: Vector,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return positions, then rates, at equal times of a phase, ends included: (samples,
+    ., batch).
+    """
+
+    def step_function(state: StageState, length: Array) -> tuple[StageState, Array]:
+        advanced = rk_step(tableau, phase.evaluate, state, length)
+        return advanced.end, _mean_squared_error(advanced, state, (), options.rtol, options.atol)
+
+    pack_state = lambda state: jnp.stack([*state.q, *state.v])
+    start = StageState(q, v, phase.evaluate(q, v))
+    return sample_at_equal_times(
+        step_function, pack_state, start, tableau, duration, n_samples, options
+    )
+
+
+def sample_at_equal_times(
+    step_function: Callable[[Any, Array], tuple[Any, Array]],
+    sample_of: Callable[[Any], Array],
+    start: Any,
+    tableau: ButcherTableau,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return `sample_of` the states at equal times, ends included, samples first.
+
+    `step_function(state, length)` returns the end of a step of the tableau, and the square of its
+    error over its tolerance.
+    """
+    zero_count = jnp.zeros((), jnp.int32)
+
+    def take_sample_step(carry: tuple) -> tuple:
+        state, h, time_left, n_tried_steps = carry
+        length = jnp.minimum(h, time_left)
+        end, squared_error = step_function(state, length)
+        length_factor = step_size_factor(tableau, squared_error, length.dtype)
+        is_kept = squared_error <= 1.0
+        # A step shortened to end at a sample is no reason to reduce the previous length.
+        h = jnp.where(
+            is_kept & (length < h), jnp.maximum(h, length * length_factor), length * length_factor
+        )
+        is_running = time_left > 0.0
+        return (
+            tree_where(is_running & is_kept, end, state),
+            jnp.where(is_running, h, carry[1]),
+            jnp.where(
+                is_running & is_kept,
+                jnp.where(length == time_left, 0.0, time_left - length),
+                time_left,
+            ),
+            n_tried_steps + 1,
+        )
+
+    def integrate_to_next(carry: tuple, _: None) -> tuple[tuple, Array]:
+        needs_step = lambda carry: jnp.any(carry[2] > 0.0) & (carry[3] < options.max_solver_steps)
+        initial_carry = (*carry, duration / (n_samples - 1), zero_count)
+        state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_carry)
+        return (state, h), sample_of(state)
+
+    initial_carry = start, options.dt0 + jnp.zeros_like(duration)
+    later_samples = lax.scan(integrate_to_next, initial_carry, None, length=n_samples - 1)[1]
+    return jnp.concatenate([sample_of(start)[None], later_samples])

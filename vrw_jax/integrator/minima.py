@@ -1,0 +1,278 @@
+"""Minima of margins along a phase, for a batch, at the integrator's accuracy.
+
+The method is that of `minima` for one wheel. During the integration, the step that holds the lowest
+minimum of each margin is stored; afterwards, secant steps on the margin's rate locate it, one
+margin after the other.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.hybrid import MINIMUM_LOCATION_TOLERANCE, find_cubic_minimum
+from vrw_jax.integrator.tableaus import AccelerationFn, ButcherTableau, StageState, StepFn
+from vrw_jax.integrator.tangents import PhaseTangents
+from vrw_jax.numerics import StepOptions, Vector, tree_where
+
+
+class MarginFunctions(NamedTuple):
+    """Margins whose minima are searched; `includes_start`: see `minima.MonitoredFunctions`."""
+
+    evaluate_margins: Callable[[StageState], Vector]
+    includes_start: tuple[bool, ...]
+
+
+class MinimaState(NamedTuple):
+    """Margins at the present state, and the step that holds the lowest minimum of each so far."""
+
+    values: Array  # (margins, batch)
+    rates: Array
+    lowest_values: Array  # lowest interior minimum, (margins, batch); infinite if there is none
+    start_q: Array  # start of that step, (margins, coordinates, batch)
+    start_v: Array
+    step_length: Array  # of that step, (margins, batch), s
+    minimum_offset: Array  # of the minimum from the step's start, s
+    start_rates: Array  # at the step's start
+    start_tangents: Array | None = None  # of that start, (margins, directions, ., batch)
+
+
+def values_and_rates(
+    function: Callable[[StageState], Vector], evaluate: AccelerationFn, state: StageState
+) -> tuple[Vector, Vector]:
+    """Return a function of the state and its time derivatives along the motion."""
+    n = len(state.q)
+
+    def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
+        return function(StageState(q, v, evaluate(q, v)))
+
+    return jax.jvp(
+        evaluate_along_motion, (state.q, state.v), (state.v, state.acceleration.acceleration[:n])
+    )
+
+
+def init_minima(
+    margins: MarginFunctions,
+    evaluate: AccelerationFn,
+    state: StageState,
+    phase_tangents: PhaseTangents | None,
+) -> MinimaState:
+    """Return the minima before the first step.
+
+    A margin that is zero at the start by construction rests there: its negative rates are round-off
+    and count as zero.
+    """
+    values, rates = map(jnp.stack, values_and_rates(margins.evaluate_margins, evaluate, state))
+    includes_start = jnp.asarray(margins.includes_start)[:, None]
+    zeros = jnp.zeros_like(values)
+    zero_starts = jnp.zeros((len(values), len(state.q), values.shape[-1]), values.dtype)
+    rates = jnp.where(includes_start, rates, jnp.maximum(rates, 0.0))
+    zero_tangents = (
+        None
+        if phase_tangents is None
+        else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(values))
+    )
+    return MinimaState(
+        values, rates, zeros + jnp.inf, zero_starts, zero_starts, zeros, zeros, zeros, zero_tangents
+    )
+
+
+class AcceptedStep(NamedTuple):
+    """A solver step of the batch elements that accepted it."""
+
+    start: StageState
+    end: StageState
+    length: Array
+    is_accepted: Array
+    start_tangents: Array | None  # of the step's start
+
+
+def update_minima(
+    margins: MarginFunctions,
+    evaluate: AccelerationFn,
+    minima: MinimaState,
+    accepted_step: AcceptedStep,
+) -> MinimaState:
+    """Return the minima, updated with the interior minima of an accepted step."""
+    start, end, length, is_accepted, _ = accepted_step
+    values, rates = map(jnp.stack, values_and_rates(margins.evaluate_margins, evaluate, end))
+    x, value = find_cubic_minimum(minima.values, minima.rates * length, values, rates * length)
+    value = jnp.where(jnp.isfinite(value), value, jnp.minimum(minima.values, values))
+    has_minimum = (minima.rates < 0.0) & (rates >= 0.0)
+    is_lower = is_accepted & has_minimum & (value < minima.lowest_values)
+    replace_if_lower = lambda new_value, old_value: jnp.where(is_lower, new_value, old_value)
+    replace_start_if_lower = lambda new_value, old_value: jnp.where(
+        is_lower[:, None], jnp.stack(new_value), old_value
+    )
+    start_tangents = minima.start_tangents
+    if start_tangents is not None and accepted_step.start_tangents is not None:
+        start_tangents = jnp.where(
+            is_lower[:, None, None], accepted_step.start_tangents[None], start_tangents
+        )
+    return MinimaState(
+        values=jnp.where(is_accepted, values, minima.values),
+        rates=jnp.where(is_accepted, rates, minima.rates),
+        lowest_values=replace_if_lower(value, minima.lowest_values),
+        start_q=replace_start_if_lower(start.q, minima.start_q),
+        start_v=replace_start_if_lower(start.v, minima.start_v),
+        step_length=replace_if_lower(length, minima.step_length),
+        minimum_offset=replace_if_lower(x * length, minima.minimum_offset),
+        start_rates=replace_if_lower(minima.rates, minima.start_rates),
+        start_tangents=start_tangents,
+    )
+
+
+class MinimaResult(NamedTuple):
+    """Minima of margins over a phase, each of shape (margins, batch)."""
+
+    phase_minima: Array  # ends included
+    interior_minima: Array  # infinite if there is none
+    length_to_minimum: Array  # of the step to the interior minimum, from the stored start
+
+
+class _MinimumSearch(NamedTuple):
+    length: Array  # of the next try
+    best_length: Array  # length with the smallest rate so far
+    best_rate: Array
+    value: Array
+    is_unresolved: Array
+    n_iterations: Array
+
+
+def refine_minima(
+    margins: MarginFunctions,
+    step_function: StepFn,
+    evaluate: AccelerationFn,
+    minima: MinimaState,
+    start_values: Array,
+    options: StepOptions,
+) -> MinimaResult:
+    """Return the minima over the phase; `start_values` are the margins at its start.
+
+    Each minimum takes at most `max_margin_search_iterations` secant steps, all from the start of
+    the step that holds it.
+    """
+
+    def refine_one(_: None, inputs: tuple) -> tuple[None, tuple[Array, Array]]:
+        index, margin_state = inputs
+        q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
+        start = StageState(q, v, evaluate(q, v))
+
+        def selected_margin(state: StageState) -> Array:
+            is_selected = jnp.arange(len(margins.includes_start)) == index
+            return jnp.sum(
+                jnp.where(is_selected[:, None], jnp.stack(margins.evaluate_margins(state)), 0.0), 0
+            )
+
+        def improve(search: _MinimumSearch) -> _MinimumSearch:
+            end = step_function(start, search.length).end
+            (value,), (rate,) = values_and_rates(
+                lambda state: (selected_margin(state),), evaluate, end
+            )
+            length_change = search.length - search.best_length
+            rate_derivative = (rate - search.best_rate) / jnp.where(
+                length_change == 0.0, 1.0, length_change
+            )
+            is_usable = (length_change != 0.0) & (rate_derivative > 0.0)
+            change = jnp.where(is_usable, -rate / jnp.where(is_usable, rate_derivative, 1.0), 0.0)
+            length = jnp.clip(search.length + change, 0.0, margin_state.step_length)
+            has_converged = (
+                jnp.abs(length - search.length)
+                <= MINIMUM_LOCATION_TOLERANCE * margin_state.step_length
+            )
+            is_better = jnp.abs(rate) < jnp.abs(search.best_rate)
+            improved_search = _MinimumSearch(
+                length=length,
+                best_length=jnp.where(is_better, search.length, search.best_length),
+                best_rate=jnp.where(is_better, rate, search.best_rate),
+                value=value,
+                is_unresolved=search.is_unresolved & ~has_converged,
+                n_iterations=search.n_iterations,
+            )
+            return tree_where(search.is_unresolved, improved_search, search)._replace(
+                n_iterations=search.n_iterations + 1
+            )
+
+        has_minimum = jnp.isfinite(margin_state.lowest_values)
+        zero = jnp.zeros_like(margin_state.step_length)
+        n_iterations = jnp.zeros((), jnp.int32)
+        search = _MinimumSearch(
+            margin_state.minimum_offset,
+            zero,
+            margin_state.start_rates,
+            zero + jnp.inf,
+            has_minimum,
+            n_iterations,
+        )
+        needs_iteration = lambda search: (
+            jnp.any(search.is_unresolved)
+            & (search.n_iterations < options.max_margin_search_iterations)
+        )
+        final_search = lax.while_loop(needs_iteration, improve, search)
+        return None, (final_search.value, final_search.length)
+
+    includes_start = np.asarray(margins.includes_start)[:, None]
+    end_minima = jnp.minimum(jnp.where(includes_start, start_values, jnp.inf), minima.values)
+    indices = jnp.arange(len(includes_start), dtype=jnp.int32)
+    interior_minima, length = lax.scan(
+        refine_one, None, (indices, minima._replace(start_tangents=None))
+    )[1]
+    return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, length)
+
+
+def minima_jvp(
+    margins_of: Callable[..., tuple[MarginFunctions, AccelerationFn]],
+    step_function: StepFn,
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents,
+    minima: MinimaState,
+    result: MinimaResult,
+    phase_ends: tuple[StageState, StageState],
+    end_tangents: Array,
+) -> Array:
+    """Return the tangents of the minima, directions first.
+
+    They are tangents along the motion at each minimum, because its location has no first-order
+    effect. `phase_ends`: the start and the end of the phase; `end_tangents`: tangents of the end
+    state.
+    """
+    margins, evaluate = margins_of(phase_tangents.constants, phase_tangents.held_constants)
+
+    def evaluate_margins(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Array:
+        margin_functions, acceleration_of = margins_of(constants, held_constants)
+        return jnp.stack(margin_functions.evaluate_margins(StageState(q, v, acceleration_of(q, v))))
+
+    tangents_of_margins = functools.partial(phase_tangents.value_tangents, evaluate_margins)
+
+    def tangent_of_one(_: None, inputs: tuple) -> tuple[None, Array]:
+        index, margin_state, length = inputs
+        q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
+        start = StageState(q, v, evaluate(q, v))
+        rk_step = step_function(start, length)
+        tangents = phase_tangents.propagate(
+            tableau, rk_step.stage_states, margin_state.start_tangents, length
+        )
+        is_selected = jnp.arange(len(margins.includes_start)) == index
+        return None, jnp.sum(
+            jnp.where(is_selected[:, None], tangents_of_margins(rk_step.end, tangents), 0.0), 1
+        )
+
+    indices = jnp.arange(len(result.phase_minima), dtype=jnp.int32)
+    interior_tangents = jnp.moveaxis(
+        lax.scan(tangent_of_one, None, (indices, minima, result.length_to_minimum))[1], 0, 1
+    )
+    first_tangents, last_tangents = (
+        tangents_of_margins(phase_ends[0], phase_tangents.start_tangents),
+        tangents_of_margins(phase_ends[1], end_tangents),
+    )
+    end_minima_tangents = jnp.where(
+        minima.values <= result.phase_minima, last_tangents, first_tangents
+    )
+    return jnp.where(
+        result.interior_minima <= result.phase_minima, interior_tangents, end_minima_tangents
+    )

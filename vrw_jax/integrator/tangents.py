@@ -1,0 +1,352 @@
+"""Tangents of a phase's end with respect to its start and the constants of its equations, per
+batch.
+
+Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
+part shared by all directions, the Jacobians at the stages, is computed once, and each direction
+then costs some hundred products. Step sizes and the tries of an event's search take no part. The
+derivative is that of the discrete flow at the lengths that were taken, and of the time at which its
+guard vanishes.
+
+`jax.vmap` around a derivative supplies its directions. Here they are the first axis of arrays
+instead: loops are traced once, not again for the vmap.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jax.extend.core import Primitive
+from jax.interpreters import batching
+from jaxtyping import Array
+
+from vrw_jax.integrator.tableaus import (
+    ButcherTableau,
+    StageAcceleration,
+    StageState,
+    evaluate_stage,
+)
+from vrw_jax.numerics import Vector, run_if_any, zero_tangent
+
+
+class ImplicitDynamics(NamedTuple):
+    """The equations of motion near a state whose accelerations are known."""
+
+    residual: Callable[[StageState], Vector]
+    """Residual of the equations of motion: left side at the state's accelerations less the right
+    side."""
+    solve: Callable[[StageState, Vector], Vector]
+    """Accelerations for which the left side equals these rows."""
+
+
+ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
+"""A function of the constants of the equations: a tree of arrays with few tangent directions, and
+numbers with any tangent, like the start of a phase."""
+
+
+def batched_jvp_rule(
+    function: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
+) -> tuple[Any, Any]:
+    """Return (values, tangents) of a JVP rule from a `function` that takes all directions together.
+
+    `primals` and `tangents` are the arguments of the rule. `function` takes tangents with the axis
+    of directions first, of length 1 where all directions agree, and returns tangents in the same
+    form.
+    """
+    leaves, structure = jax.tree.flatten((primals, tangents))
+    n_primals, size = len(jax.tree.leaves(primals)), len(_vmap_size(tangents))
+    if size == 0:
+        values, output_tangents = function(primals, jax.tree.map(lambda x: x[None], tangents))
+        return values, jax.tree.map(lambda x: x[0], output_tangents)
+    output_structure: Any = None
+
+    def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
+        nonlocal output_structure
+        if any(axis is not None for axis in axes[:n_primals]):
+            raise NotImplementedError(
+                "jax.vmap around a derivative of lanes is for its directions: what has many values "
+                "has them on the lanes' axis, the last."
+            )
+        pairs = zip(leaves[n_primals:], axes[n_primals:], strict=True)
+        direction_leaves = [
+            x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs
+        ]
+        values, output_tangents = function(
+            *jax.tree.unflatten(structure, [*leaves[:n_primals], *direction_leaves])
+        )
+        output_tangents = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), output_tangents
+        )
+        results, output_structure = jax.tree.flatten((values, output_tangents))
+        n = len(jax.tree.leaves(values))
+        return results, [None] * n + [0] * (len(results) - n)
+
+    results = _HOIST_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
+    return jax.tree.unflatten(output_structure, results)
+
+
+@custom_vmap
+def _vmap_size(_: Any) -> Array:
+    """Return as many zeros as an enclosing `jax.vmap` has directions, none without one."""
+    return jnp.zeros(0)
+
+
+@_vmap_size.def_vmap
+def _vmap_size_rule(size: int, _: list, _tangent: Any) -> tuple[Array, bool]:
+    return jnp.zeros(size), False
+
+
+_HOIST_PRIMITIVE = Primitive("beyond")
+"""What is traced outside of the `jax.vmap` around: within, its loops would be traced again."""
+_HOIST_PRIMITIVE.multiple_results = True
+batching.primitive_batchers[_HOIST_PRIMITIVE] = lambda values, axes, mapped: mapped(values, axes)
+"""Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
+loops again."""
+
+
+def _map_sequentially(function: Callable[[Any], Any], directions: Any) -> Any:
+    """Return `function` of each direction, in a loop, so that each direction stays in registers."""
+    leaves, structure = jax.tree.flatten(directions)
+    has_many = [len(x) > 1 for x in leaves]
+
+    def evaluate_one(varying_leaves: list[Array]) -> Any:
+        remaining_leaves = iter(varying_leaves)
+        pairs = zip(leaves, has_many, strict=True)
+        return function(
+            jax.tree.unflatten(structure, [next(remaining_leaves) if n else x[0] for x, n in pairs])
+        )
+
+    if not any(has_many):
+        return jax.tree.map(lambda x: x[None], evaluate_one([]))
+    return lax.map(evaluate_one, [x for x, n in zip(leaves, has_many, strict=True) if n])
+
+
+def stack_directions(directions: Vector) -> Array:
+    """Return tangents of several numbers stacked as (directions, numbers, batch)."""
+    return jnp.stack(jnp.broadcast_arrays(*directions), 1)
+
+
+class StageJacobians(NamedTuple):
+    """Jacobians of the accelerations at the stages of a step."""
+
+    state_jacobian: Array  # (stages, n, ., batch): by positions, rates, then held constants
+    constants_tangents: Array  # (stages, directions, n, batch)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _stage_jacobians(
+    dynamics_of: ImplicitDynamicsFn,
+    constants: Any,
+    constants_directions: Any,
+    held_constants: Vector,
+    stages: list[StageState],
+) -> StageJacobians:
+    def linearize_stage(row: Array) -> tuple[Array, Array]:
+        state, dynamics = _unpack_state(row), _jit_dynamics(dynamics_of(constants, held_constants))
+        residual = lambda constants, held_constants: dynamics_of(
+            constants, held_constants
+        ).residual(state)
+        acceleration_along = lambda *tangent: _solve_acceleration(
+            dynamics, state, jax.jvp(residual, *tangent)[1]
+        )
+        zero_constants = jax.tree.map(jnp.zeros_like, constants)
+        state_columns = [
+            jnp.stack(_acceleration_tangent(dynamics, state, *unit))
+            for unit in _unit_directions(state)
+        ]
+        state_columns += [
+            acceleration_along((constants, held_constants), (zero_constants, unit))
+            for unit in _unit_rows(held_constants)
+        ]
+        zero_held = tuple(jnp.zeros_like(x) for x in held_constants)
+        acceleration_by_constants = lambda constants_direction: acceleration_along(
+            (constants, held_constants), (constants_direction, zero_held)
+        )
+        return jnp.stack(state_columns, 1), _map_unrolled(
+            acceleration_by_constants, constants_directions
+        )
+
+    return StageJacobians(
+        *lax.map(linearize_stage, jnp.stack([_pack_state(state) for state in stages[:-1]]))
+    )
+
+
+def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
+    """Return `function` of each direction without a loop, so that known zeros are dropped."""
+    leaves, structure = jax.tree.flatten(directions)
+    if all(len(x) == 1 for x in leaves):
+        return function(jax.tree.unflatten(structure, [x[0] for x in leaves]))[None]
+    axes = [0 if len(x) > 1 else None for x in leaves]
+    inputs = [x if len(x) > 1 else x[0] for x in leaves]
+    return jax.vmap(lambda *x: function(jax.tree.unflatten(structure, x)), axes)(*inputs)
+
+
+def _jit_dynamics(dynamics: ImplicitDynamics) -> ImplicitDynamics:
+    return ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
+
+
+def _pack_state(state: StageState) -> Array:
+    n = len(state.q)
+    sin, cos, acceleration = state.acceleration
+    return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
+
+
+def _unpack_state(row: Array) -> StageState:
+    n = (len(row) - 2) // 3
+    numbers = tuple(row)
+    acceleration = StageAcceleration(numbers[2 * n], numbers[2 * n + 1], numbers[2 * n + 2 :])
+    return StageState(numbers[:n], numbers[n : 2 * n], acceleration)
+
+
+def _unit_rows(template: Vector) -> list[Vector]:
+    n = len(template)
+    return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
+
+
+def _unit_directions(state: StageState) -> list[tuple[Vector, Vector]]:
+    rows, n = _unit_rows((*state.q, *state.v)), len(state.q)
+    return [(row[:n], row[n:]) for row in rows]
+
+
+def _acceleration_tangent(
+    dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
+) -> Vector:
+    """Return the tangent of the accelerations along a direction of positions and rates."""
+    sin, cos, acceleration = state.acceleration
+    zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
+    state_tangent = StageState(
+        dq, dv, StageAcceleration(cos * dq[0], -sin * dq[0], zero_accelerations)
+    )
+    return tuple(
+        _solve_acceleration(
+            dynamics, state, jax.jvp(dynamics.residual, (state,), (state_tangent,))[1]
+        )
+    )
+
+
+def _solve_acceleration(dynamics: ImplicitDynamics, state: StageState, rows: Vector) -> Array:
+    return -jnp.stack(dynamics.solve(state, rows))
+
+
+@functools.partial(jax.jit, static_argnums=0)  # traced once, wherever it is called
+def _propagate_tangents(
+    tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
+) -> Array:
+    """Propagate tangents (positions, rates, held constants) from a step's start to its end."""
+    state_jacobian, n = stage_jacobians.state_jacobian, stage_jacobians.state_jacobian.shape[1]
+
+    def propagate_one(direction: tuple[Array, Array]) -> Array:
+        constants_tangent, start = direction
+        q0, v0, held_tangents = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
+        stage_tangents: list[Vector] = []
+        for i in range(len(tableau.nodes) - 1):
+            q, v = evaluate_stage(tableau, i, q0, v0, stage_tangents, h) if i else (q0, v0)
+            state_tangents = (*q, *v, *held_tangents)
+            rows = [
+                [constants_tangent[i, d], *map(lax.mul, state_jacobian[i, d], state_tangents)]
+                for d in range(n)
+            ]
+            stage_tangents.append(tuple(functools.reduce(lax.add, row) for row in rows))
+        q, v = evaluate_stage(tableau, len(tableau.nodes) - 1, q0, v0, stage_tangents, h)
+        return jnp.stack([*q, *v, *held_tangents])
+
+    return _map_sequentially(
+        propagate_one, (jnp.moveaxis(stage_jacobians.constants_tangents, 1, 0), start_tangents)
+    )
+
+
+def jvp_each(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
+    """Return `jax.jvp` along each of the directions, without the value.
+
+    The code is as short as for one direction.
+    """
+    return _map_sequentially(lambda direction: jax.jvp(function, primals, direction)[1], directions)
+
+
+def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` of trees, whose derivative with respect to their floats is `jvp_each`."""
+
+    def call_with_batched_jvp(*arguments: Any) -> Any:
+        floats, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
+        evaluate_combined = lambda *floats: function(*eqx.combine(floats, other_arguments))
+        evaluate_floats = lambda *floats: eqx.filter(
+            evaluate_combined(*floats), eqx.is_inexact_array
+        )
+        differentiable_function = jax.custom_jvp(evaluate_combined)
+
+        @differentiable_function.defjvp
+        def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
+            evaluate_with_tangents = lambda primals, directions: (
+                evaluate_combined(*primals),
+                jvp_each(evaluate_floats, primals, directions),
+            )
+            outputs, float_tangents = batched_jvp_rule(evaluate_with_tangents, primals, tangent)
+            return outputs, eqx.combine(float_tangents, zero_tangent(outputs))
+
+        return differentiable_function(*floats)
+
+    return call_with_batched_jvp
+
+
+class PhaseTangents(NamedTuple):
+    """Tangent directions of a phase: of its constants, its start and the constants held
+    since then.
+    """
+
+    dynamics_of: ImplicitDynamicsFn
+    constants: Any
+    held_constants: Vector
+    constants_tangents: Any  # structure of the constants, directions first
+    start_tangents: Array  # of positions, rates, held constants, (directions, ., batch)
+
+    def propagate(
+        self, tableau: ButcherTableau, stages: list[StageState], start_tangents: Array, h: Array
+    ) -> Array:
+        """Return the tangents at a step's start, propagated to its end."""
+        stage_jacobians = _stage_jacobians(
+            self.dynamics_of, self.constants, self.constants_tangents, self.held_constants, stages
+        )
+        return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
+
+    def propagate_if_accepted(
+        self,
+        tableau: ButcherTableau,
+        stages: list[StageState],
+        start_tangents: Array,
+        h: Array,
+        is_accepted: Array,
+    ) -> Array:
+        """Return the tangents propagated where the step is accepted; otherwise they are unchanged.
+
+        A group without accepted steps skips the computation.
+        """
+
+        def propagate_accepted(start_tangents: Array) -> Array:
+            return jnp.where(
+                is_accepted, self.propagate(tableau, stages, start_tangents, h), start_tangents
+            )
+
+        return run_if_any(jnp.any(is_accepted), propagate_accepted, start_tangents)
+
+    def value_tangents(
+        self, evaluate: Callable[..., Any], state: StageState, directions: Array
+    ) -> Any:
+        """Return the tangents of `evaluate(constants, held_constants, q, v)` for the directions at
+        a state.
+        """
+        n, direction_rows = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
+        primals = self.constants, self.held_constants, state.q, state.v
+        return jvp_each(
+            evaluate,
+            primals,
+            (
+                self.constants_tangents,
+                direction_rows[2 * n :],
+                direction_rows[:n],
+                direction_rows[n : 2 * n],
+            ),
+        )

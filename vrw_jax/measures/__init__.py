@@ -1,0 +1,21 @@
+"""The table of measures and margins: names, symbols, units and meanings."""
+
+from vrw_jax.measures.provenance import provenance
+from vrw_jax.measures.table import (
+    CONTACT_MEASURES,
+    LIMIT_CYCLE_MEASURES,
+    MARGIN_MEASURES,
+    MEASURES,
+    PHASE_NAMES,
+    STEP_MEASURES,
+    STOPPER_MARGIN_MEASURES,
+    TRAJECTORY_MEASURES,
+    UNILATERAL_DIFFERENTIABLE_NAMES,
+    UNILATERAL_STEP_MEASURES,
+    describe_violation,
+    flag_attrs,
+    get_measure,
+    locked_leg_coordinate,
+    make_variables,
+    measure_attrs,
+)

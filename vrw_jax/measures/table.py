@@ -1,0 +1,356 @@
+"""Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
+
+Every labeled result takes its units and long names from here, so that scans, trajectories and
+figures use the same names. Frame: x downhill along the slope, z normal to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vrw_jax.printing import format_mathtext
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.wheel import PAPER_PHASES as OF_STEP
+from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A named quantity; `unit` is "1" for a pure number, `equation` is the paper's, "" if there is
+    none.
+
+    `violation` is a clause with the consequence of a negative value, "" if there is none.
+    """
+
+    name: str
+    unit: str
+    symbol: str
+    long_name: str
+    description: str
+    equation: str = ""
+    dimension: str = (
+        ""  # "leg": one value for each of the locked legs 3..n, of `CONTACTS` for each leg
+    )
+    violation: str = ""
+
+    @property
+    def mathtext(self) -> str:
+        """Symbol as mathtext, without dollar signs."""
+        return format_mathtext(self.symbol)
+
+    @property
+    def label(self) -> str:
+        """Name and symbol."""
+        has_symbol = self.symbol in self.long_name
+        return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
+
+    @property
+    def display_unit(self) -> str:
+        """Unit for a reader, "" for a pure number."""
+        return "" if self.unit == "1" else self.unit
+
+    @property
+    def attrs(self) -> dict[str, str]:
+        """Attributes of a labeled variable that holds this quantity."""
+        attrs = {
+            "units": self.unit,
+            "long_name": self.long_name,
+            "symbol": self.symbol,
+            "description": self.description,
+        }
+        return attrs | ({"equation": self.equation} if self.equation else {})
+
+    def format_with_unit(self, value: object) -> str:
+        """Return a number with its unit, for a reader."""
+        return f"{float(np.asarray(value)):.6g} {self.display_unit}".strip()
+
+
+def _make_table(*measures: Measure) -> dict[str, Measure]:
+    table = {measure.name: measure for measure in measures}
+    if len(table) != len(measures):
+        raise ValueError("Two measures share one name: give each its own.")
+    return table
+
+
+# fmt: off
+STEP_MEASURES = _make_table(
+    Measure("dls_fraction", "1", "T_DLS/T", "DLS fraction",
+            "Share of the step spent in double-limb support."),
+    Measure("period", "s", "T", "step period", "Duration of the step, touchdown to touchdown."),
+    Measure("speed", "m/s", "v", "walking speed", "Step length over period, along the slope."),
+    Measure("step_length", "m", "D", "step length",
+            "Distance between both feet at the landing that opens the step."),
+    Measure("duration_dls", "s", "T_DLS", "duration of DLS",
+            "Time with both feet on the ground.", "Section 3.3.1"),
+    Measure("duration_sls1", "s", "T_SLS-I", "duration of SLS-I",
+            "Time from take-off of Leg 2 until it is at its stopper.", "Section 3.3.2"),
+    Measure("duration_sls2", "s", "T_SLS-II", "duration of SLS-II",
+            "Time from the stopper of Leg 2 to the next touchdown.", "Section 3.3.3"),
+    Measure("theta_post_impact", "rad", "θ⁺", "angle just after landing",
+            "Angle of Leg 1 from the slope's normal just after the opening landing.", "(15)"),
+    Measure("dtheta_post_impact", "rad/s", "θ̇⁺", "angular rate just after landing",
+            "Angular rate just after the opening landing.", "(20)"),
+    Measure("theta_touchdown", "rad", "θ⁻", "angle just before touchdown",
+            "Angle of Leg 1 just before the next touchdown: section state, first number."),
+    Measure("dtheta_touchdown", "rad/s", "θ̇⁻", "angular rate just before touchdown",
+            "Angular rate just before the next touchdown: section state, second number."),
+    Measure("dL1_touchdown", "m/s", "L̇1⁻", "rate of Leg 1 just before touchdown",
+            "Rate of the length of Leg 1 then: section state, third number."),
+    Measure("lambda_I4", "N s", "λ_I4", "DLS indicator λ_I4",
+            "Normal impulse of the rear foot in the landing with both feet held.", "(35)",
+            violation="landing frees the rear foot"),
+    Measure("lambda_2_plus", "N", "λ2⁺", "DLS indicator λ2⁺",
+            "Normal force of the fore foot just after landing, both feet held.", "(38)",
+            violation="fore foot pulls at once"),
+    Measure("lambda_4_plus", "N", "λ4⁺", "DLS indicator λ4⁺",
+            "Normal force of the rear foot just after landing, both feet held.", "(38)",
+            violation="rear foot lifts at once"),
+    Measure("energy_lost_landing", "J", "ΔE_I", "energy lost in the landing",
+            "Mechanical energy lost in collision I, positive when lost.", "(18)"),
+    Measure("energy_lost_stopper", "J", "ΔE_II", "energy lost at the stopper",
+            "Mechanical energy lost in collision II, positive when lost.", "(22)"),
+    Measure("energy_lost_damping", "J", "ΔE_c", "energy lost in the dampers",
+            "Mechanical energy lost by the viscous legs over the step.", "(29)"),
+    Measure("outcome", "1", "outcome", "outcome", "How the step ended."),
+    Measure("solver_steps", "1", "N", "solver steps", "Steps tried by the integrator."),
+)
+"""Measures of one step."""
+
+MARGIN_MEASURES = _make_table(
+    Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
+            "Negative where the ground would have to pull on Leg 1.",
+            violation="fore foot pulls"),
+    Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
+            "Just after the rear foot is let go, at rest on the ground; negative where it scuffs "
+            "at once.", violation="rear foot scuffs at take-off"),
+    Measure("clearance_sls1", "m", "min z2, SLS-I", "foot clearance in SLS-I",
+            "Least height of foot 2 in SLS-I; negative when it scuffs.",
+            violation="rear foot scuffs in SLS-I"),
+    Measure("clearance_sls2", "m", "min z2, SLS-II", "foot clearance in SLS-II",
+            "Least height of foot 2 in SLS-II; negative when it scuffs.",
+            violation="rear foot scuffs in SLS-II"),
+    Measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
+            "Least force of the stopper on each of the legs 3..n; negative where one comes off.",
+            dimension="leg", violation="locked leg leaves its stopper"),
+    Measure("rear_stopper_force", "N", "min F_stop,2", "stopper force of Leg 2 in SLS-II",
+            "Least force of the stopper on Leg 2 in SLS-II; negative where it comes off.",
+            violation="Leg 2 leaves its stopper"),
+    Measure("contraction", "m", "min(L0 - L1)", "contraction of Leg 1",
+            "Least contraction after the landing; negative where Leg 1 passes its stopper.",
+            violation="Leg 1 passes its stopper"),
+    Measure("friction_fore", "1", "μ - |λ1|/λ2", "friction left at the fore foot",
+            "Friction coefficient of the model less the coefficient needed at the fore foot.",
+            violation="fore foot slides"),
+    Measure("friction_rear", "1", "μ - |λ3⁺|/λ4⁺", "friction left at the rear foot after landing",
+            "Friction coefficient less the one needed at the rear foot just after landing.",
+            violation="rear foot slides just after landing"),
+    Measure("landing_stopper_impulse", "N s", "I_stop, I", "stopper impulse at the landing",
+            "Impulse on each of the legs 3..n; negative where the landing throws one off.",
+            dimension="leg", violation="landing throws a locked leg off"),
+    Measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
+            "Impulse on each of the legs 3..n; negative where the collision throws one off.",
+            dimension="leg", violation="collision II throws a locked leg off"),
+    Measure("hit_planted_impulse", "N s", "λ_s2", "normal impulse of the planted foot",
+            "Of collision II; negative where the ground would have to pull.", "(22)",
+            violation="foot pulls in collision II"),
+    Measure("landing_friction_fore", "1", "μ - |λ_I1|/λ_I2",
+            "friction left at the fore foot in the landing",
+            "Friction coefficient less the one needed at the fore foot in the landing impulse.",
+            violation="fore foot slides in the landing"),
+    Measure("landing_friction_rear", "1", "μ - |λ_I3|/λ_I4",
+            "friction left at the rear foot in the landing",
+            "Friction coefficient less the one needed at the rear foot in the landing impulse.",
+            violation="rear foot slides in the landing"),
+)
+"""Margins of the model over one step, signed, negative where violated: `Margins`."""
+
+UNILATERAL_STEP_MEASURES = _make_table(
+    Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
+    Measure("duration_flight", "s", "t₀", "time of flight", "Time with no loaded foot."),
+    Measure("slip", "m", "s", "slip per step", "Path of all sliding feet."),
+    Measure("energy_lost_impacts", "J", "ΔE_I", "energy lost in impacts",
+            "Mechanical energy lost in landings and at stoppers."),
+    Measure("energy_lost_friction", "J", "ΔE_μ", "energy lost by sliding",
+            "Mechanical energy lost by sliding feet between impacts."),
+    Measure("friction", "1", "μ", "friction coefficient", "Of the ground."),
+)
+"""Measures of a step with unilateral contact, beside those of `STEP_MEASURES` that it shares."""
+
+STOPPER_MARGIN_MEASURES = _make_table(
+    Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
+            "Negative where a stopper that only pushes would let a leg go.",
+            violation="a leg in the air leaves its stopper"),
+    Measure("stopper_impulse", "N s", "min I_stop",
+            "least impulse of a stopper on a leg in the air",
+            "Negative where a stopper that only pushes would let an impact throw a leg off.",
+            violation="an impact throws a leg off its stopper"),
+)
+"""Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
+violated."""
+
+SHARED_STEP_MEASURE_NAMES = (
+    "dls_fraction",
+    "period",
+    "speed",
+    "step_length",
+    "duration_dls",
+    "theta_post_impact",
+    "dtheta_post_impact",
+    "theta_touchdown",
+    "dtheta_touchdown",
+    "energy_lost_damping",
+    "outcome",
+    "solver_steps",
+)
+"""Measures of `STEP_MEASURES` that every model reports."""
+
+UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
+    name for name in (*SHARED_STEP_MEASURE_NAMES, *UNILATERAL_STEP_MEASURES) if name not in ("outcome", "solver_steps", "friction")
+)
+"""Measures of a step with unilateral contact that have derivatives."""
+
+LIMIT_CYCLE_MEASURES = _make_table(
+    Measure("spectral_radius", "1", "ρ", "spectral radius",
+            "Largest magnitude of a multiplier of the limit cycle; the gait is stable below 1."),
+    Measure("spectral_margin", "1", "1 - ρ", "spectral margin",
+            "One less the spectral radius; negative when the gait is unstable."),
+    Measure("stability_margin", "1", "σ", "stability margin",
+            "Smooth least Jury margin: to fold, period doubling and a pair on the unit circle; "
+            "negative when the gait is unstable."),
+)
+"""Measures of a limit cycle."""
+
+TRAJECTORY_MEASURES = _make_table(
+    Measure("time", "s", "t", "time", "Time since the landing that opens the first step."),
+    Measure("step", "1", "step", "step", "Number of the step, from 0."),
+    Measure("phase", "1", "phase", "phase", "Phase of the step."),
+    Measure("x", "m", "x", "foot of Leg 1 along the slope",
+            "Downhill position of the present Leg 1's foot; grows by a step length per landing."),
+    Measure("z", "m", "z", "foot of Leg 1 above the slope",
+            "Height of the present Leg 1's foot: 0, it stands."),
+    Measure("theta", "rad", "θ", "angle of Leg 1", "From the slope's normal, growing downhill."),
+    Measure("L1", "m", "L1", "length of Leg 1", "Fore leg, on the ground throughout."),
+    Measure("L2", "m", "L2", "length of Leg 2", "Rear leg, at angle θ + α."),
+    Measure("dx", "m/s", "ẋ", "rate of x", "0: the foot stands.", "(2)"),
+    Measure("dz", "m/s", "ż", "rate of z", "0: the foot stands.", "(2)"),
+    Measure("dtheta", "rad/s", "θ̇", "angular rate", "Rate of the angle of Leg 1."),
+    Measure("dL1", "m/s", "L̇1", "rate of Leg 1", "Rate of the length of Leg 1."),
+    Measure("dL2", "m/s", "L̇2", "rate of Leg 2", "Rate of the length of Leg 2."),
+    Measure("lambda_1", "N", "λ1", "tangential force on foot 1", "Downhill positive.", "(12)"),
+    Measure("lambda_2", "N", "λ2", "normal force on foot 1", "Positive when it pushes.", "(12)"),
+    Measure("lambda_3", "N", "λ3", "tangential force on foot 2", "0 in single support.", "(12)"),
+    Measure("lambda_4", "N", "λ4", "normal force on foot 2", "0 in single support.", "(12)"),
+    Measure("kinetic_energy", "J", "K", "kinetic energy", "Half of q̇ᵀ M q̇.", "(26)"),
+    Measure("gravitational_energy", "J", "P_g", "gravitational energy",
+            "From the first foot of the walk, the slope's drop included.", "(26)"),
+    Measure("elastic_energy", "J", "P_k", "elastic energy", "Of all legs' springs.", "(27)"),
+    Measure("total_energy", "J", "E", "total mechanical energy",
+            "Continuous but for the two collisions; falls by damping in between.", "(26), (29)"),
+    Measure("damping_power", "W", "c(L̇1² + L̇2²)", "power lost in the dampers",
+            "Minus the rate of the total energy between collisions.", "(29)"),
+    Measure("foot_1_x", "m", "x1", "foot of Leg 1 along the slope", "Downhill position."),
+    Measure("foot_1_z", "m", "z1", "foot of Leg 1 above the slope", "Height; 0, it stands."),
+    Measure("foot_2_x", "m", "x2", "foot of Leg 2 along the slope", "Downhill position."),
+    Measure("foot_2_z", "m", "z2", "foot of Leg 2 above the slope",
+            "Height; negative when it scuffs."),
+    Measure("hub_x", "m", "x_H", "hub along the slope", "Downhill position."),
+    Measure("hub_z", "m", "z_H", "hub above the slope", "Height."),
+)
+"""Coordinates and variables of a trajectory."""
+
+CONTACT_MEASURES = _make_table(
+    Measure("length", "m", "L", "length of the leg", "Of each leg.", dimension="leg"),
+    Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Of each leg.", dimension="leg"),
+    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", dimension="leg"),
+    Measure("foot_z", "m", "z", "foot above the slope", "Height.", dimension="leg"),
+    Measure("tangential", "N", "λ_t", "tangential force on the foot", "Downhill positive.",
+            dimension="leg"),
+    Measure("normal", "N", "λ_n", "normal force on the foot", "Positive when it pushes.",
+            dimension="leg"),
+    Measure("contact", "1", "contact", "contact mode of the foot", "Of each leg.", dimension="leg"),
+    Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "Of each leg.",
+            dimension="leg"),
+)
+"""Variables of a trajectory with unilateral contact, of each leg 1..n."""
+
+# fmt: on
+PARAMETER_MEASURES = _make_table(
+    *(
+        Measure(name, domain.unit or "1", domain.symbol, name.replace("_", " "), domain.description)
+        for name, domain in PARAMETER_DOMAINS.items()
+    )
+)
+"""Parameters of the wheel, for the axes of a scan."""
+
+MEASURES: dict[str, Measure] = (
+    STEP_MEASURES
+    | MARGIN_MEASURES
+    | UNILATERAL_STEP_MEASURES
+    | STOPPER_MARGIN_MEASURES
+    | LIMIT_CYCLE_MEASURES
+    | TRAJECTORY_MEASURES
+    | CONTACT_MEASURES
+    | PARAMETER_MEASURES
+)
+"""All quantities by name."""
+
+PHASE_NAMES = tuple(phase.name for phase in OF_STEP)
+"""Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
+
+
+def flag_attrs(names: Iterable[str]) -> dict[str, object]:
+    """Return CF attributes of an integer variable whose values 0, 1, ... have names."""
+    names = [name.replace(" ", "_") for name in names]
+    return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+
+
+def get_measure(name: str) -> Measure:
+    """Return the measure that a number belongs to.
+
+    The name may end in its leg, as "[5]", and begin with the minus of an upper bound.
+    """
+    return MEASURES[name.removeprefix("-").partition("[")[0]]
+
+
+def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[str, xr.Variable]:
+    """Return labeled measures over one dimension; those of the locked legs have the dimension `leg`
+    too.
+    """
+    dims_of = lambda name: (
+        (dimension, MEASURES[name].dimension) if MEASURES[name].dimension else dimension
+    )
+    return {name: xr.Variable(dims_of(name), x, measure_attrs(name)) for name, x in columns.items()}
+
+
+def locked_leg_coordinate(n_legs: int) -> xr.Variable:
+    """Return the coordinate `leg` of margins of legs 3..n."""
+    attrs = {"long_name": "locked leg", "units": "1"}
+    return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
+
+
+def describe_violation(name: str) -> str:
+    """Return the event at which a margin or indicator is zero; `name` may end in its leg, "[5]"."""
+    base, _, leg = name.partition("[")
+    if base in STEP_MEASURES and not MEASURES[base].violation:
+        return f"{MEASURES[base].long_name} is zero"
+    if base not in MEASURES or not MEASURES[base].violation:
+        return name.replace("_", " ")
+    symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP_MEASURES else ""
+    return symbol + MEASURES[base].violation + (f", leg {leg[:-1]}" if leg else "")
+
+
+def measure_attrs(name: str) -> dict[str, object]:
+    """Return the attributes of the variable `name`; phase, contact and outcome include their flag
+    names.
+    """
+    attrs: dict[str, object] = dict(MEASURES[name].attrs)
+    if name == "phase":
+        attrs |= flag_attrs(PHASE_NAMES)
+    if name == "contact":
+        attrs |= flag_attrs(("in the air", "at rest", "sliding downhill", "sliding uphill"))
+    if name == "outcome":
+        attrs |= flag_attrs(outcome.name for outcome in Outcome)
+    return attrs

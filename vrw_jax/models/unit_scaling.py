@@ -1,0 +1,101 @@
+"""Derivatives that follow from the units of length, time and mass by Euler's theorem.
+
+In other units of length, time and mass every gait is the same. So every output of a step or a cycle
+is a homogeneous function of the wheel and the start. By Euler's theorem, each unit gives one column
+of the derivatives from the other columns. The Jacobian of a step obtains two columns in this way. A
+third would follow from the unit of mass. No mass is always large enough to divide by, and the
+column of a light leg would lose its digits. For the Jacobian of a cycle, whose columns cost more,
+the direction in which both masses grow is given as well.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vrw_jax.models.batch_step import N_STEP_INPUTS, jacobian_columns
+from vrw_jax.numerics import BatchFunction
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
+
+_UNIT_POWERS = {
+    "kg": (0, 0, 1), "m": (1, 0, 0), "N/m": (0, -2, 1), "N s/m": (0, -1, 1), "rad": (0, 0, 0),
+    "m/s^2": (1, -2, 0), "rad/s": (0, -1, 0), "m/s": (1, -1, 0), "s": (0, 1, 0),
+}  # fmt: skip
+"""Powers of length, time and mass in the units of the wheel's parameters and of a step's
+outputs."""
+_STATE_UNITS = ("rad", "rad/s", "m/s")
+_INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE_UNITS)
+
+
+class UnitScaling(NamedTuple):
+    """Powers of one unit in each input (parameters, start) and output (section state,
+    durations).
+    """
+
+    input_powers: tuple[int, ...]
+    output_powers: tuple[int, ...]
+
+    def subtract_columns(
+        self, remainder: Array, inputs: Sequence[Array], columns: Mapping[int, Array]
+    ) -> Array:
+        """Return `remainder` minus the given columns, each times its input and that input's power.
+
+        The argument is the output times its power. By Euler's theorem, the result is the sum of the
+        same products over the columns that are not given.
+        """
+        for i, column in columns.items():
+            if self.input_powers[i]:
+                remainder = remainder - (self.input_powers[i] * inputs[i]) * column
+        return remainder
+
+
+def _make_unit_scaling(unit_index: int) -> UnitScaling:
+    """Return the powers of one unit: 0 is length, 1 is time, 2 is mass."""
+    powers = (
+        tuple(_UNIT_POWERS[unit_name][unit_index] for unit_name in units)
+        for units in (_INPUT_UNITS, (*_STATE_UNITS, "s", "s", "s"))
+    )
+    return UnitScaling(*powers)
+
+
+LENGTH_SCALING, TIME_SCALING, MASS_SCALING = (_make_unit_scaling(unit) for unit in range(3))
+SCALING_BY_PARAMETER = {
+    PARAMETER_NAMES.index("gravity"): TIME_SCALING,
+    PARAMETER_NAMES.index("locked_length"): LENGTH_SCALING,
+}
+"""Scaling that gives the column of a parameter, by the parameter's index. Gravity comes first,
+because its unit contains a length."""
+
+
+def complete_by_scaling(
+    inputs: Sequence[Array], columns: Mapping[int, Array], scaled_outputs: Mapping[int, Array]
+) -> dict[int, Array]:
+    """Return all columns; those of `SCALING_BY_PARAMETER` follow from the outputs times their
+    powers.
+    """
+    columns = dict(columns)
+    for index, scaling in SCALING_BY_PARAMETER.items():
+        remainder = scaling.subtract_columns(scaled_outputs[index], inputs, columns)
+        columns[index] = remainder / (scaling.input_powers[index] * inputs[index])
+    return columns
+
+
+def scaled_jacobian_columns(
+    function: BatchFunction, inputs: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
+    """Return `jacobian_columns` of a step's section state and durations for all inputs.
+
+    - `inputs`: parameters, then the start;
+    - `input_indices`: all of them, in the order of the returned columns.
+    """
+    computed_indices = [i for i in range(N_STEP_INPUTS) if i not in SCALING_BY_PARAMETER]
+    columns, outputs, aux = jacobian_columns(function, inputs, computed_indices)
+    scaled_outputs = {
+        i: jnp.asarray(scaling.output_powers, outputs.dtype)[:, None] * outputs
+        for i, scaling in SCALING_BY_PARAMETER.items()
+    }
+    columns_by_input = complete_by_scaling(
+        inputs, dict(zip(computed_indices, columns, strict=True)), scaled_outputs
+    )
+    return jnp.stack([columns_by_input[i] for i in input_indices]), outputs, aux

@@ -1,0 +1,204 @@
+"""Derivatives of any order and mode of a function that supports only forward-mode AD.
+
+Loops of unknown length (adaptive steps until an event) have no reverse mode. The rule here forms
+the Jacobian in forward mode, over the inputs that are perturbed, and returns Jacobian times
+tangent. This is linear in the tangent, so `jax.grad` transposes a small matrix instead of a loop.
+The Jacobian itself is wrapped again, so Hessians work in every combination of modes.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
+
+from vrw_jax.numerics.batching import BatchFunction, unbatch
+
+ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
+"""A map from float arrays to (float outputs, other outputs without derivative)."""
+
+
+def enable_all_ad_modes(
+    function: ForwardFunction,
+    function_to_differentiate: ForwardFunction | None = None,
+    make_jacobian: Callable[[tuple[int, ...]], ForwardFunction] | None = None,
+) -> ForwardFunction:
+    """Return `function` with derivatives in forward and reverse mode, to any order.
+
+    `function(*arrays)` must take only floating-point arrays, be differentiable by `jax.jvp` to the
+    requested order, and not close over values that are themselves differentiated. For derivatives,
+    `function_to_differentiate` replaces it, for example the same function with tighter tolerances.
+    `make_jacobian` may return (Jacobian with respect to these arguments, value) and the other
+    outputs in another way. Function and Jacobians are compiled once each: outside of `jit`, forward
+    mode, reverse mode and single directions all call the same compiled Jacobian.
+    """
+    differentiable = function if function_to_differentiate is None else function_to_differentiate
+    compiled_function = jax.jit(function)
+    wrapped_function = jax.custom_jvp(compiled_function)
+
+    @functools.cache
+    def get_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
+        forward_jacobian = _jacobian_function(differentiable, argnums)
+        return (
+            enable_all_ad_modes(forward_jacobian)
+            if make_jacobian is None
+            else enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
+        )
+
+    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+        argnums = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
+        if not argnums:
+            outputs = wrapped_function(*primals)
+            return outputs, zero_tangent(outputs)
+        (jacobian, float_outputs), other_outputs = get_jacobian(argnums)(*primals)
+        tangent = _apply_argument_jacobians(
+            float_outputs, jacobian, tuple(tangents[i] for i in argnums)
+        )
+        return (float_outputs, other_outputs), (tangent, zero_tangent(other_outputs))
+
+    wrapped_function.defjvp(wrapped_jvp, symbolic_zeros=True)
+
+    def call_function(*arrays: Any) -> tuple:
+        is_traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
+        return (
+            wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
+        )  # the custom rule costs as much as a solver step
+
+    return call_function
+
+
+def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
+    """Return a function with the float outputs (Jacobian by argument, value) in one evaluation."""
+
+    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
+        float_outputs, other_outputs = function(*arrays)
+        return float_outputs, (float_outputs, other_outputs)
+
+    def jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
+        argument_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
+            evaluate_with_aux, argnums=argnums, has_aux=True
+        )(*arrays)
+        by_argument = tuple(
+            jax.tree.map(
+                lambda _, argument_jacobian, k=k: argument_jacobian[k],
+                float_outputs,
+                argument_jacobians,
+            )
+            for k in range(len(argnums))
+        )
+        return (by_argument, float_outputs), other_outputs
+
+    return jacobian
+
+
+@jax.jit
+def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tuple) -> PyTree:
+    """Return Jacobians times tangents, leaf by leaf.
+
+    The products are sums, because products of small arrays are library calls.
+    """
+
+    def apply_leaf(_: Array, *leaf_jacobians: Array) -> Array:
+        terms = [
+            jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
+            for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
+        ]
+        return sum(terms[1:], start=terms[0])
+
+    return jax.tree.map(apply_leaf, template, *jacobians)
+
+
+ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
+"""A wrapper that selects the execution of a batch function, given the order of the derivative it
+is."""
+
+
+def with_implicit_derivative(
+    function: BatchFunction, tangents_of: Callable, wrap_execution: ExecutionWrapper, order: int = 0
+) -> Callable:
+    """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
+    mode.
+
+    `function(p, z)` acts on a batch. `tangents_of(p, z)` is dz/dp of one wheel with a leading axis
+    over p, correct wherever z = z(p), and itself made by this function. The rule ignores the
+    tangent of z, which can only be dz/dp times that of p, and returns the total derivative times
+    the tangent of p.
+    """
+    unbatched_function = unbatch(wrap_execution(function, order))
+    wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
+
+    @wrapped_function.defjvp
+    def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
+        jacobian = implicit_jacobian(function, tangents_of, wrap_execution, order + 1)(*primals)
+        return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])
+
+    return wrapped_function
+
+
+def implicit_jacobian(
+    function: BatchFunction,
+    tangents_of: Callable,
+    wrap_execution: ExecutionWrapper,
+    order: int = 1,
+    make_jacobian: BatchFunction | None = None,
+) -> Callable:
+    """Return d function(p, z(p)) / dp with a leading axis over p, differentiable as in
+    `with_implicit_derivative`.
+
+    `make_jacobian(p, (z, dz/dp))` may be a faster evaluation of it.
+    """
+
+    def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
+        """Return the derivatives over a batch, one direction after another, which keeps the code
+        short.
+        """
+        n, (z, dz) = p.shape[0], z_and_jacobian
+        units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
+        return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (units, dz))
+
+    def tangents_of_known(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+        z, dz = z_and_jacobian
+        second_derivatives = jax.jacfwd(tangents_of)(p, z)
+        return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
+
+    jacobian_function = with_implicit_derivative(
+        make_jacobian or jvp_sequentially, tangents_of_known, wrap_execution, order
+    )
+    return lambda p, z: jacobian_function(p, lax.stop_gradient((z, tangents_of(p, z))))
+
+
+def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
+    """Return the outputs of `function`, and the derivatives of its floats on last axes, in one
+    program.
+
+    With several arguments, a leaf's derivatives are a tuple with one entry for each argument.
+    """
+
+    def floats_of(*arguments: Array) -> tuple:
+        floats, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
+        return floats, (floats, other_outputs)
+
+    argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    jacobian, (floats, other_outputs) = jax.jacfwd(floats_of, argnums, has_aux=True)(*arguments)
+    return eqx.combine(floats, other_outputs), jacobian
+
+
+def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
+    """Return the Jacobian (leading axis: inputs) times the tangent, leaf by leaf."""
+    return jax.tree.map(lambda leaf: jnp.tensordot(tangent, leaf, 1), jacobian)
+
+
+def zero_tangent(tree: PyTree) -> PyTree:
+    """Return the zero tangent of any outputs."""
+    zero = lambda x: (
+        jnp.zeros_like(x)
+        if jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+        else np.zeros(jnp.shape(x), jax.dtypes.float0)
+    )
+    return jax.tree.map(zero, tree)

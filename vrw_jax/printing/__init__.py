@@ -1,0 +1,13 @@
+"""How results print themselves."""
+
+from vrw_jax.printing.text import (
+    AbstractPrintable,
+    TextRow,
+    format_html_table,
+    format_markdown_table,
+    format_mathtext,
+    format_numbers,
+    format_outcome_counts,
+    format_quantity,
+    format_text,
+)

@@ -1,0 +1,135 @@
+"""Traced functions saved beside JAX's compilation cache, to avoid tracing at the next start.
+
+JAX's persistent cache avoids compilation but not tracing, which for a limit cycle with derivatives
+takes longer than a scan of thousands. If that cache is on, its folder also contains traces, under a
+key of everything that they depend on, including the library's source.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jax.sharding import SingleDeviceSharding
+
+from vrw_jax import simd
+from vrw_jax.runtime import disk_cache as store
+from vrw_jax.runtime.start import fusion_emitter_options
+
+
+def compile_exported(
+    function: Callable, arguments: tuple, settings: object, device: jax.Device
+) -> Callable:
+    """Return `function` compiled for arguments like these, on `device`.
+
+    The `repr` of `settings` identifies the values in the function's closure.
+
+    The program is always compiled from the exported trace, saved or not, so that all runs compile
+    the same program.
+    """
+    exported_trace = _export_trace(function, arguments, settings)
+    sharding = SingleDeviceSharding(device)
+    argument_specs = [
+        jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding) for x in exported_trace.in_avals
+    ]
+    program = (
+        jax.jit(exported_trace.call).lower(*argument_specs).compile(fusion_emitter_options(False))
+    )
+    return lambda *arguments: program(*jax.tree.leaves(arguments))
+
+
+def cached_trace(function: Callable, settings: object) -> Callable:
+    """Return `function` without tracing it if its trace is saved; it is called while a program is
+    traced.
+
+    It is for functions that are neither mapped nor differentiated from outside. As with
+    `compile_exported`, first and later runs use the exported trace.
+    """
+
+    def call_cached(*arguments: Any) -> Any:
+        if _is_exporting.get() or not store.cache_folder():
+            return function(*arguments)
+        return _export_trace(function, arguments, settings).call(*jax.tree.leaves(arguments))
+
+    return call_cached
+
+
+def cached_lane_program(
+    function: Callable,
+    scalar_dtypes: Sequence[np.dtype],
+    n_lanes_in: int,
+    dtype: np.dtype,
+    settings: Any,
+    max_unrolled: int = simd.MAX_UNROLLED,
+) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
+    """Return `simd.compile_lane_program` of this library's functions, saved in the cache folder.
+
+    `settings` are those of `compile_exported`.
+    """
+    key = (settings, store.source_digest())
+    return simd.compile_lane_program(
+        function, scalar_dtypes, n_lanes_in, dtype, key, store, max_unrolled
+    )
+
+
+def cached_lane_function(
+    function: Callable,
+    shape_function: Callable,
+    settings: object,
+    max_unrolled: int = simd.MAX_UNROLLED,
+) -> Callable:
+    """Return `simd.compile_lane_function` of this library's functions, saved in the
+    cache folder.
+    """
+    return simd.compile_lane_function(
+        function, shape_function, (settings, store.source_digest()), store, max_unrolled
+    )
+
+
+def _export_trace(function: Callable, arguments: tuple, settings: object) -> export.Exported:
+    """Return the exported trace of `function` for arguments like these, with flat arguments."""
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+    # A trace calls the machine code of one processor: others may share the folder.
+    platform = (jax.default_backend(), simd.describe_processor() if simd.is_available() else None)
+    key_parts = (settings, str(structure), shapes, jax.__version__, platform, store.source_digest())
+    name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
+    content = store.load_bytes(name)
+    if content is not None:
+        names, _, trace = content.partition(b"\n")
+        if simd.ensure_loaded(names.decode().split(), store):
+            return export.deserialize(bytearray(trace))
+    flat_function = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
+    token = _is_exporting.set(True)  # cached traces called within are part of this trace
+    try:
+        code_names = sorted(
+            _machine_code_names(flat_function.trace(*shapes).jaxpr)
+        )  # traced once: the export below finds it in JAX's cache
+        allowed_checks = [export.DisabledSafetyCheck.custom_call(name) for name in code_names]
+        exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(*shapes)
+    finally:
+        _is_exporting.reset(token)
+    store.save_bytes(
+        name, " ".join(code_names).encode() + b"\n" + bytes(exported_trace.serialize())
+    )
+    return exported_trace
+
+
+def _machine_code_names(trace: Any) -> set[str]:
+    """Return the names of the machine code that a trace calls."""
+    trace = getattr(trace, "jaxpr", trace)
+    names = {
+        e.params["code"].name for e in trace.eqns if e.primitive is simd.MACHINE_CODE_PRIMITIVE
+    }
+    for equation in trace.eqns:
+        for leaf in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):
+                names |= _machine_code_names(leaf)
+    return names
+
+
+_is_exporting: ContextVar[bool] = ContextVar("_exporting", default=False)

@@ -1,0 +1,214 @@
+"""Steady gaits of many wheels: one compiled function over a batch of fixed size.
+
+The samples are divided into batches of `WHEELS_PER_BATCH` wheels, and the last batch is padded. The
+same compiled code evaluates every batch, so the result of a sample depends neither on its position
+nor on the other samples.
+
+Batches run in parallel: one thread per core, all with one compiled program, or one thread per GPU.
+"""
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome, make_finder
+from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import compile_exported
+from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
+
+WHEELS_PER_BATCH = 512
+"""Number of wheels that one call of the compiled function evaluates."""
+
+GaitOutputs = tuple[Array, Array, dict[str, Array]]
+"""Outcome, section state, and measures by name."""
+
+
+class EvaluationRequest(NamedTuple):
+    """Measures to compute for each sample, with the wheel, the model and the options."""
+
+    measures: tuple[str, ...]
+    base: WheelParams
+    model: Any
+    options: StepOptions
+    cycle_options: CycleOptions
+    tol: float | None  # permitted error of the measures, in their units
+
+
+class CollocationEngine:
+    """Engine for the paper's model and a fixed set of measures, compiled at the first call.
+
+    It finds the limit cycle with the requested derivatives by collocation. It then takes one
+    event-driven step from the cycle, for the margins and as a check. Both functions are compiled in
+    parallel.
+    """
+
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
+        """Initialize; `threads` is the number of CPU threads, by default one per core."""
+        measures, base, model, options, cycle_options, _ = request
+        self._threads = count_cores() if threads is None else threads
+        self._base, self._model, self._options = base, model, options
+        requested_derivatives = tuple(
+            d for name in measures if (d := parse_derivative(name)) is not None
+        )
+        measure_names = tuple(name for name in measures if parse_derivative(name) is None)
+        parameters = tuple(dict.fromkeys(d.parameter for d in requested_derivatives))
+        indices = np.asarray([PARAMETER_NAMES.index(name) for name in parameters], int)
+
+        finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+
+        def find_cycle_with_derivatives(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
+            """Return the limit cycle of one wheel and the requested derivatives."""
+
+            def find_measures_and_cycle(
+                swept_values: Array,
+            ) -> tuple[dict[str, Array], AbstractCycle]:
+                cycle = finder.find_cycle_from_values(values.at[indices].set(swept_values))
+                return cycle.measures(d.measure for d in requested_derivatives), cycle
+
+            if not requested_derivatives:
+                return find_measures_and_cycle(values[indices])[1], {}
+            jacobian, cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(values[indices])
+            return cycle, {
+                d.name: jacobian[d.measure][parameters.index(d.parameter)]
+                for d in requested_derivatives
+            }
+
+        def evaluate_cycle(values: Array) -> GaitOutputs:
+            """Return outcome, section state and measures that the limit cycle gives."""
+            cycle, derivative_values = find_cycle_with_derivatives(values)
+            names = (
+                *(name for name in measure_names if name in DIFFERENTIABLE_MEASURES),
+                "spectral_radius",
+            )
+            return cycle.outcome, cycle.section_state, cycle.measures(names) | derivative_values
+
+        def evaluate_step(values: Array, state: Array, options: StepOptions) -> GaitOutputs:
+            """Return outcome, section state and measures that a step from the cycle gives."""
+            result = model.take_step(wheel_from_parameters(values, base.n_legs), state, options)
+            measures = result.measures()
+            names = (
+                *(name for name in measure_names if name not in DIFFERENTIABLE_MEASURES),
+                *MARGIN_MEASURES,
+            )
+            return result.outcome, result.section_state, {name: measures[name] for name in names}
+
+        self._evaluate_cycle: Callable = jax.vmap(evaluate_cycle)
+        self._evaluate_step: Callable = jax.vmap(evaluate_step, in_axes=(0, 0, None))
+        # The repr of a model omits defaults by identity, and pickling does not preserve identity.
+        model_identity = (type(model).__name__, *vars(model).items())
+        self._cache_key = (measures, base.n_legs, model_identity, cycle_options)
+        self._free_programs: SimpleQueue[_CompiledPrograms] = SimpleQueue()
+        self._n_workers, self._compilation_lock = 0, Lock()
+
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
+        rows = stack_parameters(columns, self._model, self._base)
+        with self._compilation_lock:
+            if not self._n_workers:
+                self._compile()
+        batches = (
+            rows[begin : begin + WHEELS_PER_BATCH]
+            for begin in range(0, len(rows), WHEELS_PER_BATCH)
+        )
+        with ThreadPoolExecutor(self._n_workers) as pool:
+            parts = list(pool.map(self._evaluate_batch, batches))
+        return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
+
+    def _evaluate_batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the results of a batch, which is padded with copies of its first wheel."""
+        padded_rows = np.concatenate([rows, np.repeat(rows[:1], WHEELS_PER_BATCH - len(rows), 0)])
+        programs = self._free_programs.get()
+        try:
+            values = jax.device_put(padded_rows, programs.device)
+            outcome, state, cycle_measures = programs.evaluate_cycle(values)
+            options = jax.device_put(self._options, programs.device)
+            step_outcome, step_state, step_measures = programs.evaluate_step(values, state, options)
+            confirmed_outcome = confirm_outcome(outcome, state, step_outcome, step_state)
+            measures = cycle_measures | step_measures
+        finally:
+            self._free_programs.put(programs)
+        return mask_failures(confirmed_outcome, measures)
+
+    def _compile(self) -> None:
+        """Compile both functions in parallel for each device; all cores of a CPU share them."""
+        devices = jax.local_devices()
+        values = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, len(PARAMETER_NAMES)), self._dtype)
+        state = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, 3), self._dtype)
+        cache_key = self._cache_key
+        with ThreadPoolExecutor(2) as pool:
+            step_arguments = (values, state, self._options)
+            steps = [
+                pool.submit(
+                    compile_exported,
+                    self._evaluate_step,
+                    step_arguments,
+                    ("step", *cache_key),
+                    device,
+                )
+                for device in devices
+            ]
+            cycles = [
+                pool.submit(
+                    compile_exported, self._evaluate_cycle, (values,), ("cycle", *cache_key), device
+                )
+                for device in devices
+            ]
+        for device, cycle, step in zip(devices, cycles, steps, strict=True):
+            n = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
+            for _ in range(n):
+                self._free_programs.put(_CompiledPrograms(device, cycle.result(), step.result()))
+            self._n_workers += n
+
+    @property
+    def _dtype(self) -> np.dtype:
+        """Return the floating-point type of the parameters."""
+        return np.dtype(self._base.damping.dtype)
+
+
+class _CompiledPrograms(NamedTuple):
+    """Compiled functions of one device."""
+
+    device: jax.Device
+    evaluate_cycle: Callable
+    evaluate_step: Callable
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def stack_parameters(
+    columns: Mapping[str, np.ndarray], model: AbstractWheel, base: WheelParams
+) -> np.ndarray:
+    """Return the model's parameters of each sample, shape (samples, parameters)."""
+    n = len(next(iter(columns.values())))
+    base_values = np.asarray(model.parameter_values(base))
+    return np.stack(
+        [
+            np.asarray(columns.get(name, np.broadcast_to(value, n)), base_values.dtype)
+            for name, value in zip(model.parameter_names, base_values, strict=True)
+        ],
+        axis=-1,
+    )
+
+
+def mask_failures(outcome: np.ndarray, values_by_name: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return outcome and measures; a sample without a gait gets NaN, or -1 in an integer."""
+    measures = {name: np.array(value) for name, value in values_by_name.items()}
+    for value in measures.values():
+        missing_value = np.nan if np.issubdtype(value.dtype, np.floating) else -1
+        value[outcome != Outcome.STEPPED] = missing_value
+    return {"outcome": outcome.astype(np.int8)} | measures

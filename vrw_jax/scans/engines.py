@@ -1,0 +1,221 @@
+"""Steady gaits of many wheels with unilateral contact, and with the simplest valid model for each.
+
+With unilateral contact the result is the gait to which a slow start converges, or the slowest gait
+of all starts. For the simplest valid model, the paper's model evaluates all samples first. The
+samples that violate a margin are then evaluated with unilateral contact.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycles import (
+    MeasureReader,
+    ReturnMapCycle,
+    evaluate_on_gaits,
+    find_slow_gaits,
+    make_finder,
+)
+from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.numerics import map_in_batches
+from vrw_jax.scans.collocation_engine import (
+    CollocationEngine,
+    EvaluationRequest,
+    count_cores,
+    mask_failures,
+    stack_parameters,
+)
+from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
+from vrw_jax.selection import UNILATERAL_MODEL, VISCOELASTIC_MODEL, find_selection_reason
+from vrw_jax.tolerance import RIGID_MODEL_INDEX, measure_to_tolerance
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
+
+SAMPLES_PER_TASK, GAITS_PER_READ = 512, 64
+"""Number of samples per task of a thread, and number of gaits whose measures are read in one call;
+fixed, so that the result of a sample does not depend on the other samples."""
+
+SampleMapping = Mapping[str, np.ndarray]
+"""Swept parameters by name, with one value per sample."""
+ResultColumns = dict[str, np.ndarray]
+"""Results by variable, with one value per sample."""
+
+
+class UnilateralEngine:
+    """Engine for unilateral contact and a fixed set of measures."""
+
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
+        measures, base, model, options, *_ = request  # walks find these gaits
+        self._base, self._model = base, model
+        self._threads = count_cores() if threads is None else threads
+        derivatives = tuple(d for name in measures if (d := parse_derivative(name)) is not None)
+        measure_names = (*(n for n in measures if parse_derivative(n) is None), "spectral_radius")
+
+        finder: Any = make_finder(model, base.n_legs, step_options=options)
+        self._finder = dataclasses.replace(finder, batch_sizes=(GAITS_PER_READ,))
+        read = type(finder).read
+        self._measure_reader, self._derivatives = MeasureReader(read, measure_names), derivatives
+        self._derivative_reader = MeasureReader(
+            read, tuple(dict.fromkeys(d.measure for d in derivatives))
+        )
+
+    def __call__(self, columns: SampleMapping) -> ResultColumns:
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
+        values = stack_parameters(columns, self._model, self._base)
+        parts = np.array_split(values, max(self._threads, -(-len(values) // SAMPLES_PER_TASK)))
+        first_part, *other_parts = (part for part in parts if len(part))
+        results = [self._evaluate_part(first_part)]  # the first call compiles for all threads
+        with ThreadPoolExecutor(self._threads) as pool:
+            results += pool.map(self._evaluate_part, other_parts)
+        return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
+
+    def _evaluate_part(self, values: np.ndarray) -> ResultColumns:
+        """Return the results of the gait to which slow starts of each sample converge."""
+        # Friction balances the weight along the slope over a period; with less there is no gait.
+        friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
+        has_enough_friction = friction >= np.tan(slope)
+        results = self._evaluate_gaits(
+            values[has_enough_friction] if has_enough_friction.any() else values[:1]
+        )
+        row = np.maximum(np.cumsum(has_enough_friction) - 1, 0)  # any row if there is no gait
+        results_of_all = {name: leaf[row] for name, leaf in results.items()}
+        outcome = np.where(
+            has_enough_friction, results_of_all.pop("outcome"), Outcome.NO_CYCLE_FOUND
+        )
+        return mask_failures(outcome, results_of_all)
+
+    def _evaluate_gaits(self, values: np.ndarray) -> ResultColumns:
+        """Return outcome, measures and derivatives of the gaits of wheels, shape (wheels,)."""
+        cycle = find_slow_gaits(self._finder, values)
+        results = map_in_batches(
+            lambda cycles: _read_measures(self._measure_reader, cycles), (GAITS_PER_READ,), cycle
+        )
+        if self._derivatives:
+            differentiable_cycles = self._finder.find_gaits(
+                jnp.asarray(values), cycle.section_state
+            )
+            _, jacobians = map_in_batches(
+                lambda cycles: evaluate_on_gaits(self._derivative_reader, cycles),
+                (GAITS_PER_READ,),
+                differentiable_cycles,
+            )
+            names = self._model.parameter_names
+            for d in self._derivatives:
+                results[d.name] = jacobians[d.measure][:, names.index(d.parameter)]
+        results["outcome"] = cycle.outcome
+        return {name: np.asarray(leaf) for name, leaf in results.items()}
+
+
+@eqx.filter_jit
+def _read_measures(reader: MeasureReader, cycle: ReturnMapCycle) -> dict[str, Array]:
+    """Return the measures of a batch of gaits."""
+    first_step = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
+    return eqx.filter_vmap(reader)(cycle, first_step)
+
+
+PAPER_MEASURE_SUMS: dict[str, tuple[str, ...]] = {
+    "duration_single": ("duration_sls1", "duration_sls2"),
+    "duration_flight": (),
+    "slip": (),
+    "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
+    "energy_lost_friction": (),
+}
+"""Measures with unilateral contact as sums of measures of the paper's model."""
+
+
+class LadderEngine:
+    """Engine that evaluates each sample with the simplest valid model."""
+
+    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
+        self._measures, self._base, self._model, *_ = request
+        self._paper_model = ViscoelasticWheel()
+        parts = (
+            part for name in request.measures for part in PAPER_MEASURE_SUMS.get(name, (name,))
+        )
+        paper_request = request._replace(
+            measures=tuple(dict.fromkeys(parts)), model=self._paper_model
+        )
+        self._paper_engine = CollocationEngine(paper_request, threads)
+        self._unilateral_engine = UnilateralEngine(
+            request._replace(model=request.model.fallback_model), threads
+        )
+
+    def __call__(self, columns: SampleMapping) -> ResultColumns:
+        """Return the results by variable, with `rung` and `reason` of each sample."""
+        n = len(next(iter(columns.values())))
+        friction = columns.get(FRICTION_NAME, np.full(n, float(self._model.friction)))
+        paper_results = self._paper_engine(
+            {"damping": np.full(n, float(self._base.damping))}
+            | {name: column for name, column in columns.items() if name != FRICTION_NAME}
+        )
+        reason = self.find_reasons(paper_results, friction)
+        rung = np.where(reason == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(np.int8)
+        names = (*self._measures, "outcome", "spectral_radius")
+        results = {
+            name: sum((paper_results[part] for part in PAPER_MEASURE_SUMS[name]), start=np.zeros(n))
+            if name in PAPER_MEASURE_SUMS
+            else paper_results[name]
+            for name in names
+        }
+        unilateral_samples = np.flatnonzero(rung == UNILATERAL_MODEL)
+        if unilateral_samples.size:
+            unilateral_results = self._unilateral_engine(
+                {name: column[unilateral_samples] for name, column in columns.items()}
+            )
+            for name in names:
+                results[name][unilateral_samples] = unilateral_results[name]
+        return results | {"rung": rung, "reason": reason}
+
+    def find_reasons(self, paper_results: ResultColumns, friction: np.ndarray) -> np.ndarray:
+        """Return `ModelChoice.reason` of each gait of the paper's model, over its repeated step."""
+        reason, _ = find_selection_reason(paper_results, friction - self._paper_model.friction)
+        return np.asarray(reason, np.int8)
+
+
+class ToleranceEngine:
+    """Engine of measures to a tolerance; see `vrw.measure_to_tolerance`."""
+
+    def __init__(self, request: EvaluationRequest) -> None:
+        self._measures, self._base, self._model, *_, tol = request
+        assert tol is not None  # the caller has checked it
+        self._tol = tol
+
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the results by variable; `columns` has one value per sample of each parameter."""
+        *wheel_columns, friction = stack_parameters(columns, self._model, self._base).T
+        params = wheel_from_parameters(tuple(map(jnp.asarray, wheel_columns)), self._base.n_legs)
+        stoppers = self._model.stoppers
+        measured = measure_to_tolerance(
+            self._measures, params, self._tol, friction=friction, stoppers=stoppers
+        )
+        results = {name: measured.values[:, i] for i, name in enumerate(self._measures)}
+        results |= {
+            error_variable_name(name): measured.errors[:, i]
+            for i, name in enumerate(self._measures)
+        }
+        rung = np.maximum(measured.models - RIGID_MODEL_INDEX, 0).astype(np.int8)
+        return mask_failures(measured.outcomes, results | {"rung": rung})
+
+
+def make_engine(
+    request: EvaluationRequest, threads: int | None = None
+) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine:
+    """Return the engine for the samples of a scan of this model, or to a tolerance."""
+    if request.tol is not None:
+        return ToleranceEngine(request)
+    engine_class: Any = ENGINE_CLASSES[request.model.model_name]
+    return engine_class(request, threads)
+
+
+ENGINE_CLASSES = {
+    "viscoelastic": CollocationEngine,
+    "unilateral": UnilateralEngine,
+    "ladder": LadderEngine,
+}
+"""Engine classes by model, for the models that a scan supports."""

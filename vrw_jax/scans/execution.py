@@ -1,0 +1,245 @@
+"""Scans: the steady gait of every sample of a design, as one labelled dataset.
+
+A scan is divided into chunks, which the same compiled function computes. If a store is given, each
+chunk is written as soon as it is computed. An interrupted scan continues with the missing chunks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vrw_jax.cycles import CycleOptions
+from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.scans.design import AbstractDesign
+from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
+from vrw_jax.scans.planning import (
+    ChunkExecutor,
+    ChunkResult,
+    ScanPlan,
+    describe_difference,
+    describe_environment,
+    plan_scan,
+)
+from vrw_jax.scans.store import (
+    PROVENANCE_ATTRIBUTE,
+    AbstractStore,
+    MemoryStore,
+    ZarrStore,
+    create_store,
+    read_stored_manifest,
+)
+from vrw_jax.simulation import ModelLike
+from vrw_jax.wheel import Outcome, WheelParams
+
+ProgressCallback = Callable[["ScanProgress"], None]
+"""Function that is called with the progress after each chunk."""
+
+
+@dataclass(frozen=True)
+class ScanProgress:
+    """Progress of a scan, as numbers of samples."""
+
+    n_samples: int  # samples to compute in this run
+    n_done: int  # samples computed in this run
+    n_failed: int  # computed samples without a steady gait
+    n_reused: int  # samples that an earlier run computed
+
+
+def scan(
+    design: AbstractDesign,
+    measures: Iterable[str] | None = None,
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    store: str | Path | None = None,
+    chunk: int | None = None,
+    report: ProgressCallback | None = None,
+    dask: str | None = None,
+    tol: float | None = None,
+) -> xr.Dataset:
+    """Return the steady gait of every sample with its outcome and margins, as a labelled dataset.
+
+    `measures` are names (see `vrw_jax.scans.measure_catalog`), including derivatives as in
+    'd dls_fraction / d damping'. The variables have the requested names and order. The result of a
+    sample depends neither on other samples nor on `chunk`.
+
+    If `store` is given, the result is written there chunk by chunk. An interrupted scan continues
+    where it stopped and ends with bitwise the same data. A finished scan is only opened, but its
+    damaged chunks are computed again, with a warning.
+
+    `model` may be a `UnilateralWheel`, for which each sample walks to its gait. It may be "auto",
+    which gives each sample the simplest valid model and adds the variables `rung` and `reason`.
+    Both accept `friction` as a swept parameter.
+
+    Args:
+        design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
+        measures: names of the measures; by default DLS fraction, speed and the like.
+        base: the wheel whose parameters are not swept; Table 1 by default.
+        model: the model; "auto" for the simplest valid model of each sample.
+        options: numerical options of the steps that check the gaits.
+        cycle_options: numerical options of the gaits.
+        store: folder that holds the result.
+        chunk: number of samples that are written at a time; 4,096 by default.
+        on_progress: function that is called with the `ScanProgress` after each chunk.
+        dask: address of a dask cluster that computes the chunks, or "local" to start one.
+        tol: permitted error of each measure, in its unit, with respect to a `UnilateralWheel`. Each
+            sample is computed by the simplest model whose error bound permits it (see
+            `vrw.measure_to_tolerance`). The dataset holds `rung` and the errors, such as
+            `speed_error`.
+
+    Returns:
+        A dataset over the axes of the design.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if the store holds another scan or is
+            locked by another process; the message names the remedy.
+
+    Examples:
+        >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
+        >>> gaits.speed.round(3).values.tolist(), gaits.outcome.values.tolist()
+        ([1.018, nan], [0, 14])
+    """
+    scan_plan = plan_scan(
+        design,
+        measures,
+        base=base,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+        chunk=chunk,
+        tol=tol,
+    )
+    with resolve_executor(dask) as executor:
+        return run_scan(scan_plan, store, on_progress=report, executor=executor)
+
+
+def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
+    """Return the context of a dask cluster's workers, or of None if this process computes."""
+    if dask is None:
+        return contextlib.nullcontext()
+    from vrw_jax.scans.dask import connect_workers
+
+    return connect_workers(dask)
+
+
+def run_scan(
+    scan_plan: ScanPlan,
+    store: str | Path | AbstractStore | None = None,
+    *,
+    on_progress: ProgressCallback | None = None,
+    executor: ChunkExecutor | None = None,
+) -> xr.Dataset:
+    """Return the dataset of a plan, computed in this process or by `executor`."""
+    storage = store if isinstance(store, AbstractStore) else _open_storage(scan_plan, store)
+    missing = storage.find_missing_chunks()
+    if missing or storage.damage_description:
+        with storage.open_for_writing():
+            _compute_chunks(
+                scan_plan, storage, missing, on_progress, executor or _compute_in_process
+            )
+    return storage.load_dataset()
+
+
+def _open_storage(scan_plan: ScanPlan, store: str | Path | None) -> AbstractStore:
+    """Return the storage of a scan; warn if some of its chunks are damaged."""
+    if store is None:
+        return MemoryStore(scan_plan.layout, scan_plan.attrs)
+    storage = open_or_create_store(scan_plan, Path(store))
+    if storage.damage_description:
+        warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=4)
+    return storage
+
+
+def _compute_chunks(
+    scan_plan: ScanPlan,
+    storage: AbstractStore,
+    missing: list[int],
+    on_progress: ProgressCallback | None,
+    executor: ChunkExecutor,
+) -> None:
+    """Compute the missing chunks and write them, with a report after each."""
+    shapes = {index: scan_plan.layout.shape_of_chunk(index) for index in missing}
+    n_samples, n_done, n_failed = sum(map(math.prod, shapes.values())), 0, 0
+    if on_progress is not None:
+        on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
+    for index, results in executor(scan_plan, missing):
+        shape = shapes[index]
+        block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
+        with _explain_full_disk(storage, scan_plan.layout.n_chunks):
+            storage.write_chunk(index, block)
+        n_done += math.prod(shape)
+        n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+        if on_progress is not None:
+            on_progress(
+                ScanProgress(n_samples, n_done, n_failed, scan_plan.design.size - n_samples)
+            )
+
+
+def _compute_in_process(scan_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
+    """Yield the missing chunks, computed one after another in this process."""
+    engine = scan_plan.build_engine()
+    for index in missing:
+        yield index, engine(scan_plan.design.sample_block(scan_plan.layout.chunk_region(index)))
+
+
+def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
+    """Return the store at `path`, created if there is none; raise if it holds another scan."""
+    storage = find_store(scan_plan, path)
+    if storage is None:
+        create_store(path, scan_plan.layout, scan_plan.attrs)
+        storage = find_store(scan_plan, path)
+        assert storage is not None
+    manifest = read_stored_manifest(path) or {}
+    setting_difference = describe_difference(manifest[PROVENANCE_ATTRIBUTE], describe_environment())
+    missing = len(storage.find_missing_chunks())
+    if setting_difference and missing:
+        damaged_text = (
+            f" ({len(storage.damaged_chunks)} of them damaged)" if storage.damaged_chunks else ""
+        )
+        raise ValueError(
+            f"{path} lacks {missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
+            f"was begun by other means, so that its last digits might not fit: {setting_difference}. "
+            "Go on with what it was begun with, or begin anew in another place."
+        )
+    return storage
+
+
+def find_store(scan_plan: ScanPlan, path: Path, verify: bool = True) -> ZarrStore | None:
+    """Return the store at `path`, or None if there is none; raise if it holds another scan."""
+    manifest = read_stored_manifest(path)
+    if manifest is None:
+        return None
+    setting_difference = describe_difference(manifest[MANIFEST_ATTRIBUTE], scan_plan.settings)
+    if setting_difference:
+        raise ValueError(
+            f"{path} holds a scan made with other settings: {setting_difference}. "
+            "Give another place for this scan, or go back to those settings, or delete the store."
+        )
+    return ZarrStore(path, scan_plan.layout, verify)
+
+
+@contextlib.contextmanager
+def _explain_full_disk(storage: AbstractStore, n_chunks: int) -> Iterator[None]:
+    """Replace the error of a full disk by one that names the number of complete chunks."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        n_done = n_chunks - len(storage.find_missing_chunks())
+        raise OSError(
+            error.errno,
+            f"no space is left for {storage.location}, where {n_done} chunks are complete: make room and "
+            "run the same again, it goes on from there",
+        ) from error

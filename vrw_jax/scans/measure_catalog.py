@@ -1,0 +1,200 @@
+"""Measures that a scan can compute: those of the steady gait, and their derivatives, by name."""
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from vrw_jax.cycles import CollocationFinder
+from vrw_jax.measures import (
+    MARGIN_MEASURES,
+    MEASURES,
+    STEP_MEASURES,
+    UNILATERAL_DIFFERENTIABLE_NAMES,
+    measure_attrs,
+)
+from vrw_jax.models import AbstractWheel
+from vrw_jax.selection import SELECTION_ATTRS
+from vrw_jax.tolerance import MEASURE_FUNCTIONS
+from vrw_jax.validation import suggest_name
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
+
+ALWAYS_INCLUDED = ("outcome", "spectral_radius", *MARGIN_MEASURES)
+"""Variables of every scan, requested or not: outcome, stability and margins of the gait."""
+
+DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
+"""Measures that are computed from the limit cycle itself; these have derivatives."""
+
+REQUESTABLE_MEASURES = (
+    *DIFFERENTIABLE_MEASURES,
+    *(name for name in STEP_MEASURES if name not in (*DIFFERENTIABLE_MEASURES, "outcome")),
+)
+
+DEFAULT_MEASURES = (
+    "dls_fraction",
+    "speed",
+    "period",
+    "step_length",
+    "duration_dls",
+    "duration_sls1",
+    "duration_sls2",
+    "lambda_I4",
+    "lambda_2_plus",
+    "lambda_4_plus",
+)
+
+
+class MeasureCatalog(NamedTuple):
+    """Names of the variables that a scan of one model can compute."""
+
+    requestable: tuple[str, ...]
+    always_included: tuple[str, ...]  # in every scan, requested or not
+    differentiable: tuple[str, ...]
+    differentiation_parameters: tuple[
+        str, ...
+    ]  # parameters with respect to which derivatives are taken
+    default_measures: tuple[str, ...]
+    forecast_samples_per_core: int  # samples per core that a forecast computes
+
+
+_CONTACT_DEFAULT_MEASURES = (
+    "dls_fraction",
+    "speed",
+    "period",
+    "step_length",
+    "slip",
+    "energy_lost_impacts",
+)
+PAPER_CATALOG = MeasureCatalog(
+    REQUESTABLE_MEASURES,
+    ALWAYS_INCLUDED,
+    DIFFERENTIABLE_MEASURES,
+    PARAMETER_NAMES,
+    DEFAULT_MEASURES,
+    1024,
+)
+UNILATERAL_CATALOG = MeasureCatalog(
+    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
+    ("outcome", "spectral_radius"),
+    UNILATERAL_DIFFERENTIABLE_NAMES,
+    (*PARAMETER_NAMES, FRICTION_NAME),
+    _CONTACT_DEFAULT_MEASURES,
+    16,
+)
+LADDER_CATALOG = MeasureCatalog(
+    (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
+    ("outcome", "spectral_radius", *SELECTION_ATTRS),
+    tuple(name for name in UNILATERAL_DIFFERENTIABLE_NAMES if name in DIFFERENTIABLE_MEASURES),
+    PARAMETER_NAMES,
+    _CONTACT_DEFAULT_MEASURES,
+    64,
+)
+CATALOGS = {
+    "viscoelastic": PAPER_CATALOG,
+    "unilateral": UNILATERAL_CATALOG,
+    "ladder": LADDER_CATALOG,
+}
+"""Catalogs by model, for the models with compliant legs."""
+TOLERANCE_CATALOG = MeasureCatalog(
+    tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
+)
+"""Catalog of scans to a tolerance, in which each measure has an error."""
+ERROR_SUFFIX = "_error"
+"""Suffix of the variable that holds the error of a measure."""
+
+
+def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCatalog:
+    """Return the catalog of a model, or that of scans to a tolerance if `tol` is given."""
+    return CATALOGS[model.model_name] if tol is None else TOLERANCE_CATALOG
+
+
+def error_variable_name(measure: str) -> str:
+    """Return the name of the variable that holds the error of a measure."""
+    return measure + ERROR_SUFFIX
+
+
+_DERIVATIVE_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
+
+
+class MeasureDerivative(NamedTuple):
+    """Derivative of a measure with respect to a parameter, along the branch of limit cycles."""
+
+    measure: str
+    parameter: str
+
+    @property
+    def name(self) -> str:
+        """Return the name of the variable that holds the derivative."""
+        return f"d_{self.measure}_d_{self.parameter}"
+
+    @property
+    def attrs(self) -> dict[str, object]:
+        """Return unit, name, symbol and description of the derivative."""
+        above, below = MEASURES[self.measure], MEASURES[self.parameter]
+        units = {unit for unit in (above.unit, below.unit) if unit != "1"}
+        unit = "1" if not units else above.unit if below.unit == "1" else None
+        return {
+            "units": unit or f"{above.unit}/({below.unit})",
+            "long_name": f"derivative of {above.long_name} by {below.long_name}",
+            "symbol": f"∂({above.symbol})/∂{below.symbol}",
+            "description": "Along the branch of limit cycles, by the implicit function theorem.",
+        }
+
+
+def parse_derivative(name: str) -> MeasureDerivative | None:
+    """Return the derivative named as in 'd dls_fraction / d damping', or None for a measure."""
+    match = _DERIVATIVE_PATTERN.fullmatch(name.strip())
+    return MeasureDerivative(*match.groups()) if match else None
+
+
+def canonicalize_name(name: str) -> str:
+    """Return the name of the variable that holds `name`, as a name that a file system accepts."""
+    requested_derivative = parse_derivative(name)
+    return name.strip() if requested_derivative is None else requested_derivative.name
+
+
+def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, ...]:
+    """Return the variables' names, each once and without those in every scan; raise if unknown."""
+    checked_names: dict[str, None] = {}
+    known_names = (*catalog.requestable, *catalog.always_included)
+    for name in names:
+        requested_derivative = parse_derivative(name)
+        if requested_derivative is None:
+            if name not in known_names:
+                raise ValueError(
+                    f"{name!r} is no measure of a scan{suggest_name(name, known_names)}: "
+                    f"choose from {', '.join(catalog.requestable)}, or a derivative such as "
+                    "'d dls_fraction / d damping'."
+                )
+            if name not in catalog.always_included:
+                checked_names[name] = None
+            continue
+        if not catalog.differentiable:
+            raise ValueError(
+                f"{name!r} is a derivative, but a scan to a tolerance computes only measures: "
+                "drop it, or scan without tol."
+            )
+        if requested_derivative.measure not in catalog.differentiable:
+            raise ValueError(
+                f"{name!r} asks for a derivative of {requested_derivative.measure!r}"
+                f"{suggest_name(requested_derivative.measure, catalog.differentiable)}, but a scan differentiates only "
+                f"{', '.join(catalog.differentiable)}: choose one of these."
+            )
+        if requested_derivative.parameter not in catalog.differentiation_parameters:
+            raise ValueError(
+                f"{name!r} asks for a derivative by {requested_derivative.parameter!r}"
+                f"{suggest_name(requested_derivative.parameter, catalog.differentiation_parameters)}, but it must be by a parameter: "
+                f"choose from {', '.join(catalog.differentiation_parameters)}."
+            )
+        checked_names[requested_derivative.name] = None
+    return tuple(checked_names)
+
+
+def get_variable_attrs(name: str) -> dict[str, object]:
+    """Return unit, name and description of the variable `name` of a scan."""
+    if name in SELECTION_ATTRS:
+        return dict(SELECTION_ATTRS[name])
+    if name.removesuffix(ERROR_SUFFIX) in MEASURE_FUNCTIONS and name.endswith(ERROR_SUFFIX):
+        measure = MEASURES[name.removesuffix(ERROR_SUFFIX)]
+        return {"units": measure.unit, "long_name": f"bound of the error of {measure.long_name}"}
+    requested_derivative = parse_derivative(name)
+    return measure_attrs(name) if requested_derivative is None else requested_derivative.attrs

@@ -1,0 +1,380 @@
+"""The ladder: a wheel that takes each step by the lowest model whose assumptions hold over the
+step.
+
+The viscoelastic model takes the step and measures its margins. If one is violated, the unilateral
+model takes the step again. Under `vmap` the choice is made per batch element, and an element for
+which the viscoelastic model holds costs no work in the unilateral model. The rigid model is never
+chosen, because its assumption of rigid legs fails for every finite stiffness.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.contact import (
+    CONTACT_OFF,
+    CONTACT_STICK,
+    LOCKED_CODE_OFFSET,
+    FullState,
+    UnilateralStep,
+    UnilateralTrajectory,
+    UnilateralWheel,
+    embed_section_state,
+)
+from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.models import (
+    PAPER_START,
+    AbstractContactStep,
+    AbstractWheel,
+    AdvanceResult,
+    StepResult,
+    ViscoelasticWheel,
+    replace_invalid,
+)
+from vrw_jax.numerics import RealInput, Scalar, StepOptions
+from vrw_jax.printing import AbstractPrintable, TextRow
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+
+RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL = 0, 1, 2
+"""Codes of the models; 0 is the rigid one."""
+
+SELECTION_MARGINS: dict[str, str] = {
+    name: MARGIN_MEASURES[name].violation
+    for name in (
+        "fore_foot_force",
+        "clearance_sls1",
+        "clearance_sls2",
+        "contraction",
+        "friction_fore",
+        "friction_rear",
+        "landing_friction_fore",
+        "landing_friction_rear",
+    )
+}
+"""Margins of the assumptions that only the viscoelastic model makes, with the text of a
+violation."""
+
+REASON_START_NOT_EMBEDDABLE = 1 + len(SELECTION_MARGINS)
+"""Reason code of a start that is not a section state of the viscoelastic model."""
+
+
+SELECTION_ATTRS: dict[str, dict[str, object]] = {
+    "rung": {
+        "long_name": "rung that served",
+        "flag_values": [RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL],
+        "flag_meanings": "RigidWheel ViscoelasticWheel UnilateralWheel",
+    },
+    "reason": {
+        "long_name": "why that rung served",
+        "units": "1",
+        "description": "0: all premises of the paper's wheel hold; above: the first that breaks, "
+        f"of {', '.join(SELECTION_MARGINS)}; below: minus that wheel's outcome.",
+    },
+}
+"""Attributes of the variables `model_selection` in data sets."""
+
+
+class ModelChoice(AbstractPrintable):
+    """Choice of the model, and its reason. Batched under vmap: every field gains the axis.
+
+    `reason_code` is 0 if the viscoelastic model holds. If a margin is violated, it is 1 + the index
+    of the first one in `SELECTION_MARGINS`. It is `REASON_START_NOT_EMBEDDABLE` if a leg other than
+    Leg 1 is loaded or off its stopper at the start. If the viscoelastic step does not reach a
+    touchdown, it is minus the outcome.
+
+    - `model_code`: VISCOELASTIC_MODEL or UNILATERAL_MODEL;
+    - `margins`: of `SELECTION_MARGINS`, negative where violated;
+    - `friction`: coefficient of the ground.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> vrw.choose_model(vrw.WheelParams(), x, friction=50.0).margins.shape
+        (8,)
+    """
+
+    model_code: Int[Array, ""]
+    reason_code: Int[Array, ""]
+    margins: Float[Array, " n_premises"]
+    friction: Scalar
+
+    def summary_rows(self) -> list[TextRow]:
+        """Return the printable rows: model, explanation and margins."""
+        reason = np.asarray(self.reason_code)
+        if reason.ndim:
+            n_paper_model = int(np.sum(reason == 0))
+            return [
+                (
+                    "wheels",
+                    f"{reason.size} in shape {reason.shape}, {n_paper_model} served by the paper's",
+                )
+            ]
+        named_margins = zip(SELECTION_MARGINS, np.asarray(self.margins), strict=True)
+        margins = [
+            (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(value))
+            for n, value in named_margins
+        ]
+        return [("rung", type(self.model).__name__), ("why", self.why), *margins]
+
+    def model_selection(self) -> dict[str, Array]:
+        """Return model and reason codes, see `AbstractStep.model_selection`."""
+        return {"rung": self.model_code, "reason": self.reason_code}
+
+    @property
+    def model(self) -> AbstractWheel:
+        """The chosen model itself, for one wheel."""
+        if int(self.model_code) == VISCOELASTIC_MODEL:
+            return ViscoelasticWheel(friction=float(self.friction))
+        return UnilateralWheel(friction=self.friction)
+
+    @property
+    def why(self) -> str:
+        """Reason of the choice as one sentence, for one wheel."""
+        return describe_reason(int(self.reason_code))
+
+
+def describe_reason(reason: int) -> str:
+    """Return a reason code of `ModelChoice` as a sentence."""
+    if reason == 0:
+        return "The paper's wheel serves: all its premises hold over this step."
+    if reason < 0:
+        return f"The paper's wheel can't step: {Outcome(-reason).meaning}"
+    if reason == REASON_START_NOT_EMBEDDABLE:
+        return "The start is not the paper's: another leg is loaded or off its stopper."
+    return f"The paper's premises break: {list(SELECTION_MARGINS.values())[reason - 1]}."
+
+
+def find_selection_reason(
+    measures: Mapping[str, Any], friction_difference: Any
+) -> tuple[Array, Array]:
+    """Return `ModelChoice.reason_code` of viscoelastic steps, and their margins on the last axis.
+
+    - `measures`: measures and outcome of these steps;
+    - `friction_difference`: friction of the ground minus the friction behind `measures`.
+    """
+    margins = [
+        measures[name] + (friction_difference if "friction" in name else 0.0)
+        for name in SELECTION_MARGINS
+    ]
+    is_violated = ~(jnp.stack(margins, -1) >= 0.0)
+    first_violated = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
+    outcome = jnp.asarray(measures["outcome"], first_violated.dtype)
+    return jnp.where(outcome == Outcome.STEPPED, first_violated, -outcome), jnp.stack(margins, -1)
+
+
+class LadderStep(AbstractContactStep):
+    """One step by the lowest valid model, in the same form for both. Batched under vmap.
+
+    - `choice`: the chosen model, and the reason;
+    - `section_state`: just before the next landing; zeros if there was none;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: with two feet loaded, with one, with none, s;
+    - `step_length`: m;
+    - `energy_impacts`: lost in impacts, J;
+    - `energy_damping`: lost in the dampers, J;
+    - `energy_friction`: lost by sliding between impacts, J;
+    - `slip`: path length of sliding feet, m;
+    - `outcome`: an Outcome;
+    - `solver_steps`: attempted solver steps, of both models.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=vrw.LadderWheel(friction=50.0))
+        >>> print(f"{step.dls_fraction:.3f}")
+        0.532
+    """
+
+    choice: ModelChoice
+    section_state: FullState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "3"]
+    step_length: Scalar
+    energy_impacts: Scalar
+    energy_damping: Scalar
+    energy_friction: Scalar
+    slip: Scalar
+    outcome: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+
+    def model_selection(self) -> dict[str, Array]:
+        return self.choice.model_selection()
+
+
+class LadderWheel(AbstractWheel):
+    """The viscoelastic model where it is valid, and the unilateral model with this `friction`
+    elsewhere.
+
+    Section states are those of `UnilateralWheel`; three-number states of the paper are accepted.
+
+    - `friction`: coefficient of the ground, `inf` for feet that never slide.
+
+    Examples:
+        >>> wheel = vrw.LadderWheel(friction=50.0)
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
+        >>> step.choice.explanation
+        "The paper's wheel serves: all its premises hold over this step."
+    """
+
+    model_name: ClassVar[str] = "ladder"
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
+
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+
+    if TYPE_CHECKING:
+
+        def __init__(self, friction: RealInput = 0.7) -> None: ...
+
+    @property
+    def unilateral_model(self) -> UnilateralWheel:
+        """The upper model."""
+        return UnilateralWheel(friction=self.friction)
+
+    @property
+    def fallback_model(self) -> UnilateralWheel:
+        return self.unilateral_model
+
+    def default_start(self, params: WheelParams) -> FullState:
+        return self.unilateral_model.default_start(params)
+
+    def section_size(self, params: WheelParams) -> int:
+        return self.unilateral_model.section_size(params)
+
+    def n_continuous(self, params: WheelParams) -> int:
+        return self.unilateral_model.n_continuous(params)
+
+    def embed_section(self, params: WheelParams, x: Array) -> FullState:
+        return self.unilateral_model.embed_section(params, x)
+
+    def choose_model(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> tuple[ModelChoice, StepResult]:
+        """Return the chosen model, and the step of the viscoelastic model."""
+        paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        is_embeddable = _is_embeddable(x, params.n_legs)
+        result = paper_model.take_step(
+            params,
+            jnp.where(is_embeddable, _paper_section_state(x, params.n_legs), jnp.nan),
+            options,
+        )
+        reason_code, margins = find_selection_reason(
+            result.measures(), friction - paper_model.friction
+        )
+        reason_code = jnp.where(is_embeddable, reason_code, REASON_START_NOT_EMBEDDABLE).astype(
+            jnp.int32
+        )
+        model_code = jnp.where(reason_code == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(
+            jnp.int32
+        )
+        return ModelChoice(model_code, reason_code, margins, friction), result
+
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        choice, paper_result = self.choose_model(params, x, options)
+        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        contact_result = self.unilateral_model.advance(
+            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        )
+        return AdvanceResult(
+            section_state=jnp.where(
+                uses_paper_model,
+                _embed_paper_result(uses_paper_model, params, paper_result),
+                contact_result.section_state,
+            ),
+            durations=jnp.where(
+                uses_paper_model, _durations_by_feet(paper_result), contact_result.durations
+            ),
+            outcome=jnp.where(uses_paper_model, paper_result.outcome, contact_result.outcome),
+            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
+            model_code=choice.model_code,
+            reason_code=choice.reason_code,
+        )
+
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
+        choice, paper_result = self.choose_model(params, x, options)
+        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        contact_result: UnilateralStep = self.unilateral_model.take_step(
+            params, jnp.where(uses_paper_model, jnp.nan, x), options
+        )
+        select_result = lambda paper_value, contact_value: jnp.where(
+            uses_paper_model, paper_value, contact_value
+        )
+        return LadderStep(
+            choice=choice,
+            section_state=select_result(
+                _embed_paper_result(uses_paper_model, params, paper_result),
+                contact_result.section_state,
+            ),
+            post_impact=select_result(paper_result.post_impact, contact_result.post_impact),
+            durations=select_result(_durations_by_feet(paper_result), contact_result.durations),
+            step_length=select_result(paper_result.step_length, contact_result.step_length),
+            energy_impacts=select_result(
+                paper_result.energy.landing + paper_result.energy.stopper,
+                contact_result.energy_impacts,
+            ),
+            energy_damping=select_result(
+                paper_result.energy.damping, contact_result.energy_damping
+            ),
+            energy_friction=select_result(0.0, contact_result.energy_friction),
+            slip=select_result(0.0, contact_result.slip),
+            outcome=select_result(paper_result.outcome, contact_result.outcome),
+            solver_steps=paper_result.solver_steps + contact_result.solver_steps,
+        )
+
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> UnilateralTrajectory:
+        """Return the motion in the form of the upper model: without slip it equals the paper's
+        motion.
+        """
+        choice, _ = self.choose_model(params, x, options)
+        friction = jnp.where(choice.model_code == VISCOELASTIC_MODEL, jnp.inf, self.friction)
+        wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+        trajectory = wheel.sample_step(params, x, options, n_samples)
+        return dataclasses.replace(trajectory, model_selection=choice.model_selection())
+
+
+def _paper_section_state(x: FullState, n: int) -> Float[Array, "3"]:
+    """Return (theta-, dtheta-, dL1-) of a full section state."""
+    return jnp.stack([x[0], x[1], x[4 + n]])
+
+
+def _is_embeddable(x: FullState, n: int) -> Bool[Array, ""]:
+    """Return whether Leg 1 alone is loaded and at rest, with all other legs on their stoppers."""
+    paper_codes = jnp.where(
+        jnp.arange(n) == 0, float(CONTACT_STICK), float(LOCKED_CODE_OFFSET + CONTACT_OFF)
+    )
+    return jnp.all(jnp.round(x[4 + 2 * n :]) == paper_codes)
+
+
+def _embed_paper_result(
+    uses_paper_model: Array, params: WheelParams, paper_result: StepResult
+) -> FullState:
+    """Return the full section state of a viscoelastic step.
+
+    Where the viscoelastic model is not used, it is the state of Table 1's start.
+    """
+    fallback_x = jnp.asarray(PAPER_START, paper_result.section_state.dtype)
+    params, x = replace_invalid(uses_paper_model, params, paper_result.section_state, fallback_x)
+    return embed_section_state(params.symbols(), x)
+
+
+def _durations_by_feet(paper_result: StepResult) -> Float[Array, "3"]:
+    """Return the durations with two loaded feet, with one and with none, s."""
+    double_support, *single_support = paper_result.durations
+    return jnp.stack(
+        [double_support, single_support[0] + single_support[1], jnp.zeros_like(double_support)]
+    )
+
+
+def refuse_ladder(model: object, role: str) -> None:
+    """Raise `TypeError` for a ladder where a model with smoothly varying gaits is required."""
+    if isinstance(model, LadderWheel | str):
+        raise TypeError(
+            f"the ladder can't be {role}, since its gaits jump where the rung changes: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )

@@ -1,0 +1,416 @@
+"""Arrays of LLVM values: entries in registers, and lazy arrays whose entries are computed on
+access.
+
+An array whose last axis are lanes is, without that axis, an array of LLVM vectors; any other is one
+of scalars. Small arrays are divided into their entries, which live in registers: moving axes,
+slicing and stacking cost nothing. Large arrays are lazy: each entry is computed or loaded on
+access, in a loop over the index. They are stored in memory only where a loop carries them, where a
+long sum ends and where the trace has an `optimization_barrier`. Code therefore stays short and
+compiles fast. No operation may combine lanes, except to test whether any or all of them continue.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import llvmlite.ir as ir
+import numpy as np
+
+from vrw_jax.simd.arithmetic import emit_elementwise
+from vrw_jax.simd.lazy_arrays import (
+    ArrayValue,
+    EntryIndex,
+    LazyArray,
+    MemoryArray,
+    PendingUpdate,
+    Uninitialized,
+)
+from vrw_jax.simd.value_emitter import I64, NUMBER_TYPES, Value, ValueEmitter
+
+LANE_AXIS_SENTINEL = 1021
+"""Length of the lane axis in the trace, by which the axis is recognized; machine code has any
+number of lanes."""
+MAX_UNROLLED = 8
+"""Most entries of a lazy array that are computed individually, and most terms of a sum that are
+unrolled."""
+MAX_REGISTERS = 32
+"""Most entries of an array that a loop carries in registers, and of a constant that needs no
+table."""
+MAX_REGISTERS_INNER = 64
+"""The same limit of carried entries for loops without inner loops, which are unrolled."""
+
+
+class PrimitiveCall(NamedTuple):
+    """An equation of a trace with one result."""
+
+    name: str
+    params: dict[str, Any]
+    in_avals: Sequence[Any]  # of the operands: shape and type
+    out_aval: Any  # of the result
+
+
+class ArrayEmitter:
+    """Emitter of operations on arrays, into the function of its value emitter."""
+
+    def __init__(
+        self, emitter: ValueEmitter, is_unrolled: bool = False, max_unrolled: int = MAX_UNROLLED
+    ) -> None:
+        self.emitter, self.builder, self.max_unrolled = emitter, emitter.builder, max_unrolled
+        self.kept_alive: list[Any] = []  # objects identified by `id`
+        self.is_unrolled = is_unrolled  # within a loop without inner loops: constants need no table
+
+    def entry_type_of(self, aval: Any) -> ir.Type:
+        """Return the type of the entries of an array of the trace."""
+        return self.emitter.vector_type(number_type(aval)) if has_lanes(aval) else number_type(aval)
+
+    def emit_constants(self, value: np.ndarray, aval: Any) -> ArrayValue:
+        """Return the numbers of a constant as an array."""
+        if LANE_AXIS_SENTINEL in aval.shape:
+            raise lane_axis_error("A constant", aval)
+        number = number_type(aval)
+        entries = make_array(value.shape, [self.emitter.constant(number, x) for x in value.ravel()])
+        return (
+            entries if value.size <= MAX_REGISTERS or self.is_unrolled else self.make_table(entries)
+        )
+
+    def get_entries(self, array: ArrayValue) -> np.ndarray:
+        """Return all entries, one by one."""
+        if isinstance(array, np.ndarray):
+            return array
+        return make_array(array.shape, [self.get_entry(array, i) for i in np.ndindex(array.shape)])
+
+    def get_entry(self, array: ArrayValue, index: EntryIndex) -> Value:
+        """Return an entry, which is computed once for each index."""
+        self.kept_alive.append(array)
+        if isinstance(array, LazyArray):
+            key = ("entry", id(array), *(i if isinstance(i, int) else ("at", id(i)) for i in index))
+            return self.emitter.emit_once(key, lambda: array.entry_at(index))
+        # An array with stride 0 along an axis is the same at all its indices.
+        axes = zip(index, array.strides, array.shape, strict=True)
+        index = tuple(0 if step == 0 or length == 1 else i for i, step, length in axes)
+        varying = tuple(i for i in index if not isinstance(i, int))
+        if not varying:
+            return array[index]
+        fixed_index = tuple(i if isinstance(i, int) else slice(None) for i in index)
+        table = self.emitter.emit_once(
+            ("table", id(array), str(fixed_index)), lambda: self.make_table(array[fixed_index])
+        )
+        return self.get_entry(table, varying)
+
+    def flatten_entries(self, arrays: Sequence[ArrayValue], avals: Sequence[Any]) -> list[Value]:
+        """Return all entries in a row, with vectors for those that have lanes."""
+        flat: list[Value] = []
+        for array, aval in zip(arrays, avals, strict=True):
+            broadcast_entries = np.broadcast_to(
+                self.get_entries(array), shape_without_lanes(aval)
+            ).ravel()
+            flat += [self.emitter.splat(x) if has_lanes(aval) else x for x in broadcast_entries]
+        return flat
+
+    def linear_index(self, index: EntryIndex, shape: Sequence[int]) -> Value:
+        """Return the offset of an entry among all, row after row."""
+        stride, constant_offset = math.prod(shape), 0
+        offset: Value = None
+        for i, length in zip(index, shape, strict=True):
+            stride //= length
+            if isinstance(i, int):
+                constant_offset += i * stride
+                continue
+            term = i if stride == 1 else self.builder.mul(i, ir.Constant(I64, stride))
+            offset = term if offset is None else self.builder.add(offset, term)
+        if offset is None:
+            return ir.Constant(I64, constant_offset)
+        return (
+            self.builder.add(offset, ir.Constant(I64, constant_offset))
+            if constant_offset
+            else offset
+        )
+
+    def loop_over_indices(
+        self,
+        shape: Sequence[int],
+        body: Callable[[EntryIndex, list[Value]], Sequence[Value]],
+        carry: Sequence[Value] = (),
+    ) -> list[Value]:
+        """Emit loops over all indices of `shape`: `carry = body(index, carry)`."""
+
+        def nest(index: EntryIndex, carry: Sequence[Value]) -> Sequence[Value]:
+            if len(index) == len(shape):
+                return body(index, list(carry))
+            if shape[len(index)] == 1:
+                return nest((*index, 0), carry)
+            run_nested = lambda i, carry: nest((*index, i), carry)
+            return self.loop_n_times(shape[len(index)], run_nested, carry)
+
+        return list(nest((), carry))
+
+    def loop_n_times(
+        self,
+        length: int,
+        body: Callable[[Value, list[Value]], Sequence[Value]],
+        carry: Sequence[Value],
+    ) -> list[Value]:
+        """Emit `for i in range(length): carry = body(i, carry)`."""
+        return self.loop_over_range(ir.Constant(I64, 0), ir.Constant(I64, length), body, carry)
+
+    def loop_over_range(
+        self,
+        begin: Value,
+        end: Value,
+        emit_body: Callable[[Value, list[Value]], Sequence[Value]],
+        carry: Sequence[Value] = (),
+    ) -> list[Value]:
+        """Emit `for i in range(begin, end): carry = emit_body(i, carry)`."""
+
+        def body(state: list[Value]) -> list[Value]:
+            next_carry = emit_body(state[0], state[1:])
+            return [self.builder.add(state[0], ir.Constant(I64, 1)), *next_carry]
+
+        condition = lambda state: self.builder.icmp_signed("<", state[0], end)
+        return self.emitter.emit_loop([begin, *carry], condition, body)[1:]
+
+    def allocate(self, shape: Sequence[int], kind: ir.Type) -> MemoryArray:
+        """Return memory that is allocated once, at the start of the function."""
+        with self.builder.goto_entry_block():
+            base = self.builder.alloca(kind, ir.Constant(I64, max(1, math.prod(shape))))
+        return MemoryArray(self, shape, kind, base)
+
+    def fill_memory(self, memory: MemoryArray, array: ArrayValue) -> None:
+        """Store all initialized entries."""
+        if isinstance(array, Uninitialized):
+            return
+        if isinstance(array, PendingUpdate):
+            self.fill_memory(memory, array.base_array)
+            array.store_into(memory)
+            return
+        if isinstance(array, np.ndarray) and any(array.strides):
+            for index in np.ndindex(memory.shape):
+                memory.store(index, array[index])
+            return
+
+        def store_entry(index: EntryIndex, _: Any) -> list[Value]:
+            memory.store(index, self.get_entry(array, index))
+            return []
+
+        self.loop_over_indices(memory.shape, store_entry)
+
+    def materialize(self, array: ArrayValue) -> MemoryArray:
+        """Return the array with all entries computed and stored, so that an LLVM index can access
+        them.
+        """
+        if isinstance(array, MemoryArray):
+            return array
+        memory = self.allocate(array.shape, _entry_type(array))
+        self.fill_memory(memory, array)
+        return memory
+
+    def make_table(self, array: np.ndarray) -> MemoryArray:
+        """Return entries in memory, so that an LLVM index can access them; constants are stored in
+        the program.
+        """
+        if not all(isinstance(x, ir.Constant) for x in array.ravel()):
+            return self.materialize(array)
+        number = array.ravel()[0].type
+        kind = ir.ArrayType(number, array.size)
+        module = self.builder.module
+        table = ir.GlobalVariable(module, kind, module.get_unique_name("table"))
+        table.initializer = ir.Constant(kind, list(array.ravel()))
+        table.global_constant, table.linkage = True, "internal"
+        return MemoryArray(self, array.shape, number, table)
+
+    def emit_elementwise(self, call: PrimitiveCall, values: Sequence[ArrayValue]) -> ArrayValue:
+        """Emit an elementwise primitive."""
+        name, params, in_avals, out_aval = call
+        shape, in_dtype = shape_without_lanes(out_aval), in_avals[0].dtype
+        if not shape and all(isinstance(x, np.ndarray) and not x.shape for x in values):
+            operands = [x.item() for x in values]  # type: ignore[union-attr]
+            return make_array(
+                (),
+                [emit_elementwise(self.emitter, name, params, in_dtype, out_aval.dtype, operands)],
+            )
+        if any(x.shape != shape for x in values):
+            # An operand without lanes may have an extra axis, or fewer axes.
+            values = [
+                self.reshape_if_needed(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values
+            ]
+            values = [self.broadcast_array(x, shape, range(len(x.shape))) for x in values]
+        emit_entry = lambda operands: emit_elementwise(
+            self.emitter, name, params, in_dtype, out_aval.dtype, operands
+        )
+        if any(isinstance(x, LazyArray) for x in values):
+            entry_at = lambda index: emit_entry([self.get_entry(x, index) for x in values])
+            return LazyArray(shape, self.entry_type_of(out_aval), entry_at)
+        # Along an axis on which no operand varies, the entry is computed once and repeated.
+        is_varying_axes = (any(x.strides[axis] for x in values) for axis in range(len(shape)))  # type: ignore[union-attr]
+        varying_part = (*(slice(None if is_varying else 1) for is_varying in is_varying_axes), ...)
+        parts = [x[varying_part] for x in values]  # type: ignore[index]
+        entries = zip(*(x.ravel() for x in parts), strict=True)
+        results = make_array(parts[0].shape, [emit_entry(operands) for operands in entries])
+        return np.broadcast_to(results, shape)
+
+    def reshape_if_needed(
+        self, array: ArrayValue, shape: tuple[int, ...], is_needed: bool
+    ) -> ArrayValue:
+        """Return the array reshaped, if needed."""
+        return self.reshape_array(array, shape) if is_needed else array
+
+    def broadcast_array(
+        self, array: ArrayValue, shape: tuple[int, ...], axes: Sequence[int]
+    ) -> ArrayValue:
+        """Return the array with its axes at these positions of `shape`."""
+        lengths = array.shape
+        if lengths == shape and tuple(axes) == tuple(range(len(shape))):
+            return array
+        if isinstance(array, np.ndarray):
+            new_shape = [1] * len(shape)
+            for axis, length in zip(axes, lengths, strict=True):
+                new_shape[axis] = length
+            return np.broadcast_to(array.reshape(new_shape), shape)
+
+        def entry_at(index: EntryIndex) -> Value:
+            pairs = zip(axes, lengths, strict=True)
+            return self.get_entry(array, tuple(0 if n == 1 else index[axis] for axis, n in pairs))
+
+        return LazyArray(shape, array.entry_type, entry_at)
+
+    def reshape_array(self, array: ArrayValue, shape: tuple[int, ...]) -> ArrayValue:
+        """Return an array with the same entries in the same order."""
+        if array.shape == shape:
+            return array
+        if isinstance(array, np.ndarray):
+            return array.reshape(shape)
+        if isinstance(array, MemoryArray):
+            return MemoryArray(self, shape, array.entry_type, array.base, array.is_overwritable)
+        old_shape = array.shape
+
+        def entry_at(index: EntryIndex) -> Value:
+            offset = self.linear_index(index, shape)
+            constant_offset = offset.constant if isinstance(offset, ir.Constant) else None
+            if constant_offset is not None:
+                return self.get_entry(
+                    array, tuple(map(int, np.unravel_index(constant_offset, old_shape)))
+                )
+            old_index: list[Any] = []
+            for length in old_shape[:0:-1]:
+                size = ir.Constant(I64, length)
+                old_index.append(0 if length == 1 else self.builder.urem(offset, size))
+                offset = offset if length == 1 else self.builder.udiv(offset, size)
+            return self.get_entry(array, (0 if old_shape[0] == 1 else offset, *old_index[::-1]))
+
+        old_axes = [i for i, length in enumerate(old_shape) if length > 1]
+        new_axes = [i for i, length in enumerate(shape) if length > 1]
+        if [old_shape[i] for i in old_axes] == [
+            shape[i] for i in new_axes
+        ]:  # only axes of length 1 differ
+
+            def entry_at(index: EntryIndex) -> Value:
+                index_by_axis = dict(zip(old_axes, (index[i] for i in new_axes), strict=True))
+                return self.get_entry(
+                    array, tuple(index_by_axis.get(i, 0) for i in range(len(old_shape)))
+                )
+
+        return LazyArray(shape, array.entry_type, entry_at)
+
+    def shift_index(self, i: Any, start: int, step: int = 1) -> Any:
+        """Return start + step * i."""
+        if isinstance(i, int):
+            return start + step * i
+        i = i if step == 1 else self.builder.mul(i, ir.Constant(I64, step))
+        return i if start == 0 else self.builder.add(i, ir.Constant(I64, start))
+
+    def clamp_index(self, i: Value, last: int) -> Value:
+        """Return the nearest index from 0 to `last`."""
+        build, zero, end = self.builder, ir.Constant(I64, 0), ir.Constant(I64, last)
+        i = build.select(build.icmp_signed("<", i, zero), zero, i)
+        return build.select(build.icmp_signed(">", i, end), end, i)
+
+    def add_indices(self, index: EntryIndex, begin: EntryIndex) -> EntryIndex:
+        """Return the sum of two indices."""
+
+        def add_index(i: Any, j: Any) -> Any:
+            if isinstance(j, int):
+                return self.shift_index(i, j)
+            return self.shift_index(j, i) if isinstance(i, int) else self.builder.add(i, j)
+
+        return tuple(add_index(i, j) for i, j in zip(index, begin, strict=True))
+
+    def make_zero(self, entry_type: ir.Type) -> Value:
+        """Return a zero as the start of a sum, which is not simplified like a known
+        constant zero.
+        """
+        number = entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
+        value = ir.Constant(number, 0.0 if isinstance(number, _FLOAT_TYPES) else 0)
+        if not isinstance(entry_type, ir.VectorType):
+            return value
+        return ir.Constant(entry_type, [value] * entry_type.count)
+
+
+_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
+
+
+def _entry_type(array: ArrayValue) -> ir.Type:
+    """Return the type of entries: a vector if any entry is one."""
+    if isinstance(array, LazyArray):
+        return array.entry_type
+    kinds = [x.type for x in array.ravel()]
+    return next((kind for kind in kinds if isinstance(kind, ir.VectorType)), kinds[0])
+
+
+def has_lanes(aval: Any) -> bool:
+    """Return whether an array of the trace has the axis of lanes."""
+    return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
+
+
+def shape_without_lanes(aval: Any) -> tuple[int, ...]:
+    """Return the shape without the axis of lanes."""
+    return aval.shape[:-1] if has_lanes(aval) else aval.shape
+
+
+def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
+    """Return the error for an axis as long as the lanes' that is another, or is moved there."""
+    return NotImplementedError(
+        f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is the lanes', which come "
+        "from arguments and stay the last; keep them there, and give other axes another length."
+    )
+
+
+def lane_mixing_error(name: str) -> NotImplementedError:
+    """Return the error for a primitive that combines or moves lanes."""
+    return NotImplementedError(
+        f"{name} moves, joins or picks lanes: do the same to each by itself; only `any` and `all` "
+        "may ask about all of them."
+    )
+
+
+def number_type(aval: Any) -> ir.Type:
+    """Return the type of an entry for one lane."""
+    if aval.dtype not in _TYPE_BY_DTYPE:
+        raise NotImplementedError(
+            f"{aval.str_short()} has numbers that machine code does not know: convert them to one "
+            f"of {', '.join(NUMBER_TYPES)}."
+        )
+    return _TYPE_BY_DTYPE[aval.dtype]
+
+
+_TYPE_BY_DTYPE = {
+    np.dtype(name): kind for name, kind in NUMBER_TYPES.items()
+}  # dtype names are slow to compute
+
+
+def make_array(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
+    """Return an array of LLVM values."""
+    array = np.empty(len(entries), object)
+    array[:] = entries
+    return array.reshape(shape)
+
+
+def split_arrays(flat: Sequence[Value], avals: Sequence[Any]) -> list[ArrayValue]:
+    """Return the arrays whose entries `ArrayEmitter.flatten_entries` returned."""
+    arrays: list[ArrayValue] = []
+    begin = 0
+    for aval in avals:
+        shape = shape_without_lanes(aval)
+        end = begin + math.prod(shape)
+        arrays.append(make_array(shape, flat[begin:end]))
+        begin = end
+    return arrays

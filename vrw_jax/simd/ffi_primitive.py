@@ -1,0 +1,70 @@
+"""Machine code as a JAX primitive, which JAX programs call by the name of the code."""
+
+import functools
+from collections.abc import Sequence
+from threading import Lock
+from typing import Any
+
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from vrw_jax.simd.code_cache import MachineCode
+from vrw_jax.simd.ffi_handler import HANDLER_NAME
+from vrw_jax.simd.machine import LoadedCode
+
+LOADED_BY_NAME: dict[str, LoadedCode] = {}
+"""Machine code by the name under which JAX programs can call it; XLA never releases it."""
+_registry_lock = Lock()
+
+
+def register_code(code: MachineCode) -> None:
+    """Make this code callable by its name in JAX programs."""
+    object_code = code.wait_for_code()
+    with _registry_lock:
+        if code.name not in LOADED_BY_NAME:
+            loaded_code = LoadedCode(object_code)
+            jax.ffi.register_ffi_target(
+                code.name, loaded_code.capsule(HANDLER_NAME), platform="cpu"
+            )
+            LOADED_BY_NAME[code.name] = loaded_code
+
+
+MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
+"""A call of machine code by programs of JAX, which need it only when they are compiled themselves:
+until then LLVM may be at work on it."""
+MACHINE_CODE_PRIMITIVE.multiple_results = True
+
+
+@MACHINE_CODE_PRIMITIVE.def_abstract_eval
+def _abstract_results(
+    *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+) -> list[Any]:
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
+
+
+@MACHINE_CODE_PRIMITIVE.def_impl
+def _call_jitted(*arguments: Any, **params: Any) -> Any:
+    return jax.jit(functools.partial(MACHINE_CODE_PRIMITIVE.bind, **params))(*arguments)
+
+
+def _lower_call(
+    context: Any, *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+) -> Any:
+    register_code(code)
+    return jax.ffi.ffi_lowering(code.name)(context, *arguments)
+
+
+def _refuse_transform(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError(
+        "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
+        "all lanes at once, on the last axis, and for derivatives the function that returns them."
+    )
+
+
+mlir.register_lowering(MACHINE_CODE_PRIMITIVE, _lower_call, platform="cpu")
+batching.primitive_batchers[MACHINE_CODE_PRIMITIVE] = ad.primitive_jvps[MACHINE_CODE_PRIMITIVE] = (
+    _refuse_transform
+)
+"""A call of machine code by JAX programs, which require the code only when they are compiled: LLVM
+can compile it in the meantime."""

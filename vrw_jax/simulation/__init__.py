@@ -1,0 +1,19 @@
+"""One step, a walk, a trajectory, attractors and basins."""
+
+from vrw_jax.simulation.basins import PRE_TOUCHDOWN_NAMES, basin
+from vrw_jax.simulation.stepping import (
+    ModelLike,
+    Walk,
+    check_model,
+    check_options,
+    check_section_state,
+    check_single_wheel,
+    choose_model,
+    paper_start,
+    return_map,
+    step,
+    validate_arguments,
+    walk,
+    walk_toward_gait,
+)
+from vrw_jax.simulation.trajectory import simulate

@@ -1,0 +1,203 @@
+"""Attractors: many starts, each walked until its motion is periodic or the wheel falls.
+
+Starts may belong to different wheels. Starts without a result after a round are packed together
+for the next round, so that long transients cost little.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.contact import (
+    UnilateralWheel,
+    embed_section_states,
+    step_batch_with_jacobian,
+    walk_batch,
+)
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.simulation.stepping import walk
+from vrw_jax.wheel import Outcome, WheelParams
+
+STEPS_PER_ROUND = 10
+"""Number of steps between two tests for periodic motion."""
+
+STARTS_PER_BLOCK = 128
+"""Number of starts per compiled call; one shape is compiled once."""
+
+PERIODICITY_TOLERANCE = 1e-7
+"""Largest change of the section states over one period in periodic motion."""
+
+ORBIT_ARRIVAL_DISTANCE = 1e-3
+"""Distance from its orbit below which a walk has reached the orbit."""
+
+SAME_ORBIT_DISTANCE = 1e-4
+"""Distance below which two orbits are the same."""
+
+
+class WalkEnds(NamedTuple):
+    """Ends of walks, as numpy arrays with a leading axis over starts."""
+
+    outcome: np.ndarray  # STEPPED if it still walks
+    period: np.ndarray  # of its orbit, in steps; 0 if the motion is not periodic
+    n_steps: np.ndarray  # until it reached its orbit, or fell
+    orbit_states: (
+        np.ndarray
+    )  # (start, max_period, m): section states, lowest dtheta- first, then NaN
+
+
+@eqx.filter_jit
+def _walk_block(
+    model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
+) -> tuple[Array, Array]:
+    """Return section states and outcomes of one round of steps from a block of starts."""
+    walk_round = lambda params, x: walk(params, x, STEPS_PER_ROUND, model=model, options=options)
+    walks = jax.vmap(walk_round)(params, x)
+    return walks.steps.section_state, walks.steps.outcome
+
+
+def _walk_round_batched(
+    model: Any, options: StepOptions, params: WheelParams, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same for unilateral contact and any number of wheels, by the batch kernel."""
+    n, columns = params.n_legs, np.asarray(jax.vmap(model.values)(params)).T
+    x = embed_section_states(columns, np.asarray(x), n)
+    states, codes = list[np.ndarray](), list[np.ndarray]()
+    for _ in range(STEPS_PER_ROUND):
+        x, _, outcome, *_ = walk_batch(columns, x, 1, model, options, n)
+        # A wheel that fell has no section state, so its outcome is kept.
+        outcome = outcome if not codes else np.where(codes[-1] > 0, codes[-1], outcome)
+        states.append(x)
+        codes.append(outcome)
+    return np.stack(states, 1), np.stack(codes, 1)
+
+
+ROUND_WALKERS: dict[str, Callable[..., tuple]] = {"unilateral": _walk_round_batched}
+"""Functions that walk one round of many starts, for models that do not walk it by blocks."""
+
+
+def walk_until_periodic(
+    params: WheelParams,
+    starts: np.ndarray,
+    model: AbstractWheel,
+    options: StepOptions,
+    max_steps: int,
+    max_period: int,
+) -> WalkEnds:
+    """Return how each walk ends; `params` is one wheel or has the leading axis of the starts."""
+    n = len(starts)
+    broadcast = lambda x: np.broadcast_to(np.asarray(x), n)
+    wheels = jax.tree.map(broadcast, params)
+    n_rounds = -(-max_steps // STEPS_PER_ROUND)
+    history = np.full((n, 1 + n_rounds * STEPS_PER_ROUND, starts.shape[1]), np.nan)
+    history[:, 0] = starts
+    outcome = np.full(n, int(Outcome.STEPPED))
+    period, n_walked = np.zeros(n, int), np.zeros(n, int)
+    unsettled = np.arange(n)
+    batched_walker = ROUND_WALKERS.get(model.model_name)
+    walk_wheels_and_states = functools.partial(batched_walker or _walk_block, model, options)
+    walk_round = (
+        walk_wheels_and_states
+        if batched_walker
+        else functools.partial(map_in_batches, walk_wheels_and_states, (STARTS_PER_BLOCK,))
+    )
+    for k in range(n_rounds):
+        round_rows = slice(1 + k * STEPS_PER_ROUND, 1 + (k + 1) * STEPS_PER_ROUND)
+        unsettled_starts = take_rows(wheels, unsettled), history[unsettled, k * STEPS_PER_ROUND]
+        states, codes = map(np.asarray, walk_round(*unsettled_starts))
+        history[unsettled, round_rows], outcome[unsettled] = states, codes[:, -1]
+        n_walked[unsettled] = k * STEPS_PER_ROUND + np.sum(codes == Outcome.STEPPED, 1)
+        n_known = (k + 1) * STEPS_PER_ROUND
+        period[unsettled] = _detect_periods(history[unsettled, : n_known + 1], max_period)
+        period[outcome != Outcome.STEPPED] = 0
+        unsettled = unsettled[(outcome[unsettled] == Outcome.STEPPED) & (period[unsettled] == 0)]
+        if not len(unsettled):
+            break
+    orbit = np.full((n, max_period, starts.shape[1]), np.nan)
+    for i in np.flatnonzero(period):
+        last_states = history[i, n_walked[i] + 1 - period[i] : n_walked[i] + 1]
+        orbit[i, : period[i]] = np.roll(last_states, -int(np.argmin(last_states[:, 1])), axis=0)
+        distances = np.linalg.norm(
+            history[i, : n_walked[i] + 1, None] - last_states[None], axis=-1
+        ).min(1)
+        distant_steps = np.flatnonzero(distances > ORBIT_ARRIVAL_DISTANCE)
+        n_walked[i] = distant_steps[-1] + 1 if len(distant_steps) else 0
+    return WalkEnds(outcome, period, n_walked, orbit)
+
+
+def _detect_periods(history: np.ndarray, max_period: int) -> np.ndarray:
+    """Return the shortest period, in steps, that the last two periods confirm, or 0."""
+    periods = np.zeros(len(history), int)
+    n_states = history.shape[1]
+    for period in range(min(max_period, (n_states - 1) // 3), 0, -1):
+        change = np.abs(
+            history[:, n_states - 2 * period :]
+            - history[:, n_states - 3 * period : n_states - period]
+        )
+        periods[change.max((1, 2)) < PERIODICITY_TOLERANCE] = period
+    return periods
+
+
+class Attractors(NamedTuple):
+    """Distinct orbits of many starts, ordered by decreasing number of starts."""
+
+    orbit_index: np.ndarray  # index of the orbit of each start; -1 without an orbit
+    orbits: list[np.ndarray]  # (period, m) each
+
+
+def find_distinct_orbits(walk_ends: WalkEnds) -> Attractors:
+    """Return the distinct orbits, compared without regard to their first step."""
+    index = np.full(len(walk_ends.period), -1)
+    orbits: list[np.ndarray] = []
+    for i in np.flatnonzero(walk_ends.period):
+        orbit = walk_ends.orbit_states[i, : walk_ends.period[i]]
+        for j, known_orbit in enumerate(orbits):
+            if (
+                len(known_orbit) == len(orbit)
+                and np.abs(known_orbit - orbit).max() < SAME_ORBIT_DISTANCE
+            ):
+                index[i] = j
+                break
+        else:
+            index[i] = len(orbits)
+            orbits.append(orbit)
+    count = [int(np.sum(index == j)) for j in range(len(orbits))]
+    order = np.argsort(count)[::-1]
+    rank = np.full(len(orbits) + 1, -1)
+    rank[order] = np.arange(len(orbits))
+    return Attractors(rank[index], [orbits[j] for j in order])
+
+
+@eqx.filter_jit
+def _measure_block(
+    model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
+) -> dict[str, Array]:
+    """Return all measures of one step from each start of a block."""
+    return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
+
+
+def measure_orbits(
+    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: StepOptions
+) -> dict[str, np.ndarray]:
+    """Return all measures of one step from each of `states`, shape (n, m)."""
+    n = len(states)
+    wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
+    if model.model_name in ROUND_WALKERS:
+        columns, unilateral_model = (
+            np.asarray(jax.vmap(model.parameter_values)(wheels)).T,
+            cast(UnilateralWheel, model),
+        )
+        step_results, _ = step_batch_with_jacobian(
+            columns, states, unilateral_model, options, params.n_legs, ()
+        )
+        return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
+    measure_block = functools.partial(_measure_block, model, options)
+    return jax.tree.map(
+        np.asarray, map_in_batches(measure_block, (STARTS_PER_BLOCK,), wheels, states)
+    )

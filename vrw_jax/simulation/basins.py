@@ -1,0 +1,239 @@
+"""Basins of attraction: the gait that each start of a grid reaches, or how it fails."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES, measure_attrs, provenance
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.simulation.attractors import find_distinct_orbits, measure_orbits, walk_until_periodic
+from vrw_jax.simulation.stepping import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.validation import check_int, check_not_traced, check_reals, check_type
+from vrw_jax.wheel import Outcome, WheelParams, transitions
+
+PRE_TOUCHDOWN_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
+"""Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
+
+POST_LANDING_NAMES = ("theta_post_impact", "dtheta_post_impact")
+"""Names of the components of a state just after a landing on both feet, in rad, rad/s."""
+
+StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
+"""Values of each component of a start, by name; a single number is not an axis."""
+
+NO_ATTRACTOR = -1
+"""Index of a start that reaches no attractor."""
+
+
+def basin(
+    params: WheelParams,
+    grid: StartGrid,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+    max_steps: int = 200,
+    max_period: int = 16,
+) -> xr.Dataset:
+    """Return where a walk from each start of `grid` ends, as a labelled dataset.
+
+    `grid` names all components of a start before touchdown, such as {"theta_touchdown": 0.09,
+    "dtheta_touchdown": np.linspace(1.0, 2.5, 60), "dL1_touchdown": np.linspace(-0.5, 0.2, 60)}, or
+    all of "theta_post_impact" and "dtheta_post_impact". Components with several values are the axes
+    of the result, in this order. The variables over these axes are
+
+    - `attractor`: index of the orbit that the walk reaches within `max_steps`, or -1;
+    - `outcome`: STEPPED, or how the wheel fell; BAD_INPUT if no landing leads to the start;
+    - `steps`: number of steps until the walk stays within 1e-3 of the orbit, or until the fall.
+
+    The orbits are in `orbit_state` over (attractor_index, orbit_step), ordered by decreasing number
+    of starts. Each has an `orbit_period` in steps, a DLS fraction and, for the paper's model, its
+    least margins. With unilateral contact, section states are full states. "auto" means unilateral
+    contact, which is valid for all starts.
+
+    Args:
+        params: the wheel.
+        grid: one or more values of each component of a start, by name.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+        max_steps: largest number of steps of a walk.
+        max_period: longest period, in steps, that is recognized.
+
+    Returns:
+        A dataset over the axes of `grid`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
+        >>> starts |= {"dL1_touchdown": -0.1}
+        >>> basins = vrw.basin(vrw.WheelParams(damping=150.0), starts)
+        >>> basins.attractor.values.tolist()
+        [0, 0]
+    """
+    model, options = _validate_arguments(params, model, options)
+    options = options.with_engine(engine)
+    max_steps = check_int("most_steps", max_steps)
+    max_period = check_int("longest_period", max_period)
+    values = _parse_grid_values(grid)
+    names = tuple(values)
+    axes = [name for name in names if np.ndim(grid[name]) > 0]
+    shape = tuple(len(values[name]) for name in axes)
+    mesh = np.meshgrid(*values.values(), indexing="ij")
+    points = np.stack([m.ravel() for m in mesh], -1)
+    starts = points if names == PRE_TOUCHDOWN_NAMES else _invert_landing(params, points)
+    is_reachable = np.isfinite(starts).all(-1)
+    starts = np.where(is_reachable[:, None], starts, np.nan)
+    to_full_state = functools.partial(model.embed_section, params)
+    starts = np.asarray(jax.vmap(to_full_state)(jnp.asarray(starts)))
+    walk_ends = walk_until_periodic(params, starts, model, options, max_steps, max_period)
+    attractors = find_distinct_orbits(walk_ends)
+
+    data = {
+        "attractor": xr.Variable(
+            axes,
+            attractors.orbit_index.reshape(shape),
+            {"long_name": "orbit that the walk settles on", "flag_none": NO_ATTRACTOR},
+        ),
+        "outcome": xr.Variable(axes, walk_ends.outcome.reshape(shape), measure_attrs("outcome")),
+        "steps": xr.Variable(
+            axes,
+            walk_ends.n_steps.reshape(shape),
+            {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
+        ),
+    }
+    labels = {name: _make_coordinate(name, values[name], name in axes) for name in names}
+    orbits = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
+    attrs = {
+        "title": "Basins of attraction",
+        "most_steps": max_steps,
+        "starts": "before touchdown" if names == PRE_TOUCHDOWN_NAMES else "after landing",
+    }
+    return xr.Dataset(data | orbits, labels, attrs | provenance(params, model, options))
+
+
+def _make_coordinate(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
+    """Return the coordinate of a component of the starts."""
+    dims, coordinate_values = (name, values) if is_axis else ((), values[0])
+    return xr.Variable(dims, coordinate_values, dict(MEASURES[name].attrs))
+
+
+def _validate_arguments(
+    params: WheelParams, model: ModelLike | None, options: StepOptions | None
+) -> tuple[AbstractWheel, StepOptions]:
+    """Return model and options with their defaults; raise if an argument is invalid."""
+    check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
+    check_single_wheel(params, "ask for one basin after the other")
+    checked_model, options = (
+        check_model(model).fallback_model,
+        check_options(options),
+    )  # valid for any start
+    options.check_tolerances(np.dtype(params.damping.dtype))
+    return checked_model, options
+
+
+def _parse_grid_values(grid: StartGrid) -> dict[str, np.ndarray]:
+    """Return the values of each component as an array of one axis; raise for other shapes."""
+    values = {
+        name: np.asarray(check_reals(name, grid[name]), float) for name in _find_grid_names(grid)
+    }
+    for name, value in values.items():
+        if value.ndim > 1 or not value.size:
+            raise ValueError(
+                f"{name} has shape {value.shape}, but it is a number, or a list of at least one: "
+                "give one axis of values."
+            )
+    return {name: np.atleast_1d(value) for name, value in values.items()}
+
+
+def _find_grid_names(grid: StartGrid) -> tuple[str, ...]:
+    """Return the names of the components; raise unless the grid names all of one kind."""
+    check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
+    for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
+        if set(grid) == set(names):
+            return names
+    raise ValueError(
+        f"the grid names {', '.join(grid) or 'nothing'}, but it must name all of "
+        f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give each a number or an axis."
+    )
+
+
+def _invert_landing(params: WheelParams, points: np.ndarray) -> np.ndarray:
+    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN.
+
+    The angular rate after the landing is proportional to that before the landing.
+    """
+    s = params.symbols()
+
+    def invert_at_point(point: jax.Array) -> jax.Array:
+        theta, target_rate = point[0] + s.alpha, point[1]
+        landing = transitions.land(
+            s, theta, jnp.ones_like(target_rate), jnp.zeros_like(target_rate)
+        )
+        dtheta = target_rate / landing.motion.dtheta
+        is_admissible = landing.keeps_rear_foot & (dtheta > 0.0)
+        return jnp.where(is_admissible, jnp.stack([theta, dtheta, 0.0 * dtheta]), jnp.nan)
+
+    return np.asarray(jax.vmap(invert_at_point)(jnp.asarray(points)))
+
+
+def _make_orbit_variables(
+    params: WheelParams,
+    orbits: list[np.ndarray],
+    max_period: int,
+    model: AbstractWheel,
+    options: StepOptions,
+) -> dict[str, xr.Variable]:
+    """Return states, periods, DLS fractions and least margins of the orbits."""
+    n = len(orbits)
+    states = np.full((n, max_period, model.section_size(params)), np.nan)
+    margins = MARGIN_MEASURES if model.section_size(params) == 3 else ()
+    fractions, least_margins = np.zeros(n), {name: np.zeros(n) for name in margins}
+    for i, orbit in enumerate(orbits):
+        states[i, : len(orbit)] = orbit
+        measures = measure_orbits(params, orbit, model, options)
+        fractions[i] = measures["duration_dls"].sum() / measures["period"].sum()
+        for name in margins:
+            least_margins[name][i] = measures[name].min()
+    return {
+        "orbit_state": xr.Variable(
+            ("attractor_index", "orbit_step", "component"),
+            states,
+            {"long_name": "section states of the orbit, lowest dtheta- first"},
+        ),
+        "orbit_period": xr.Variable(
+            "attractor_index",
+            np.array([len(orbit) for orbit in orbits], int),
+            {"units": "1", "long_name": "steps until the orbit repeats"},
+        ),
+        "orbit_dls_fraction": xr.Variable(
+            "attractor_index", fractions, dict(MEASURES["dls_fraction"].attrs)
+        ),
+        **{
+            f"orbit_{name}": xr.Variable(
+                "attractor_index", values, dict(MARGIN_MEASURES[name].attrs)
+            )
+            for name, values in least_margins.items()
+        },
+    }
+
+
+def compute_end_shares(basins: xr.Dataset) -> dict[str, float]:
+    """Return the share of starts by end: "attractor 0", ..., or the name of the outcome."""
+    attractors = basins.attractor.values.ravel()
+    codes = basins.outcome.values.ravel()
+    names = [
+        f"attractor {a}"
+        if a >= 0
+        else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
+        for a, c in zip(attractors, codes, strict=True)
+    ]
+    return {name: names.count(name) / len(names) for name in sorted(set(names))}

@@ -1,0 +1,425 @@
+"""Single steps, the return map, and walks of many steps.
+
+All functions are pure, take a single wheel, and work with `jit`, `vmap` and every mode of
+differentiation. A model compiles its own step once.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from vrw_jax.contact import UnilateralStep, UnilateralWheel
+from vrw_jax.models import (
+    AbstractWheel,
+    AdvanceResult,
+    SectionState,
+    StepGround,
+    StepResult,
+    ViscoelasticWheel,
+)
+from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.printing import (
+    AbstractPrintable,
+    TextRow,
+    format_numbers,
+    format_outcome_counts,
+    format_quantity,
+)
+from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.validation import check_int, check_reals, check_type
+from vrw_jax.wheel import Outcome, WheelParams
+
+SectionLike = Array | np.ndarray | Sequence[float]
+"""Section state as a caller gives it; `validate_arguments` converts it to an array."""
+ModelLike = AbstractWheel | Literal["auto"]
+"""Model as a caller gives it; "auto" is `LadderWheel()`, the simplest valid model."""
+
+
+def paper_start() -> SectionState:
+    """Return a section state (theta-, dtheta-, dL1-) in the basin of the gait of Table 1.
+
+    Returns:
+        The section state, shape (3,), in rad, rad/s, m/s.
+
+    Examples:
+        >>> vrw.paper_start().round(4).tolist()
+        [0.1, 1.6, -0.1]
+    """
+    return ViscoelasticWheel().default_start(WheelParams())
+
+
+def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
+    """Return the model of an argument: by default the paper's, for "auto" a `LadderWheel`.
+
+    Raise if the argument is no model, or if its friction is an array although that is not allowed.
+    """
+    if model is None:
+        return _make_default_model()
+    if isinstance(model, str) and model == "auto":
+        return LadderWheel()
+    if not isinstance(model, AbstractWheel):
+        raise TypeError(
+            f"model is {model!r}, but a rung of the ladder is needed: give "
+            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
+        )
+    if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
+        raise ValueError(
+            f"friction has shape {shape}, but this is about one ground: give one number, or vary "
+            "it in a design of vrw.scan; vrw.step_batch takes one for each lane, vrw.walk one for each "
+            "of its steps."
+        )
+    return model
+
+
+_make_default_model = functools.cache(ViscoelasticWheel)
+
+
+def check_single_wheel(params: Any, remedy: str) -> None:
+    """Raise unless `params` is a single wheel; `remedy` completes the message."""
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    WheelParams.require_single(params, remedy)  # binding it takes as long as a step
+
+
+def check_options(options: StepOptions | None) -> StepOptions:
+    """Return the options, by default `StepOptions()`; raise if they are of another type."""
+    if options is not None:
+        check_type(
+            "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
+        )
+    return _make_default_options(jnp.result_type(float)) if options is None else options
+
+
+@functools.cache
+def _make_default_options(dtype: np.dtype) -> StepOptions:
+    """Return the default options, made once per type and concrete even under a trace."""
+    with jax.ensure_compile_time_eval():
+        return StepOptions()
+
+
+def check_section_state(
+    x: Any, description: str = "the section state", converter: Callable = check_reals
+) -> Any:
+    """Return the section state that `converter` makes of an argument; raise if it is invalid."""
+    return converter(
+        description,
+        x,
+        "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
+        "cycle.section_state",
+    )
+
+
+def validate_arguments(
+    params: WheelParams,
+    x: object,
+    model: ModelLike | None,
+    options: StepOptions | None,
+    engine: EngineName = "auto",
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    """Return wheel, section state, model and options of one type; raise if one is invalid."""
+    check_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
+    model, options = check_model(model), StepOptions.with_engine(check_options(options), engine)
+    state = check_section_state(x)
+    size = model.section_size(params)
+    if state.shape == (3,) and size != 3:
+        state = model.embed_section(params, state)
+    if state.shape != (size,):
+        raise ValueError(
+            f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
+            f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
+            "for batches map over it with jax.vmap."
+        )
+    # Parameters made in single precision stay inaccurate after a conversion to double precision.
+    StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
+    dtype = jnp.result_type(state, params.damping)
+    StepOptions.check_tolerances(options, dtype)
+
+    def convert(tree: Any) -> Any:
+        """Return the tree with all leaves of the common type."""
+        if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
+            return tree
+        return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
+
+    return convert(params), convert(state), model, convert(options)
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: UnilateralWheel,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> UnilateralStep: ...
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: LadderWheel | Literal["auto"],
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> LadderStep: ...
+
+
+@overload
+def step(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: AbstractWheel | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> StepResult: ...
+
+
+def step(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> StepResult | UnilateralStep | LadderStep:
+    """Return one step from touchdown to touchdown, with indicators, margins and energies.
+
+    The `outcome` of the result describes how the step ended; a fall raises no error. Errors of
+    values and first derivatives are below 1e-9 at the default options and below 1e-12 at
+    `StepOptions.tight()`.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        A `StepResult`; a `UnilateralStep` with unilateral contact, or a `LadderStep` for "auto".
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
+        >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
+        0.714 s, STEPPED
+    """
+    params, state, model, options = validate_arguments(params, x, model, options, engine)
+    return model.take_step(params, state, options)
+
+
+def return_map(
+    params: WheelParams,
+    x: SectionLike,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> Array:
+    """Return the section state one step later; all zeros (no section state) if the step failed.
+
+    No margins are computed. The map is differentiable in forward and reverse mode, to any order.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        The section state just before the next touchdown, of the shape of `x`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> params, x = vrw.WheelParams(damping=150.0), vrw.paper_start()
+        >>> vrw.return_map(params, x).round(4).tolist()
+        [0.091, 1.7355, -0.1587]
+        >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
+        (3, 3)
+    """
+    params, state, model, options = validate_arguments(params, x, model, options, engine)
+    return model.advance(params, state, options).section_state
+
+
+class Walk(AbstractPrintable):
+    """Results of consecutive steps without margins, with a leading axis over steps.
+
+    - `start`: section state at the start;
+    - `steps`: section state, durations and outcome of each step;
+    - `n_stepped`: number of steps before the first failure.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> walk.steps.section_state.shape
+        (5, 3)
+    """
+
+    start: Array
+    steps: AdvanceResult
+    n_stepped: Int[Array, ""]
+
+    @property
+    def outcome(self) -> Array:
+        """Return the outcome of the walk: that of the first failed step, or STEPPED."""
+        last_index = self.steps.outcome.shape[-1] - 1
+        return jnp.take_along_axis(
+            self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
+        )[..., 0]
+
+    def summary_rows(self) -> list[TextRow]:
+        """Return names and texts of outcome, steps, start, last state and time."""
+        outcome = np.asarray(self.outcome)
+        if outcome.ndim:
+            return [("walks", format_outcome_counts(outcome, Outcome))]
+        last_index = max(int(self.n_stepped) - 1, 0)
+        return [
+            ("outcome", Outcome(int(outcome)).meaning),
+            ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
+            ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
+            ("last section state", format_numbers(self.steps.section_state[last_index])),
+            ("time", format_quantity(np.sum(self.steps.durations), "s")),
+        ]
+
+
+@eqx.filter_jit
+def _scan_steps(
+    model: AbstractWheel,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+    n_steps: int,
+    ground_per_step: StepGround | None,
+) -> Walk:
+    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
+
+    def take_gait_step(carry: tuple, ground: StepGround | None) -> tuple:
+        """Return the next carry and one step, which is not taken after a failure."""
+        x, outcome = carry
+        is_walking = outcome == Outcome.STEPPED
+        model_and_params = (model, params) if ground is None else model.with_ground(params, ground)
+        advance = model_and_params[0].advance(
+            model_and_params[1], jnp.where(is_walking, x, jnp.nan), options
+        )
+        outcome = jnp.where(is_walking, advance.outcome, outcome)
+        advance = dataclasses.replace(
+            advance,
+            durations=jnp.where(is_walking, advance.durations, 0.0),
+            outcome=outcome,
+            solver_steps=jnp.where(is_walking, advance.solver_steps, 0),
+        )
+        return (advance.section_state, outcome), advance
+
+    carry = (x, jnp.int32(Outcome.STEPPED))
+    steps: AdvanceResult
+    _, steps = lax.scan(take_gait_step, carry, ground_per_step, length=n_steps)
+    return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
+
+
+def walk(
+    params: WheelParams,
+    x: SectionLike,
+    n_steps: int,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> Walk:
+    """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
+
+    With unilateral contact, `params.slope` and the friction of the model may be arrays over steps,
+    which describe uneven ground. Lines of these slopes connect the footholds: the k-th line ends
+    where the k-th step begins with a landing. Each foot has the friction of its own landing. Forces
+    are along and normal to the line that ends at the last landing. A section state refers to the
+    line that ends at its landing.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        n_steps: largest number of steps.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        A `Walk` whose fields have a leading axis over the steps.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> int(walk.n_stepped), walk.steps.durations.shape
+        (5, (5, 3))
+    """
+    n_steps = check_int("n_steps", n_steps)
+    checked_model, ground_per_step = check_model(model, allows_arrays=True), None
+    if isinstance(params, WheelParams):
+        ground_per_step = checked_model.split_ground(params, n_steps)
+    if ground_per_step is not None:
+        checked_model, params = checked_model.with_ground(
+            params, jax.tree.map(lambda row: row[0], ground_per_step)
+        )
+    params, state, checked_model, options = validate_arguments(
+        params, x, checked_model, options, engine
+    )
+    return _scan_steps(checked_model, params, state, options, n_steps, ground_per_step)
+
+
+N_APPROACH_STEPS = 100
+"""Number of steps toward a gait, for a search that needs a state near the gait."""
+
+
+def walk_toward_gait(model: AbstractWheel, params: WheelParams, options: StepOptions) -> Walk:
+    """Return a walk toward an attracting gait from the default start of the model."""
+    return walk(params, model.default_start(params), N_APPROACH_STEPS, model=model, options=options)
+
+
+def choose_model(
+    params: WheelParams,
+    start: SectionLike,
+    *,
+    friction: float | Array = 0.7,
+    options: StepOptions | None = None,
+) -> ModelChoice:
+    """Return the simplest model whose margins hold over one step from `start`.
+
+    `start` is the section state (theta-, dtheta-, dL1-) of the paper's model, or the full one of
+    `UnilateralWheel`. The function can be mapped over batches with `jax.vmap`.
+
+    Args:
+        params: the wheel.
+        start: section state, shape (3,), or a full state of `UnilateralWheel`.
+        friction: friction coefficient of the ground.
+        options: numerical options of the steps.
+
+    Returns:
+        A `ModelChoice` with the chosen `model` and the reason.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> choice = vrw.choose_model(vrw.WheelParams(), vrw.paper_start(), friction=0.7)
+        >>> type(choice.model).__name__
+        'UnilateralWheel'
+    """
+    model = LadderWheel(friction=friction)
+    params, x, _, options = validate_arguments(params, start, model, options)
+    return model.choose_model(params, x, options)[0]

@@ -1,0 +1,159 @@
+"""Steps of the highest model, unilateral contact, in batches and without derivatives."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.contact import (
+    CONTACT_STICK,
+    LOCKED_CODE_OFFSET,
+    UnilateralWheel,
+    embed_section_states,
+    min_dip_depth,
+    walk_batch,
+)
+from vrw_jax.numerics import StepOptions
+from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
+
+TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE = 1e-10, 1e-12
+"""Tolerances of steps. Looser ones save a seventh of the time but miss events; the tighter one
+costs a third more."""
+WALK_TOLERANCE = 3e-6
+"""Tolerance of walks by Tsit5, whose steps cost a quarter. At 1e-5, three gaits in 118 are
+missed."""
+COMPARISON_TOLERANCES = {
+    TIGHT_TOLERANCE: (VERY_TIGHT_TOLERANCE, 1e-11, 3e-11),
+    VERY_TIGHT_TOLERANCE: (1e-13, 3e-12, 1e-11),
+}
+"""Other tolerances for comparison if feet may dip."""
+
+
+class StepQuantities(NamedTuple):
+    """Result of a step of some elements."""
+
+    section_states: np.ndarray  # (elements, 4 + 3 n): section state after it; zeros if it failed
+    quantities: np.ndarray  # (elements, 7)
+    outcome: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class GroundBatch:
+    """Batch of wheels with unilateral contact, each with its own friction."""
+
+    parameter_columns: np.ndarray  # (10, elements): parameters and friction
+    n_legs: int  # number of legs
+    model: UnilateralWheel
+    options: StepOptions
+
+    @classmethod
+    def from_params(
+        cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: StepOptions
+    ) -> "GroundBatch":
+        parameter_columns = [
+            *(np.asarray(getattr(params, name)) for name in PARAMETER_NAMES),
+            friction,
+        ]
+        model = UnilateralWheel(stoppers=stoppers)  # type: ignore[arg-type]
+        return cls(np.stack(parameter_columns), params.n_legs, model, options)
+
+    def embed_states(
+        self, indices: np.ndarray, section_states: np.ndarray, is_rigid: Any = False
+    ) -> np.ndarray:
+        """Return full section states from the paper's, (elements, 3), with Leg 1 on its stopper
+        where `is_rigid`."""
+        full_states = np.array(
+            embed_section_states(self.parameter_columns[:, indices], section_states, self.n_legs)
+        )
+        full_states[:, 4 + 2 * self.n_legs] += np.where(is_rigid, LOCKED_CODE_OFFSET, 0)
+        return full_states
+
+    def take_steps(
+        self, indices: np.ndarray, section_states: np.ndarray, n_steps: int = 1
+    ) -> StepQuantities:
+        """Take steps from full section states."""
+        parameter_columns = self.parameter_columns[:, indices]
+        end_states, durations, outcome, *_, step_length = walk_batch(
+            parameter_columns, section_states, n_steps, self.model, self.options, self.n_legs
+        )
+        quantities = np.column_stack([durations, step_length, end_states[:, self.plane_indices()]])
+        return StepQuantities(end_states, quantities, outcome)
+
+    def with_loose_steps(self) -> "GroundBatch":
+        """Return the batch with steps for walks."""
+        return dataclasses.replace(
+            self, options=StepOptions(solver="Tsit5", rtol=WALK_TOLERANCE, atol=WALK_TOLERANCE)
+        )
+
+    def with_other_tolerances(self) -> list["GroundBatch"]:
+        """Return the batch with steps at other tolerances."""
+        own_tolerance = (
+            VERY_TIGHT_TOLERANCE
+            if float(self.options.rtol) < 0.5 * TIGHT_TOLERANCE
+            else TIGHT_TOLERANCE
+        )
+        options = [
+            StepOptions(rtol=tolerance, atol=tolerance)
+            for tolerance in COMPARISON_TOLERANCES[own_tolerance]
+        ]
+        return [dataclasses.replace(self, options=step_options) for step_options in options]
+
+    def min_dip_duration(self, indices: np.ndarray) -> np.ndarray:
+        """Return the time that a foot is off the ground in the smallest resolved dip, s."""
+        parameter = lambda name: self.parameter_columns[PARAMETER_NAMES.index(name)]
+        dip_depth = np.asarray(min_dip_depth(jnp.asarray(parameter("locked_length")), self.options))
+        return np.sqrt(8.0 * dip_depth / parameter("gravity"))[indices]
+
+    def free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
+        """Return which numbers of section states are free for the given legs' codes, (elements, 4 +
+        2 n).
+
+        The other numbers are determined by them. The hub's rates follow from a sticking foot, Leg
+        1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
+        """
+        n_legs = self.n_legs
+        contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
+        is_free = np.zeros((len(section_states), 4 + 2 * n_legs), bool)
+        is_free[:, :2] = is_free[:, 4 + n_legs] = True
+        is_free[:, 2] = contact_codes[:, 0] != CONTACT_STICK
+        is_free[:, 3] = is_free[:, 4] = contact_codes[:, 0] % LOCKED_CODE_OFFSET == 0
+        is_off_stopper = contact_codes[:, 1:] < LOCKED_CODE_OFFSET
+        is_free[:, 5 : 4 + n_legs], is_free[:, 5 + n_legs :] = is_off_stopper, is_off_stopper
+        return is_free
+
+    def complete_states(self, section_states: np.ndarray) -> np.ndarray:
+        """Return section states with the numbers that follow from the free ones: see
+        `free_coordinates`."""
+        n_legs, section_states = self.n_legs, section_states.copy()
+        theta, leg_1_code = (
+            section_states[:, 0],
+            np.round(section_states[:, 4 + 2 * n_legs]).astype(int),
+        )
+        foot_code = leg_1_code % LOCKED_CODE_OFFSET
+        height = section_states[:, 3 + n_legs] * np.cos(
+            theta - 2.0 * np.pi / n_legs
+        )  # of the hub, from the landing leg
+        sin, cos, hub_rate, leg_1_rate = (
+            np.sin(theta),
+            np.cos(theta),
+            section_states[:, 1],
+            section_states[:, 4 + n_legs],
+        )
+        section_states[:, 4] = np.where(
+            (foot_code != 0) & (leg_1_code < LOCKED_CODE_OFFSET), height / cos, section_states[:, 4]
+        )
+        length = section_states[:, 4]
+        section_states[:, 2] = np.where(
+            foot_code == CONTACT_STICK,
+            leg_1_rate * sin + length * hub_rate * cos,
+            section_states[:, 2],
+        )
+        section_states[:, 3] = np.where(
+            foot_code != 0, leg_1_rate * cos - length * hub_rate * sin, section_states[:, 3]
+        )
+        return section_states
+
+    def plane_indices(self) -> np.ndarray:
+        """Return the indices of the paper's section state in a full one."""
+        return np.array([0, 1, 4 + self.n_legs])

@@ -1,0 +1,177 @@
+"""Gaits of the models below unilateral contact, with the matrices that propagate a defect to
+measures."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.batches import step_batch
+from vrw_jax.cycles import GAIT_BATCH_SIZES, make_finder, retry_from_walks
+from vrw_jax.models import RigidWheel
+from vrw_jax.numerics import StepOptions, map_in_batches, take_rows, value_and_jacobian
+from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
+from vrw_jax.wheel import Outcome, WheelParams
+
+NO_MODEL, RIGID_MODEL_INDEX, PAPER_MODEL_INDEX, UNILATERAL_MODEL_INDEX = 0, 1, 2, 3
+MODEL_NAMES = ("none", "rigid", "viscoelastic", "unilateral")
+"""Names of the models by index."""
+
+SECTION_STATE_NAME = "section_state"
+
+FINAL_OUTCOMES = (Outcome.STEPPED, Outcome.EVENT_ORDER_MISMATCH)
+"""Outcomes of a search after which no walk is tried. Of 210 wheels with 6 to 12 legs whose solution
+has another order of phases, walks lead 3 to a gait."""
+
+
+class LowerFidelityGait(NamedTuple):
+    """One gait of each element, in a model whose section state is the paper's; the batch axis comes
+    first."""
+
+    model_index: np.ndarray  # NO_MODEL if there is no gait
+    section_state: np.ndarray  # (elements, 3)
+    quantities: np.ndarray  # (elements, 7): quantities of the step from it
+    newton_matrix: np.ndarray  # (elements, 3, 3): (I - DP)^-1
+    quantity_jacobian: np.ndarray  # (elements, 7, 3): derivatives of the quantities
+    defect: np.ndarray  # (elements, 3): numerical defect of the gait times `newton_matrix`
+    outcome: np.ndarray
+
+
+def empty_gaits(n_elements: int) -> LowerFidelityGait:
+    """Return empty gaits for a batch."""
+    return LowerFidelityGait(
+        np.full(n_elements, NO_MODEL), np.zeros((n_elements, 3)), np.zeros((n_elements, N_STEP_QUANTITIES)), np.zeros((n_elements, 3, 3)),
+        np.zeros((n_elements, N_STEP_QUANTITIES, 3)), np.zeros((n_elements, 3)), np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
+    )  # fmt: skip
+
+
+def replace_gaits(
+    gaits: LowerFidelityGait, indices: np.ndarray, new_gaits: LowerFidelityGait
+) -> None:
+    """Replace the gaits at these indices."""
+    for all_values, new_values in zip(gaits, new_gaits, strict=True):
+        all_values[indices] = new_values
+
+
+def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelityGait:
+    """Return gaits by collocation, with derivatives from one step by machine code."""
+
+    finder = make_finder(None, params.n_legs)
+    cycles = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params)
+    section_states, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
+    (missing,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
+    if len(missing):  # one mesh for all keeps digits independent of the batch
+        cycles = retry_from_walks(finder, *jax.device_put(take_rows((params, cycles), missing)))
+        section_states[missing], outcome[missing] = cycles.section_state, cycles.outcome
+    all_gaits = empty_gaits(len(section_states))
+    all_gaits.outcome[:] = outcome
+    (found_indices,) = np.nonzero(outcome == Outcome.STEPPED)
+    if not len(found_indices):
+        return all_gaits
+    found_params = jax.device_put(take_rows(params, found_indices))
+    step = step_batch(
+        found_params,
+        section_states[found_indices],
+        options=options,
+        derivatives=[SECTION_STATE_NAME],
+    )
+    step_jacobian = jax.tree.map(np.asarray, step.derivatives[SECTION_STATE_NAME])
+    end_states, durations = np.asarray(step.section_state), np.asarray(step.durations)
+    has_stepped = np.asarray(step.outcome) == Outcome.STEPPED
+    foot_distance = _foot_distance_factor(found_params) / np.cos(end_states[:, 0])
+    zeros = np.zeros(len(found_indices))
+    quantities = np.column_stack(
+        [durations[:, 0], durations[:, 1] + durations[:, 2], zeros, foot_distance, end_states]
+    )
+    length_jacobian = (foot_distance * np.tan(end_states[:, 0]))[
+        :, None
+    ] * step_jacobian.section_state[:, 0]
+    dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
+    rows = [dls_jacobian, sls1_jacobian + sls2_jacobian, 0.0 * dls_jacobian, length_jacobian]
+    quantity_jacobian = np.concatenate([np.stack(rows, 1), step_jacobian.section_state], 1)
+    gaits = _make_gaits(
+        PAPER_MODEL_INDEX,
+        section_states[found_indices],
+        end_states,
+        quantities,
+        step_jacobian.section_state,
+        quantity_jacobian,
+    )
+    replace_gaits(
+        all_gaits,
+        found_indices[has_stepped],
+        LowerFidelityGait(*(part[has_stepped] for part in gaits)),
+    )
+    all_gaits.outcome[found_indices[~has_stepped]] = np.asarray(step.outcome)[~has_stepped]
+    return all_gaits
+
+
+def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
+    """Return the rigid gaits in closed form: rolling with the classic landing, whose rear foot
+    leaves.
+
+    Stiff legs with unilateral contact approach this gait. The paper's landing, whose rear foot is
+    held, has a gait half as fast again.
+    """
+    section_states, end_states, length, duration, jacobian, duration_jacobian = map(
+        np.asarray, map_in_batches(_rolling_gaits, GAIT_BATCH_SIZES, params)
+    )
+    zeros = np.zeros_like(duration)
+    quantities = np.column_stack([zeros, duration, zeros, length, end_states])
+    zero_row = 0.0 * duration_jacobian
+    quantity_jacobian = np.concatenate(
+        [np.stack([zero_row, duration_jacobian, zero_row, zero_row], 1), jacobian], 1
+    )
+    return _make_gaits(
+        RIGID_MODEL_INDEX, section_states, end_states, quantities, jacobian, quantity_jacobian
+    )
+
+
+def static_contraction(params: WheelParams) -> np.ndarray:
+    """Return the static contraction of a leg over its length, which is the order of the rigid
+    model's error."""
+    s = jax.tree.map(np.asarray, params.symbols())
+    return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
+
+
+def _foot_distance_factor(params: WheelParams) -> np.ndarray:
+    """Return the distance between both feet at touchdown, times cos(theta-): L0 sin(alpha), m."""
+    return np.asarray(params.locked_length) * np.sin(params.leg_angle)
+
+
+def _make_gaits(
+    model_index: int, section_states: np.ndarray, end_states: np.ndarray, quantities: np.ndarray, jacobian: np.ndarray,
+    quantity_jacobian: np.ndarray,
+) -> LowerFidelityGait:  # fmt: skip
+    with np.errstate(all="ignore"):
+        newton_matrix = np.linalg.inv(np.eye(3) - jacobian)
+    defect = np.einsum("ijk,ik->ij", newton_matrix, end_states - section_states)
+    outcomes = np.full(len(section_states), int(Outcome.STEPPED))
+    return LowerFidelityGait(
+        np.full(len(section_states), model_index),
+        section_states,
+        quantities,
+        newton_matrix,
+        quantity_jacobian,
+        defect,
+        outcomes,
+    )
+
+
+@jax.jit
+def _rolling_gaits(params: WheelParams) -> tuple:
+    model, options = RigidWheel(stop_at_lift_off=False), StepOptions()
+
+    def rolling_gait(params: WheelParams) -> tuple:
+        def step_outputs(x: jax.Array) -> tuple:
+            step = model.take_step(params, x, options)
+            return step.section_state, step.step_length, jnp.sum(step.durations)
+
+        x = model.default_start(params)
+        (y, length, duration), (jacobian, _, duration_jacobian) = value_and_jacobian(
+            step_outputs, x
+        )
+        return x, y, length, duration, jacobian, duration_jacobian
+
+    return jax.vmap(rolling_gait)(params)

@@ -1,0 +1,607 @@
+"""Refinement of gaits of the highest model by quasi-Newton steps that need only its values.
+
+One step of the highest model from a state x gives the defect r = P(x) - x. Multiplied by the
+inverse of I - DP it is Newton's correction d. The gait's quantities are near those of this step
+plus their change along d. At first both matrices are the lower model's, if it has a gait. Each
+further step updates them by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965). If
+the convergence is slow, and if the legs' codes have changed, finite differences of a few more steps
+replace the matrices. The matrices of another motion predict a small correction in a slow direction,
+and an error bound that follows from them is invalid. The contraction q of d from one step to the
+next is measured, and the larger of the last two bounds the remaining error. As for a contraction
+(Kantorovich), with a factor of two, the bound is 2q/(1 - q) times the last change but one.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait
+from vrw_jax.tolerance.step_quantities import (
+    N_DURATIONS,
+    N_STEP_QUANTITIES,
+    evaluate_measures,
+    measure_derivatives,
+)
+from vrw_jax.wheel import Outcome
+
+REFRESH_ABOVE, MAX_TRUSTED_RATE, MIN_RATE = 0.5, 0.25, 0.1
+"""Contraction rates. Above the first, matrices are recomputed. Above the second, the rate is not
+trusted to bound the remaining error. The third is the smallest rate that is assumed. A slow
+direction is hidden behind quick ones: when corrections decreased by a third each, one gait was four
+times as far away as its bound."""
+CURVATURE_PER_LENGTH = 5.0
+"""Smallest assumed contraction rate over the length of a correction, a measure of the curvature of
+the maps."""
+MAX_CORRECTION = 1.0
+"""Longest accepted correction, rad, rad/s, m/s; beyond it the linearization is unknown."""
+MAX_FAILURES = 4
+"""Number of corrections that do not contract, or of changes of the legs' codes, before an element
+fails."""
+STEP_ERROR_PER_TOLERANCE = 30.0
+"""Error of a step over the tolerance of its solver steps; 99 of 100 are within a third of it."""
+ErrorGoal = Callable[[np.ndarray], np.ndarray]
+"""Allowed errors of measures with about these values, (elements, measures)."""
+MIN_UPDATE_SHARE = 1e-3
+"""Smallest share of a direction that must remain after a step for an update of the inverse."""
+DIFFERENCE_STEP = 1e-5
+"""Step of finite differences in a coordinate of the section state, rad, rad/s, m, m/s."""
+MAX_FD_DERIVATIVE = 10.0
+"""Derivative by differences above which they may cross a jump. Of 1,042 derivatives at gaits one in
+a hundred is steeper. Across a jump a correction gives no information about the remaining error."""
+MAX_ITERATIONS, REFRESH_INTERVAL = 24, 8
+"""Largest number of corrections of one iteration, and the number after which matrices are
+recomputed."""
+ROUNDOFF_LEVEL, STALL_LEVEL = 1e2, 1e4
+"""Lengths of corrections in tolerances: the level of the integrator's errors, and the level below
+which corrections may stall."""
+N_PRESUMED_DIPS = 3.0
+"""Number of shortest dips of a foot that a step may miss or add."""
+MAX_PRESUMED_SHARE = 0.1
+"""Largest share of the allowed error that is assumed for such dips; otherwise it is measured."""
+STALL_SAFETY_FACTOR = 6.0
+"""Safety factor of stalled corrections, relative to their own effect, and of the difference between
+steps at two tolerances. A factor of four was too small for 4 of 10,365 results."""
+MAX_GAIT_DISTANCE, MAX_WALK_DRIFT = 1e-3, 1e-3
+"""Largest distance of a gait from a walk's end without a second walk, and largest drift of that
+second walk, rad, rad/s, m, m/s."""
+MIN_RESOLVED_CHANGE = 1e-13
+"""Length below which a change is not resolved."""
+
+
+class StepEstimate(NamedTuple):
+    """Estimate of a gait's measures from one step of the highest model; the batch axis comes
+    first."""
+
+    same_codes: np.ndarray  # whether the legs' codes are unchanged by the step
+    values: np.ndarray  # (elements, measures): estimated measures of the gait
+    correction_effect: (
+        np.ndarray
+    )  # (elements, measures): sum of the absolute effects of the correction
+    quantity_jacobian: (
+        np.ndarray
+    )  # (elements, measures, 7): derivatives with respect to the step's quantities
+    numerical_error: np.ndarray  # (elements, measures): bound of the integrator's error
+    dip_error: np.ndarray  # (elements, measures): bound of the error from unresolved short dips
+
+
+class RefinementResult(NamedTuple):
+    """Result of the refinement."""
+
+    is_done: np.ndarray
+    values: np.ndarray
+    remaining_error: np.ndarray  # (elements, measures): bound of the iteration's error
+    numerical_error: np.ndarray
+    n_steps: np.ndarray  # of the highest model
+    section_states: np.ndarray  # (elements, 4 + 3 n)
+    speed: np.ndarray  # of the last step, m/s
+
+
+@dataclasses.dataclass
+class BroydenIteration:
+    """Quasi-Newton iteration of a batch to a fixed point of the highest model, with Broyden
+    updates."""
+
+    ground: GroundBatch
+    indices: np.ndarray
+    section_states: np.ndarray
+    newton_matrix: np.ndarray  # (elements, m, m): inverse of I - DP
+    quantity_jacobian: (
+        np.ndarray
+    )  # (elements, 7, m): derivatives of the quantities with respect to x
+    has_current_matrices: np.ndarray  # whether the matrices are those of this motion
+    is_free: np.ndarray
+    has_previous: np.ndarray  # whether the previous step had the same codes
+    previous: tuple[np.ndarray, ...]  # its start, defect and quantities
+    correction: np.ndarray
+
+    @classmethod
+    def from_states(
+        cls,
+        ground: GroundBatch,
+        indices: np.ndarray,
+        section_states: np.ndarray,
+        lower_gaits: LowerFidelityGait | None,
+    ) -> "BroydenIteration":
+        """Start from `section_states`, with the matrices of the lower model's gaits if there are
+        any."""
+        n_elements, n_numbers = len(indices), section_states.shape[1] - ground.n_legs
+        newton_matrix, quantity_jacobian = (
+            np.tile(np.eye(n_numbers), (n_elements, 1, 1)),
+            np.zeros((n_elements, N_STEP_QUANTITIES, n_numbers)),
+        )
+        if lower_gaits is not None:
+            plane_indices = ground.plane_indices()
+            newton_matrix[:, plane_indices[:, None], plane_indices] = lower_gaits.newton_matrix
+            quantity_jacobian[:, :, plane_indices] = lower_gaits.quantity_jacobian
+        previous = (
+            np.zeros((n_elements, n_numbers)),
+            np.zeros((n_elements, n_numbers)),
+            np.zeros((n_elements, N_STEP_QUANTITIES)),
+        )
+        has_current_matrices, has_previous = (
+            np.full(n_elements, lower_gaits is not None),
+            np.zeros(n_elements, bool),
+        )
+        is_free = ground.free_coordinates(section_states)
+        return cls(
+            ground,
+            indices,
+            section_states.copy(),
+            newton_matrix,
+            quantity_jacobian,
+            has_current_matrices,
+            is_free,
+            has_previous,
+            previous,
+            np.zeros((n_elements, n_numbers)),
+        )
+
+    def select(self, selected: np.ndarray) -> "BroydenIteration":
+        """Return the iteration of the selected elements."""
+        ground, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return BroydenIteration(ground, *jax.tree.map(lambda x: x[selected], arrays))
+
+    def observe(
+        self, positions: np.ndarray, step: StepQuantities, names: Sequence[str]
+    ) -> StepEstimate:
+        """Update the matrices from a step of some elements, and return the estimate of their
+        gaits."""
+        n_numbers = self.is_free.shape[1]
+        section_states, end_states = self.section_states[positions], step.section_states
+        same_codes = self.has_same_codes(positions, step)
+        defect = np.where(
+            self.is_free[positions] & same_codes[:, None],
+            end_states[:, :n_numbers] - section_states[:, :n_numbers],
+            0.0,
+        )
+        self._update_matrices(
+            positions, section_states[:, :n_numbers], defect, step.quantities, same_codes
+        )
+        newton_matrix, quantity_jacobian = (
+            self.newton_matrix[positions],
+            self.quantity_jacobian[positions],
+        )
+        correction = np.where(
+            self.is_free[positions], np.einsum("ijk,ik->ij", newton_matrix, defect), 0.0
+        )
+        self.correction[positions] = correction
+        for previous_values, current_values in zip(
+            self.previous, (section_states[:, :n_numbers], defect, step.quantities), strict=True
+        ):
+            previous_values[positions] = current_values
+        with np.errstate(all="ignore"):
+            estimate = step.quantities + np.einsum("ijk,ik->ij", quantity_jacobian, correction)
+            measure_jacobian = measure_derivatives(names, estimate)
+            state_sensitivity = np.abs(measure_jacobian @ quantity_jacobian)
+            correction_effect = np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction))
+            tolerance = STEP_ERROR_PER_TOLERANCE * float(self.ground.options.rtol)
+            total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
+                state_sensitivity @ np.abs(newton_matrix), axis=-1
+            )
+            # A dip moves time from one duration to another.
+            spread = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
+            dip_error = (
+                N_PRESUMED_DIPS
+                * self.ground.min_dip_duration(self.indices[positions])[:, None]
+                * spread
+            )
+            values = evaluate_measures(names, estimate)
+            return StepEstimate(
+                same_codes,
+                values,
+                correction_effect,
+                measure_jacobian,
+                tolerance * total_sensitivity,
+                dip_error,
+            )
+
+    def _update_matrices(
+        self,
+        positions: np.ndarray,
+        x: np.ndarray,
+        defect: np.ndarray,
+        quantities: np.ndarray,
+        same_codes: np.ndarray,
+    ) -> None:
+        """Apply Broyden's updates to both matrices if the previous step is comparable."""
+        previous_x, previous_defect, previous_quantities = (
+            previous_values[positions] for previous_values in self.previous
+        )
+        state_change = np.where(self.is_free[positions], x - previous_x, 0.0)
+        defect_change = previous_defect - defect
+        newton_matrix, quantity_jacobian = (
+            self.newton_matrix[positions],
+            self.quantity_jacobian[positions],
+        )
+        squared_length = np.einsum("ij,ij->i", state_change, state_change)
+        predicted_change = np.einsum("ijk,ik->ij", newton_matrix, defect_change)
+        projection = np.einsum("ij,ij->i", state_change, predicted_change)
+        can_update = (
+            self.has_previous[positions] & same_codes & (squared_length > MIN_RESOLVED_CHANGE**2)
+        )
+        is_well_conditioned = can_update & (np.abs(projection) > MIN_UPDATE_SHARE * squared_length)
+        update_row = (
+            np.einsum("ij,ijk->ik", state_change, newton_matrix)
+            / np.where(is_well_conditioned, projection, 1.0)[:, None]
+        )
+        updated = (
+            newton_matrix + (state_change - predicted_change)[:, :, None] * update_row[:, None, :]
+        )
+        self.newton_matrix[positions] = np.where(
+            is_well_conditioned[:, None, None], updated, newton_matrix
+        )
+        prediction_error = (
+            quantities
+            - previous_quantities
+            - np.einsum("ijk,ik->ij", quantity_jacobian, state_change)
+        )
+        update_row = state_change / np.where(can_update, squared_length, 1.0)[:, None]
+        updated = quantity_jacobian + prediction_error[:, :, None] * update_row[:, None, :]
+        self.quantity_jacobian[positions] = np.where(
+            can_update[:, None, None], updated, quantity_jacobian
+        )
+        self.has_previous[positions] = same_codes
+
+    def step_elements(self, positions: np.ndarray) -> StepQuantities:
+        """Take one step from the current states of some elements."""
+        return self.ground.take_steps(self.indices[positions], self.section_states[positions])
+
+    def has_same_codes(self, positions: np.ndarray, step: StepQuantities) -> np.ndarray:
+        """Return whether the step of these elements ended with the codes at its start."""
+        n_numbers = self.is_free.shape[1]
+        same_codes = np.all(
+            self.section_states[positions, n_numbers:] == step.section_states[:, n_numbers:], axis=1
+        )
+        return same_codes & (step.outcome == Outcome.STEPPED)
+
+    def dip_errors_by_comparison(
+        self, positions: np.ndarray, names: Sequence[str], refinement: "RefinementResult"
+    ) -> np.ndarray:
+        """Return numerical errors from steps at other tolerances, which replace the assumed error
+        of dips.
+
+        At another tolerance the shortest resolved dips are shorter or longer. The error is infinite
+        if one of these steps has another motion.
+        """
+        worst_error = np.zeros_like(refinement.numerical_error[positions])
+        for other_ground in self.ground.with_other_tolerances():
+            other_iteration = dataclasses.replace(
+                self.select(positions),
+                ground=other_ground,
+                has_previous=np.zeros(len(positions), bool),
+            )
+            estimate = other_iteration.observe(
+                np.arange(len(positions)),
+                other_iteration.step_elements(np.arange(len(positions))),
+                names,
+            )
+            difference_bound = STALL_SAFETY_FACTOR * np.abs(
+                estimate.values - refinement.values[positions]
+            )
+            error = difference_bound + np.minimum(
+                estimate.numerical_error, refinement.numerical_error[positions]
+            )
+            worst_error = np.maximum(
+                worst_error, np.where(estimate.same_codes[:, None], error, np.inf)
+            )
+        return worst_error
+
+    def is_attracting(self) -> np.ndarray:
+        """Return whether nearby walks converge to the current states: no multiplier is outside the
+        unit circle.
+
+        Equivalently, no eigenvalue of (I - DP)^-1 has a real part below a half.
+        """
+        return np.linalg.eigvals(self.newton_matrix).real.min(-1) > 0.5
+
+    def distance_to(self, section_states: np.ndarray) -> np.ndarray:
+        """Return the largest distance of the current states from `section_states`."""
+        return np.abs(self.section_states - section_states)[:, : self.is_free.shape[1]].max(-1)
+
+    def stays_near(self, n_steps: int) -> np.ndarray:
+        """Return whether a walk stays at the current states, because finite differences across a
+        dip give wrong multipliers."""
+        end = self.ground.take_steps(self.indices, self.section_states, n_steps)
+        return (end.outcome == Outcome.STEPPED) & (
+            self.distance_to(end.section_states) <= MAX_WALK_DRIFT
+        )
+
+    def apply_correction(
+        self, positions: np.ndarray, end_states: np.ndarray, same_codes: np.ndarray
+    ) -> None:
+        """Move to the corrected states, or to the end of the step if codes have changed."""
+        n_numbers = self.is_free.shape[1]
+        corrected = np.where(
+            self.is_free[positions],
+            self.section_states[positions, :n_numbers] + self.correction[positions],
+            end_states[:, :n_numbers],
+        )
+        self.section_states[positions] = end_states
+        self.section_states[positions[same_codes], :n_numbers] = corrected[same_codes]
+        self.section_states[positions[same_codes]] = self.ground.complete_states(
+            self.section_states[positions[same_codes]]
+        )
+        changed_positions = positions[~same_codes]
+        self.newton_matrix[changed_positions] = np.eye(n_numbers)
+        self.quantity_jacobian[changed_positions] = 0.0
+        self.has_current_matrices[changed_positions] = False
+        self.is_free[changed_positions] = self.ground.free_coordinates(
+            self.section_states[changed_positions]
+        )
+
+    def difference_matrices(self, positions: np.ndarray, step: StepQuantities) -> np.ndarray:
+        """Recompute both matrices by finite differences, one more step for each free coordinate.
+
+        `step` is the one from the current states. Return the number of steps taken for each
+        element. A difference above MAX_FD_DERIVATIVE is also taken on the other side, and the
+        smaller one is used.
+        """
+        n_numbers = self.is_free.shape[1]
+        element_positions, coordinate_indices = np.nonzero(self.is_free[positions])
+        if not len(element_positions):
+            return np.zeros(0, int)
+        differences = self._finite_differences(
+            positions, step, element_positions, coordinate_indices, DIFFERENCE_STEP
+        )
+        steep_pairs = np.flatnonzero(np.abs(differences).max(-1) > MAX_FD_DERIVATIVE)
+        if len(steep_pairs):
+            reverse_differences = self._finite_differences(
+                positions,
+                step,
+                element_positions[steep_pairs],
+                coordinate_indices[steep_pairs],
+                -DIFFERENCE_STEP,
+            )
+            is_smaller = np.abs(reverse_differences).max(-1) < np.abs(differences[steep_pairs]).max(
+                -1
+            )
+            differences[steep_pairs[is_smaller]] = reverse_differences[is_smaller]
+        jacobian, quantity_jacobian = (
+            np.zeros((len(positions), n_numbers, n_numbers)),
+            np.zeros((len(positions), N_STEP_QUANTITIES, n_numbers)),
+        )
+        jacobian[element_positions, :, coordinate_indices] = np.where(
+            self.is_free[positions][element_positions], differences[:, :n_numbers], 0.0
+        )
+        quantity_jacobian[element_positions, :, coordinate_indices] = differences[:, n_numbers:]
+        newton_system = np.eye(n_numbers) - jacobian
+        is_singular = np.abs(np.linalg.det(newton_system)) < MIN_RESOLVED_CHANGE
+        newton_system[is_singular] = np.eye(n_numbers)
+        self.newton_matrix[positions], self.quantity_jacobian[positions] = (
+            np.linalg.inv(newton_system),
+            quantity_jacobian,
+        )
+        self.has_previous[positions], self.has_current_matrices[positions] = False, True
+        return np.bincount(
+            np.concatenate([element_positions, element_positions[steep_pairs]]),
+            minlength=len(positions),
+        )
+
+    def _finite_differences(
+        self,
+        positions: np.ndarray,
+        step: StepQuantities,
+        element_positions: np.ndarray,
+        coordinate_indices: np.ndarray,
+        difference_step: float,
+    ) -> np.ndarray:
+        """Return derivatives of section state and quantities, (pairs, m + 7), for changes of single
+        coordinates.
+
+        A pair is an element position and a coordinate. The derivatives are zero if the step ends
+        with other codes.
+        """
+        n_numbers = self.is_free.shape[1]
+        section_states = self.section_states[positions][element_positions]
+        section_states[np.arange(len(element_positions)), coordinate_indices] += difference_step
+        perturbed_step = self.ground.take_steps(
+            self.indices[positions][element_positions], self.ground.complete_states(section_states)
+        )
+        same_codes = np.all(
+            perturbed_step.section_states[:, n_numbers:]
+            == step.section_states[element_positions, n_numbers:],
+            axis=1,
+        )
+        changes = np.concatenate(
+            [
+                perturbed_step.section_states[:, :n_numbers]
+                - step.section_states[element_positions, :n_numbers],
+                perturbed_step.quantities - step.quantities[element_positions],
+            ],
+            1,
+        )
+        return np.where(same_codes[:, None], changes, 0.0) / difference_step
+
+
+class _ErrorBound:
+    """Bounds of the remaining error from the measured contraction of each element's corrections."""
+
+    def __init__(self, n_elements: int, n_measures: int, tolerance: float) -> None:
+        self.tolerance = tolerance
+        self.correction_length, self.contraction_rate = (
+            np.full(n_elements, np.inf),
+            np.zeros(n_elements),
+        )
+        self.correction_effect, self.measures = (
+            np.full((n_elements, n_measures), np.inf),
+            np.full((n_elements, n_measures), np.nan),
+        )
+
+    def reset(self, positions: np.ndarray, contraction_rate: float) -> None:
+        """Reset these elements after their matrices have been replaced."""
+        self.correction_length[positions], self.contraction_rate[positions] = (
+            np.inf,
+            contraction_rate,
+        )
+
+    def remaining_error(
+        self, positions: np.ndarray, estimate: StepEstimate, correction_length: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Return the bound of the remaining error, (elements, measures), the contraction rates, and
+        which stall.
+
+        Corrections stall if they stop decreasing and are as small as the integrator's errors allow.
+        """
+        previous_length = self.correction_length[positions]
+        with np.errstate(all="ignore"):
+            rate = np.where(estimate.same_codes, correction_length / previous_length, np.inf)
+            # With differences across a dip, shorter corrections change measures as much as before.
+            effect_rate = np.max(
+                estimate.correction_effect
+                / np.maximum(self.correction_effect[positions], MIN_RESOLVED_CHANGE),
+                axis=1,
+            )
+            is_stalled = (
+                estimate.same_codes
+                & (np.maximum(rate, effect_rate) > REFRESH_ABOVE)
+                & np.isfinite(previous_length)
+            )
+            is_stalled &= (
+                np.maximum(correction_length, previous_length) <= STALL_LEVEL * self.tolerance
+            )
+            rate = np.where(
+                estimate.same_codes & (correction_length <= ROUNDOFF_LEVEL * self.tolerance),
+                0.0,
+                rate,
+            )
+            # No rate is trusted before there is a previous correction.
+            min_rate = np.clip(CURVATURE_PER_LENGTH * previous_length, MIN_RATE, MAX_TRUSTED_RATE)
+            min_rate = np.where(np.isfinite(previous_length), min_rate, np.inf)
+            worst_rate = np.maximum(np.maximum(rate, self.contraction_rate[positions]), min_rate)
+            worst_rate = np.maximum(worst_rate, np.where(rate > 0.0, effect_rate, 0.0))
+            change = np.abs(estimate.values - self.measures[positions])
+            effect = np.fmax(
+                np.fmax(estimate.correction_effect, self.correction_effect[positions]), change
+            )
+            error_share = np.where(
+                worst_rate <= MAX_TRUSTED_RATE, 2.0 * worst_rate / (1.0 - worst_rate), np.inf
+            )
+            error_share = np.where(
+                is_stalled, np.minimum(error_share, STALL_SAFETY_FACTOR), error_share
+            )
+            remaining_error = np.nan_to_num(
+                error_share[:, None] * effect, nan=np.inf, posinf=np.inf
+            )
+        has_previous = np.isfinite(previous_length)
+        self.contraction_rate[positions] = np.where(
+            has_previous, np.where(estimate.same_codes, rate, 0.0), self.contraction_rate[positions]
+        )
+        self.correction_length[positions] = np.where(estimate.same_codes, correction_length, np.inf)
+        self.correction_effect[positions], self.measures[positions] = (
+            estimate.correction_effect,
+            estimate.values,
+        )
+        return remaining_error, rate, is_stalled
+
+
+def refine(
+    iteration: BroydenIteration,
+    names: Sequence[str],
+    error_goal: ErrorGoal,
+    n_steps_before_differences: int,
+    first_step_and_estimate: tuple[StepQuantities, StepEstimate] | None = None,
+) -> RefinementResult:
+    """Apply corrections until the remaining error is below the goal, at most MAX_ITERATIONS.
+
+    Finite differences replace the matrices after `n_steps_before_differences` steps, and
+    immediately if the matrices are those of another motion. `first_step_and_estimate` is the step
+    from the current states with its estimate, if it has been taken.
+    """
+    n_elements, n_measures = len(iteration.indices), len(names)
+    result = RefinementResult(
+        np.zeros(n_elements, bool), np.full((n_elements, n_measures), np.nan), np.full((n_elements, n_measures), np.inf), np.zeros((n_elements, n_measures)),
+        np.zeros(n_elements, int), iteration.section_states, np.full(n_elements, np.nan),
+    )  # fmt: skip
+    error_bound = _ErrorBound(n_elements, n_measures, float(iteration.ground.options.rtol))
+    n_failures, n_steps_since_refresh, active = (
+        np.zeros(n_elements, int),
+        np.full(n_elements, REFRESH_INTERVAL - n_steps_before_differences),
+        np.arange(n_elements),
+    )
+    needs_comparison = np.zeros(n_elements, bool)
+    for iteration_index in range(MAX_ITERATIONS):
+        if not len(active):
+            break
+        if first_step_and_estimate is not None and iteration_index == 0:
+            step, estimate = first_step_and_estimate
+        else:
+            step = iteration.step_elements(active)
+            result.n_steps[active] += 1
+            needs_refresh = iteration.has_same_codes(active, step) & (
+                (n_steps_since_refresh[active] >= REFRESH_INTERVAL)
+                | ~iteration.has_current_matrices[active]
+            )
+            positions = active[needs_refresh]
+            result.n_steps[positions] += iteration.difference_matrices(
+                positions, StepQuantities(*(x[needs_refresh] for x in step))
+            )
+            error_bound.reset(positions, 0.0 if n_steps_before_differences else np.inf)
+            n_steps_since_refresh[positions] = 0
+            estimate = iteration.observe(active, step, names)
+        correction_length = np.linalg.norm(iteration.correction[active], axis=1)
+        remaining_error, rate, is_stalled = error_bound.remaining_error(
+            active, estimate, correction_length
+        )
+        error_goals = error_goal(estimate.values)
+        is_done = is_stalled | np.all(
+            remaining_error
+            <= np.maximum(error_goals - estimate.numerical_error, estimate.numerical_error),
+            axis=1,
+        )
+        result.values[active], result.remaining_error[active], result.is_done[active] = (
+            estimate.values,
+            remaining_error,
+            is_done,
+        )
+        result.numerical_error[active] = estimate.numerical_error + estimate.dip_error
+        result.speed[active] = evaluate_measures(("speed",), step.quantities)[:, 0]
+        # A walk may end at a gait whose feet dip more often than assumed.
+        needs_comparison[active] = is_done & (
+            np.any(estimate.dip_error > MAX_PRESUMED_SHARE * error_goals, axis=1)
+            | (n_steps_before_differences == 0)
+        )
+        is_slow = np.isfinite(rate) & (rate > REFRESH_ABOVE)
+        n_failures[active] += ~estimate.same_codes | is_slow
+        n_steps_since_refresh[active] = np.where(
+            is_slow, REFRESH_INTERVAL, n_steps_since_refresh[active] + 1
+        )
+        continues = (
+            ~is_done & (step.outcome == Outcome.STEPPED) & (correction_length <= MAX_CORRECTION)
+        )
+        continues &= n_failures[active] < MAX_FAILURES
+        iteration.apply_correction(
+            active[continues], step.section_states[continues], estimate.same_codes[continues]
+        )
+        active = active[continues]
+    positions = np.flatnonzero(needs_comparison)
+    if len(positions):
+        result.numerical_error[positions] = iteration.dip_errors_by_comparison(
+            positions, names, result
+        )
+        result.n_steps[positions] += len(iteration.ground.with_other_tolerances())
+    result.is_done[positions] &= np.isfinite(result.numerical_error[positions]).all(1)
+    return result

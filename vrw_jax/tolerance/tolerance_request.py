@@ -1,0 +1,420 @@
+"""Measures to within a tolerance, from the lowest model whose error can be bounded.
+
+The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
+by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
+residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
+finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise the
+same step is the first of an iteration to the gait with unilateral contact. If the iteration does
+not contract, the gait is another one, and a walk leads to it.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
+from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.tolerance.contact_steps import TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE, GroundBatch
+from vrw_jax.tolerance.lower_fidelity import (
+    NO_MODEL,
+    RIGID_MODEL_INDEX,
+    UNILATERAL_MODEL_INDEX,
+    LowerFidelityGait,
+    empty_gaits,
+    find_paper_gaits,
+    find_rigid_gaits,
+    replace_gaits,
+    static_contraction,
+)
+from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
+from vrw_jax.tolerance.refinement import (
+    MAX_GAIT_DISTANCE,
+    BroydenIteration,
+    RefinementResult,
+    refine,
+)
+from vrw_jax.tolerance.settling import walk_until_settled
+from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
+from vrw_jax.validation import (
+    check_bool,
+    check_choice,
+    check_known_name,
+    check_names,
+    check_not_traced,
+    check_positive,
+    check_type,
+)
+from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
+
+ERROR_SAFETY_FACTOR = 4.0
+"""Factor from the error estimate of one step to its bound, valid as long as corrections contract by
+3/4."""
+TIGHT_BELOW = 1e-7
+"""Tolerance of a measure below which steps use VERY_TIGHT_TOLERANCE."""
+N_EXACT_STEPS = 3
+"""Number of steps after a loose walk, before corrections, because looser steps may end in other
+modes."""
+N_STABILITY_STEPS = 60
+"""Number of steps of a walk that must stay near a gait if the gait is far from the end of the
+previous walk."""
+N_COLD_STARTS = 2
+"""Number of starts, slow ones first, for wheels without a lower gait. Of 232 wheels the first two
+starts led 100 to a gait, and the other starts led none of the rest."""
+MAX_DISTANCE_RATIO = 2.0
+"""Largest distance of the gait with unilateral contact from the lower gait that it continues, in
+first corrections. It is chosen because a contraction by a half moves at most so far."""
+N_STEPS_BEFORE_DIFFERENCES = 3
+"""Number of steps from a lower gait with its own derivatives, before finite differences replace
+them."""
+
+
+def measure_to_tolerance(
+    measures: str | Sequence[str],
+    params: WheelParams,
+    tol: float,
+    *,
+    friction: Any = 0.7,
+    relative: bool = False,
+    stoppers: str = "bilateral",
+    which: GaitChoice | None = None,
+) -> MeasureResult:
+    """Return measures of the wheel's gait on ground of this friction, each to within `tol`.
+
+    The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the one that
+    continues the paper's gait, or else the one that a walk from the paper's gait reaches;
+    `MeasureResult.explanation` names which. Fields of `params` and `friction` may have one batch
+    axis; each element is computed independently.
+
+    This function cannot be used inside `jax.jit`, because it depends on values.
+
+    Args:
+        measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
+            duration_single, duration_flight, theta_touchdown, dtheta_touchdown, dL1_touchdown.
+        params: the wheel, or a batch of wheels.
+        tol: allowed error, in the measure's unit or relative to the value.
+        friction: friction coefficient of the ground.
+        relative: whether `tol` is relative to the value itself.
+        stoppers: of the reference wheel, "bilateral" or "one-sided".
+        which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
+            contact that walks from a stated set of starts reach; replaces the gait above.
+
+    Returns:
+        A `MeasureResult`.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> wheel = vrw.WheelParams(damping=150.0)
+        >>> result = vrw.measure_to_tolerance("speed", wheel, 1e-3, friction=50.0)
+        >>> print(f"{result.value:.2f} m/s", result.error <= 1e-3)
+        1.02 m/s True
+    """
+    start_seconds = time.perf_counter()
+    check_not_traced(
+        "vrw.measure_to_tolerance", "it on numbers, and give lanes as arrays", params, friction
+    )
+    names = check_names("measures", measures)
+    for name in names:
+        check_known_name(name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    if not names:
+        raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
+    tol, relative = check_positive("tol", tol), check_bool("relative", relative)
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
+    params, mu, shape = check_batch(params, convert_friction(friction))
+    rank = None if which is None else parse_gait_choice(which)
+    tolerance = TIGHT_TOLERANCE if tol >= TIGHT_BELOW else VERY_TIGHT_TOLERANCE
+    options = StepOptions(rtol=tolerance, atol=tolerance)
+    request = _MeasureRequest(
+        names, tol, relative, GroundBatch.from_params(params, mu, stoppers, options), params
+    )
+    if rank is None:
+        request.try_rigid_model()
+        request.try_paper_model()
+        request.walk_to_gaits()
+    else:
+        request.select_by_rank(rank)
+    results = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), request.results)
+    del results["speeds"]
+    return MeasureResult(
+        **results,
+        names=names,
+        is_single=isinstance(measures, str),
+        seconds=time.perf_counter() - start_seconds,
+    )
+
+
+def check_batch(
+    params: WheelParams, friction: Any
+) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
+    """Return wheels and friction broadcast to one batch axis, and the shape that they were given
+    in."""
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
+    shape = max(shapes, key=len)
+    if len(shape) > 1 or shapes - {(), shape}:
+        shapes_text = ", ".join(map(str, sorted(shapes - {()})))
+        raise ValueError(
+            f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but lanes have one axis, the same for "
+            "all: give one value for all, or one for each lane."
+        )
+    n_elements = shape[0] if shape else 1
+    broadcast = lambda x: np.broadcast_to(np.asarray(x, float), (n_elements,))
+    return jax.tree.map(lambda x: jnp.asarray(broadcast(x)), params), broadcast(friction), shape
+
+
+class _MeasureRequest:
+    """Request for measures of a batch of wheels, with the results so far."""
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        tol: float,
+        relative: bool,
+        ground: GroundBatch,
+        params: WheelParams,
+    ) -> None:
+        n_elements, n_measures = len(ground.parameter_columns.T), len(names)
+        self.names, self.tol, self.relative = names, tol, relative
+        self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
+        full = lambda fill: np.full((n_elements, n_measures), fill)
+        self.results = {
+            "values": full(np.nan), "errors": full(np.inf), "model_errors": full(np.nan),
+            "numerical_errors": full(np.inf), "models": np.full(n_elements, NO_MODEL),
+            "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)), "n_steps": np.zeros(n_elements, int),
+            "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n_elements, int),
+            "speeds": np.full(n_elements, np.nan), "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
+        }  # fmt: skip
+
+    def error_goal(self, values: np.ndarray) -> np.ndarray:
+        """Return the absolute tolerance of measures with about these values."""
+        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
+
+    @property
+    def unanswered_indices(self) -> np.ndarray:
+        """Return the indices of the elements without a result."""
+        return np.flatnonzero(self.results["models"] == NO_MODEL)
+
+    def try_rigid_model(self) -> None:
+        """Try the rigid gait for wheels whose legs are stiff enough."""
+        with np.errstate(all="ignore"):
+            indices = np.flatnonzero(
+                ERROR_SAFETY_FACTOR * static_contraction(self.params) <= self.tol
+            )
+        if not len(indices):
+            return
+        replace_gaits(self.lower_gaits, indices, find_rigid_gaits(self._take_wheels(indices)))
+        indices = indices[np.isfinite(self.lower_gaits.quantities[indices]).all(1)]
+        self._correct_from_gaits(indices, continues=False)
+
+    def try_paper_model(self) -> None:
+        """Try the paper's gaits, and the nearby gaits with unilateral contact if their values are
+        not accurate enough."""
+        indices = self.unanswered_indices
+        if not len(indices):
+            return
+        replace_gaits(
+            self.lower_gaits,
+            indices,
+            find_paper_gaits(self._take_wheels(indices), self.ground.options),
+        )
+        self._correct_from_gaits(
+            indices[self.lower_gaits.model_index[indices] != NO_MODEL], continues=True
+        )
+
+    def walk_to_gaits(self) -> None:
+        """Walk to the gaits with unilateral contact that are far from the paper's gait, or where it
+        has none."""
+        indices = self.unanswered_indices
+        if not len(indices):
+            return
+        has_lower_gait = self.lower_gaits.model_index[indices] != NO_MODEL
+        start_states = self.ground.embed_states(
+            indices[has_lower_gait], self.lower_gaits.section_state[indices[has_lower_gait]]
+        )
+        self._walk_and_correct(
+            indices[has_lower_gait], start_states, MeasureStatus.REACHED_FROM_LOWER_GAIT
+        )
+        indices = indices[~has_lower_gait]
+        if not len(indices):
+            return
+        for start in compute_walk_starts(self._take_wheels(indices))[:N_COLD_STARTS]:
+            is_unanswered = self.results["models"][indices] == NO_MODEL
+            start_states = self.ground.embed_states(indices[is_unanswered], start[is_unanswered])
+            self._walk_and_correct(
+                indices[is_unanswered], start_states, MeasureStatus.REACHED_FROM_START
+            )
+
+    def select_by_rank(self, rank: int) -> None:
+        """Select the gait of this rank, slowest first, among those that walks from all starts
+        reach."""
+        indices, empty_results, results_of_starts = self.unanswered_indices, self.results, []
+        for start in compute_walk_starts(self.params):
+            self.results = {name: x.copy() for name, x in empty_results.items()}
+            self._walk_and_correct(
+                indices, self.ground.embed_states(indices, start), MeasureStatus.SELECTED_BY_RANK
+            )
+            results_of_starts.append(self.results)
+        self.results = empty_results
+        empty_results["n_steps"][:] = np.sum(
+            [results["n_steps"] for results in results_of_starts], axis=0
+        )
+        for index in indices:
+            distinct_gaits = _find_distinct_gaits(
+                [{name: x[index] for name, x in results.items()} for results in results_of_starts]
+            )
+            empty_results["n_gaits"][index] = len(distinct_gaits)
+            if -len(distinct_gaits) <= rank < len(distinct_gaits):
+                for name in empty_results.keys() - {"n_steps", "n_gaits"}:
+                    empty_results[name][index] = distinct_gaits[rank][name]
+
+    def _take_wheels(self, indices: np.ndarray) -> WheelParams:
+        return jax.device_put(take_rows(self.params, indices))
+
+    def _correct_from_gaits(self, indices: np.ndarray, continues: bool) -> None:
+        """Take one step with unilateral contact from the lower gaits, and more steps if one is not
+        enough."""
+        if not len(indices):
+            return
+        lower_gaits = LowerFidelityGait(*(part[indices] for part in self.lower_gaits))
+        section_states = self.ground.embed_states(
+            indices, lower_gaits.section_state, lower_gaits.model_index == RIGID_MODEL_INDEX
+        )
+        iteration = BroydenIteration.from_states(self.ground, indices, section_states, lower_gaits)
+        all_positions = np.arange(len(indices))
+        first_step = iteration.step_elements(all_positions)
+        estimate = iteration.observe(all_positions, first_step, self.names)
+        values = evaluate_measures(self.names, lower_gaits.quantities)
+        with np.errstate(all="ignore"):
+            correction_effect = (
+                np.abs(evaluate_measures(self.names, first_step.quantities) - values)
+                + estimate.correction_effect
+            )
+            error = values - estimate.values
+            plane_indices = self.ground.plane_indices()
+            sensitivity = np.abs(
+                estimate.quantity_jacobian @ iteration.quantity_jacobian[:, :, plane_indices]
+            )
+            own_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
+            numerical = own_defect_effect + estimate.numerical_error + estimate.dip_error
+            bound = np.abs(error) + (ERROR_SAFETY_FACTOR - 1.0) * correction_effect + numerical
+            is_accepted = estimate.same_codes & np.all(bound <= self.error_goal(values), axis=1)
+        self.results["n_steps"][indices] += 1
+        self._record(indices[is_accepted], lower_gaits.model_index[is_accepted], MeasureStatus.CHECKED_BY_ONE_STEP, {
+            "values": values[is_accepted], "errors": bound[is_accepted], "model_errors": error[is_accepted],
+            "numerical_errors": numerical[is_accepted], "states": section_states[is_accepted],
+        })  # fmt: skip
+        rejected = np.flatnonzero(~is_accepted & estimate.same_codes)
+        if not continues or not len(rejected):
+            return
+        max_distance = MAX_DISTANCE_RATIO * np.linalg.norm(
+            iteration.correction[rejected][:, plane_indices], axis=1
+        )
+        first_step_and_estimate = jax.tree.map(lambda part: part[rejected], (first_step, estimate))
+        refinement = refine(
+            iteration.select(rejected),
+            self.names,
+            self.error_goal,
+            N_STEPS_BEFORE_DIFFERENCES,
+            first_step_and_estimate,
+        )
+        is_near = (
+            np.linalg.norm(
+                (refinement.section_states - section_states[rejected])[:, plane_indices], axis=1
+            )
+            <= max_distance
+        )
+        self._record_gaits(
+            indices[rejected],
+            refinement._replace(is_done=refinement.is_done & is_near),
+            MeasureStatus.CONTINUES_LOWER_GAIT,
+        )
+
+    def _walk_and_correct(
+        self, indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
+    ) -> None:
+        """Walk from the states, and correct the ends of the walks."""
+        walk_end = walk_until_settled(self.ground, indices, section_states)
+        self.results["n_steps"][indices] += walk_end.n_steps
+        # A step cannot begin if a wheel has turned more than once in flight.
+        is_walk_outcome = np.isin(walk_end.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
+        self.results["outcomes"][indices] = np.where(
+            is_walk_outcome, Outcome.NO_CYCLE_FOUND, walk_end.outcome
+        )
+        indices, section_states = (
+            indices[walk_end.is_settled],
+            walk_end.section_states[walk_end.is_settled],
+        )
+        if not len(indices):
+            return
+        step = self.ground.take_steps(indices, section_states, N_EXACT_STEPS)
+        self.results["n_steps"][indices] += N_EXACT_STEPS
+        continues = step.outcome == Outcome.STEPPED
+        indices, section_states = indices[continues], step.section_states[continues]
+        iteration = BroydenIteration.from_states(self.ground, indices, section_states, None)
+        refinement = refine(iteration, self.names, self.error_goal, 0)
+        refinement.is_done[refinement.is_done] = iteration.select(
+            refinement.is_done
+        ).is_attracting()
+        far_positions = np.flatnonzero(
+            refinement.is_done & (iteration.distance_to(section_states) > MAX_GAIT_DISTANCE)
+        )
+        refinement.is_done[far_positions] = iteration.select(far_positions).stays_near(
+            N_STABILITY_STEPS
+        )
+        refinement.n_steps[far_positions] += N_STABILITY_STEPS
+        self._record_gaits(indices, refinement, status)
+
+    def _record_gaits(
+        self, indices: np.ndarray, refinement: RefinementResult, status: MeasureStatus
+    ) -> None:
+        """Record gaits with unilateral contact."""
+        self.results["n_steps"][indices] += refinement.n_steps
+        indices, refinement = (
+            indices[refinement.is_done],
+            RefinementResult(*(part[refinement.is_done] for part in refinement)),
+        )
+        has_lower_gait = (self.lower_gaits.model_index[indices] != NO_MODEL)[:, None]
+        values = evaluate_measures(
+            self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)
+        )
+        self._record(indices, np.full(len(indices), UNILATERAL_MODEL_INDEX), status, {
+            "values": refinement.values, "errors": refinement.remaining_error + refinement.numerical_error,
+            "model_errors": values - refinement.values,
+            "numerical_errors": refinement.remaining_error + refinement.numerical_error, "speeds": refinement.speed,
+            "states": refinement.section_states,
+        })  # fmt: skip
+
+    def _record(
+        self,
+        indices: np.ndarray,
+        model_index: np.ndarray,
+        status: MeasureStatus,
+        new_results: dict[str, np.ndarray],
+    ) -> None:
+        for name, values in new_results.items():
+            self.results[name][indices] = values
+        self.results["models"][indices], self.results["statuses"][indices] = model_index, status
+        self.results["outcomes"][indices] = Outcome.STEPPED
+
+
+def _find_distinct_gaits(
+    results_of_starts: list[dict[str, np.ndarray]],
+) -> list[dict[str, np.ndarray]]:
+    """Return the gaits of one wheel that differ by more than their errors, slowest first."""
+    distinct: list[dict[str, np.ndarray]] = []
+    for candidate in results_of_starts:
+        differs = (
+            np.any(
+                np.abs(candidate["values"] - other["values"])
+                > candidate["errors"] + other["errors"]
+            )
+            for other in distinct
+        )
+        if candidate["models"] != NO_MODEL and all(differs):
+            distinct.append(candidate)
+    return sorted(distinct, key=lambda candidate: candidate["speeds"])

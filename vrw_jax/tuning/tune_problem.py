@@ -1,0 +1,590 @@
+"""Tuning a wheel: maximization of a gait's objective under margins, with exact gradients.
+
+Without margins as constraints, the maximization gains double support by scuffing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.cycles import (
+    AbstractGaitFinder,
+    CycleOptions,
+    Gait,
+    default_margins,
+    evaluate_on_gait,
+    evaluate_on_gaits,
+    is_same_branch,
+    make_finder,
+    resolve_model,
+)
+from vrw_jax.measures import (
+    MARGIN_MEASURES,
+    MEASURES,
+    flag_attrs,
+    get_measure,
+    measure_attrs,
+    provenance,
+)
+from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.selection import SELECTION_MARGINS
+from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
+from vrw_jax.tuning.exploration import Exploration, explore_starts
+from vrw_jax.tuning.maximization import (
+    ClimbResult,
+    EvaluatedTrial,
+    TrialKind,
+    compute_optimality,
+    maximize_objective,
+)
+from vrw_jax.tuning.objective import (
+    UPPER_BOUND_PREFIX,
+    CycleObjective,
+    GaitEvaluation,
+    MarginSpec,
+    MeasureFunction,
+    ObjectiveAndConstraints,
+    WeightedSum,
+    max_breach,
+    parse_margins,
+    scale_slacks,
+    signed_bound,
+)
+from vrw_jax.tuning.tune_result import ActiveConstraint, TuneResult, WalkValidation
+from vrw_jax.validation import (
+    check_int,
+    check_known_name,
+    check_names,
+    check_not_traced,
+    check_positive,
+    check_range,
+    check_real,
+    check_type,
+    format_value,
+)
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
+
+ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
+
+
+START_DISPLACEMENT, N_VALIDATION_STEPS, N_EXPLORATION_STEPS = 1e-5, 10, 25
+
+
+def tune(
+    params: WheelParams,
+    objective: ObjectiveSpec,
+    free: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    constraints: MarginSpec | None = None,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    tolerance: float = 1e-6,
+    max_evaluations: int = 200,
+    n_starts: int = 1,
+    seed: int = 0,
+) -> TuneResult:
+    """Return the wheel near `params` whose gait maximizes the objective and satisfies its
+    constraints.
+
+    The default constraints are all margins that gaits of this model can keep (`default_margins`);
+    {} is none. A constraint counts as satisfied within 1e-6 of its change over the bounds. The
+    method is local: it ends at an optimum of the branch of `params`. With `n_starts` above 1 it
+    begins with `params` and random wheels within the bounds. They take N_EXPLORATION_STEPS
+    first-order steps side by side, and the best is maximized.
+
+    With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
+    sum of several. A walk from the start finds the first gait. Constraints, none by default, are on
+    such measures, for example {"slip": (0.0, 0.05)}. Model "auto" uses the model that is selected
+    for the start's gait. If that is the paper's, its margins are the constraints, so that it stays
+    valid.
+
+    Args:
+        params: the start, one wheel.
+        objective: maximized quantity: a measure's name, weights of several, or a function of a
+            LimitCycle (and, if it takes two arguments, of the StepResult from it).
+        free: names of the free parameters.
+        bounds: lower and upper bound of each free parameter.
+        constraints: least values of measures by name, or pairs of least and most; names alone mean
+            zero.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: of the steps.
+        cycle_options: of the gaits.
+        tolerance: on the first-order condition, relative to the objective's gradient.
+        max_evaluations: largest number of gaits.
+        n_starts: number of starts, the best of which is maximized.
+        seed: of the random starts.
+
+    Returns:
+        A `TuneResult`, whose `status` is CONVERGED at an optimum.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
+        CONVERGED 0.534 ['damping']
+    """
+    check_not_traced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
+    max_evaluations, n_starts = (
+        check_int("max_evaluations", max_evaluations),
+        check_int("n_starts", n_starts),
+    )
+    tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
+    start_seconds = time.perf_counter()
+    problem = make_tune_problem(
+        params,
+        objective,
+        free,
+        bounds,
+        constraints,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+    )
+    exploration = problem.explore_starts(n_starts, seed) if n_starts > 1 else None
+    problem.finder.precompile(params)
+    start_trial = (
+        problem.evaluate_start()
+        if exploration is None
+        else problem.evaluate_trial(exploration.normalized_parameters[exploration.best_index], None)
+    )
+    compiled_seconds = time.perf_counter()
+    climb_result = maximize_objective(
+        problem.evaluate_trial, start_trial, tolerance=tolerance, max_evaluations=max_evaluations
+    )
+    return problem.make_result(climb_result, start_seconds, compiled_seconds, exploration)
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneProblem:
+    """Validated tuning problem: free parameters, objective and constraints."""
+
+    params: WheelParams
+    free: tuple[str, ...]
+    lower: np.ndarray
+    upper: np.ndarray
+    margins: dict[str, float]
+    objective_label: str
+    objective_and_constraints: ObjectiveAndConstraints
+    finder: AbstractGaitFinder
+
+    @property
+    def widths(self) -> np.ndarray:
+        return self.upper - self.lower
+
+    @property
+    def free_indices(self) -> list[int]:
+        return [PARAMETER_NAMES.index(name) for name in self.free]
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Return one name for each constrained number: margins of the locked legs have six."""
+        names: list[str] = []
+        for name in self.margins:
+            if get_measure(name).dimension:
+                names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
+            else:
+                names.append(name)
+        return tuple(names)
+
+    @property
+    def min_constraint_values(self) -> np.ndarray:
+        """Return the margins, one for each of `constraint_names`."""
+        return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
+
+    def denormalize(self, normalized_parameters: np.ndarray) -> np.ndarray:
+        """Return all float parameters for free ones `u` widths above their lower bounds."""
+        values = np.array(self.finder.model.parameter_values(self.params))
+        values[self.free_indices] = self.lower + normalized_parameters * self.widths
+        return values
+
+    def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
+        return self.finder.model.from_values(
+            jnp.asarray(self.denormalize(normalized_parameters)), self.params.n_legs
+        )[1]
+
+    @property
+    def normalized_start(self) -> np.ndarray:
+        values = np.array([float(getattr(self.params, name)) for name in self.free])
+        return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
+
+    def evaluate_start(self) -> EvaluatedTrial:
+        """Return the trial at the start.
+
+        Raises: ValueError: the start has no gait.
+        """
+        trial = self.evaluate_trial(self.normalized_start, None)
+        if not trial.is_found:
+            raise ValueError(
+                f"the start has no gait to tune ({trial.outcome.name}: {trial.outcome.meaning[:-1]}"
+                "): start from a wheel that walks, such as WheelParams()."
+            )
+        return trial
+
+    def evaluate_trial(
+        self, normalized_parameters: np.ndarray, neighbor: EvaluatedTrial | None
+    ) -> EvaluatedTrial:
+        """Return the trial at `u`, searched for from a neighbor's gait if one is given."""
+        parameters = jnp.asarray(self.denormalize(normalized_parameters))
+        neighbor_evaluation = None if neighbor is None else neighbor.evaluation
+        guess = (
+            self.finder.initial_guess(parameters)
+            if neighbor_evaluation is None
+            else neighbor_evaluation.gait.cycle.warm_start
+        )
+        gait = self.finder.find_gait(parameters, guess)
+        evaluation = GaitEvaluation(gait, *evaluate_on_gait(self.objective_and_constraints, gait))
+        outcome, is_on_branch = Outcome(int(evaluation.gait.outcome)), True
+        if outcome == Outcome.STEPPED and neighbor is not None and neighbor_evaluation is not None:
+            parameter_change = self.denormalize(normalized_parameters) - self.denormalize(
+                neighbor.normalized_parameters
+            )
+            is_on_branch = is_same_branch(
+                neighbor_evaluation.gait.branch_point,
+                evaluation.gait.branch_point,
+                parameter_change,
+            )
+        return self.make_trial(normalized_parameters, evaluation, outcome, is_on_branch)
+
+    def make_trial(
+        self,
+        normalized_parameters: np.ndarray,
+        evaluation: GaitEvaluation,
+        outcome: Outcome,
+        is_on_branch: bool,
+    ) -> EvaluatedTrial:
+        """Return a trial with objective and constraints of a gait."""
+        values = np.array(evaluation.values)
+        jacobian = np.array(evaluation.jacobian)[self.free_indices].T * self.widths
+        if outcome != Outcome.STEPPED:
+            values, jacobian = np.full_like(values, np.nan), np.full_like(jacobian, np.nan)
+        return EvaluatedTrial(
+            normalized_parameters, outcome, is_on_branch, float(values[0]), jacobian[0], values[1:] - self.min_constraint_values,
+            jacobian[1:], evaluation,
+        )  # fmt: skip
+
+    def explore_starts(self, n_starts: int, seed: int) -> Exploration:
+        """Take first-order steps from many starts side by side: this wheel, and random ones."""
+        random_starts = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
+        exploration = explore_starts(
+            self._evaluate_batch,
+            np.vstack([self.normalized_start, random_starts]),
+            self._parameter_change,
+            self.free_indices,
+            self.widths,
+            self.min_constraint_values,
+            N_EXPLORATION_STEPS,
+        )
+        if not np.isfinite(exploration.objective).any():
+            raise ValueError(
+                f"none of {n_starts} starts within the bounds has a gait: narrow the bounds around "
+                "wheels that walk, such as WheelParams()."
+            )
+        return exploration
+
+    def _evaluate_batch(
+        self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
+    ) -> GaitEvaluation:
+        parameters = jnp.asarray([self.denormalize(row) for row in normalized_parameters])
+        guesses = self.finder.initial_guesses(parameters)
+        guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
+        gait = self.finder.find_gaits(parameters, guess)
+        return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
+
+    def _parameter_change(self, difference: np.ndarray) -> np.ndarray:
+        """Return changes of all parameters from changes of u, row by row."""
+        parameter_change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
+        parameter_change[:, self.free_indices] = difference * self.widths
+        return parameter_change
+
+    def make_result(
+        self,
+        climb_result: ClimbResult,
+        start_seconds: float,
+        compiled_seconds: float,
+        exploration: Exploration | None = None,
+    ) -> TuneResult:
+        best_trial = climb_result.best
+        assert best_trial.evaluation is not None
+        gait = best_trial.evaluation.gait
+        params = self.make_wheel(best_trial.normalized_parameters)
+        conditions = compute_optimality(best_trial)
+        active = [
+            ActiveConstraint(
+                name.removeprefix(UPPER_BOUND_PREFIX),
+                signed_bound(name, limit),
+                get_measure(name).unit,
+                price,
+            )
+            for name, limit, price in zip(
+                self.constraint_names,
+                self.min_constraint_values,
+                map(float, conditions.prices),
+                strict=True,
+            )
+            if price > 0.0
+        ]
+        sides = (
+            (self.lower, conditions.lower_bound_prices),
+            (self.upper, conditions.upper_bound_prices),
+        )
+        for limits, prices in sides:
+            for name, limit, price, width in zip(
+                self.free, limits, prices, self.widths, strict=True
+            ):
+                if price > 0.0:
+                    unit, cost = get_measure(name).unit, float(price / width)
+                    active.append(ActiveConstraint(name, float(limit), unit, cost))
+        end_seconds = time.perf_counter()
+        validation = self._validate_by_walking(params, gait)
+        measures = gait.step.measures()
+        violated = [
+            name for name in MARGIN_MEASURES if name in measures and np.min(measures[name]) < 0.0
+        ]
+        return TuneResult(
+            params=params,
+            status=climb_result.status,
+            objective=self.objective_label,
+            value=best_trial.objective,
+            start_value=climb_result.trials[0].objective,
+            cycle=gait.cycle,
+            step=gait.step,
+            active=tuple(active),
+            kkt_residual=conditions.residual,
+            violated_margins=tuple(name for name in violated if name not in self.margins),
+            validation=validation,
+            path=self._make_path(climb_result),
+            n_evaluations=len(climb_result.trials)
+            + (0 if exploration is None else exploration.n_evaluations),
+            n_backtracks=sum(kind == TrialKind.LOST for kind in climb_result.kinds),
+            seconds=end_seconds - start_seconds,
+            compile_seconds=compiled_seconds - start_seconds,
+            exploration=exploration,
+        )
+
+    def _validate_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
+        cycle_state = np.array(gait.cycle.section_state)
+        # The state is scaled down, not up: no leg may be beyond its stopper.
+        section_state, is_feasible, outcome, n_walked = (
+            cycle_state * (1.0 - START_DISPLACEMENT),
+            True,
+            Outcome.STEPPED,
+            0,
+        )
+        default_least = default_margins(params)
+        for _ in range(N_VALIDATION_STEPS):
+            step_result = self.finder.take_step(params, jnp.asarray(section_state))
+            outcome = Outcome(int(step_result.outcome))
+            if outcome != Outcome.STEPPED:
+                break
+            n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
+            measures = {name: np.asarray(value) for name, value in step_result.measures().items()}
+            for name, lower in self.margins.items():
+                if (measure := name.removeprefix(UPPER_BOUND_PREFIX)) in measures:
+                    value = measures[measure] if measure == name else -measures[measure]
+                    # The optimum satisfies it within 1e-6 of its change over the bounds, and the
+                    # start is displaced: each is some thousandths of a take-off margin.
+                    tolerance = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(
+                        default_least.get(name, 0.0)
+                    )
+                    is_feasible &= bool(np.all(value >= lower - tolerance - 1e-9))
+        distance = float(np.max(np.abs(section_state - cycle_state)))
+        return WalkValidation(
+            n_walked, outcome, distance, is_feasible and outcome == Outcome.STEPPED
+        )
+
+    def _make_path(self, climb_result: ClimbResult) -> xr.Dataset:
+        dimension = "evaluation"
+        normalized_parameters = np.array(
+            [trial.normalized_parameters for trial in climb_result.trials]
+        )
+        values = self.lower + normalized_parameters * self.widths
+        lower = self.min_constraint_values
+        constraints = np.array([trial.slack + lower for trial in climb_result.trials])
+        start = climb_result.trials[0]
+        scales = scale_slacks(start.slack, start.slack_jacobian)
+        outcomes = [
+            trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
+            for trial in climb_result.trials
+        ]
+        data: dict[str, Any] = {
+            name: (dimension, values[:, i], measure_attrs(name)) for i, name in enumerate(self.free)
+        }
+        data |= {
+            "objective": (
+                dimension,
+                [t.objective for t in climb_result.trials],
+                {"long_name": self.objective_label},
+            ),
+            "constraint_value": (
+                (dimension, "constraint"),
+                constraints.reshape(len(normalized_parameters), lower.size),
+            ),
+            "margin": ("constraint", lower, {"long_name": "least value allowed"}),
+            "breach": (
+                dimension,
+                np.array([max_breach(trial.slack, scales) for trial in climb_result.trials]),
+                {"long_name": "largest breach of a constraint, in widths of the bounds"},
+            ),
+            "kind": (
+                dimension,
+                np.array(climb_result.kinds, int),
+                flag_attrs(kind.name for kind in TrialKind),
+            ),
+            "outcome": (dimension, np.array(outcomes, int), measure_attrs("outcome")),
+            "on_branch": (dimension, np.array([t.is_on_branch for t in climb_result.trials])),
+        }
+        units = [get_measure(name).unit for name in self.constraint_names]
+        labels = {
+            dimension: np.arange(len(normalized_parameters)),
+            "constraint": list(self.constraint_names),
+            "constraint_unit": ("constraint", units),
+        }
+        attrs = {
+            "title": f"Path of tuning {self.objective_label} over {', '.join(self.free)}",
+            "free": " ".join(self.free),  # as text: netCDF has no lists of names
+            "lower": [float(v) for v in self.lower],
+            "upper": [float(v) for v in self.upper],
+            "ending": climb_result.status.name,
+        }
+        origin = provenance(self.params, self.finder.model, self.finder.step_options)
+        return xr.Dataset(data, labels, attrs | origin)
+
+
+def make_tune_problem(
+    params: WheelParams,
+    objective: ObjectiveSpec,
+    free: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    constraints: MarginSpec | None = None,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+) -> TuneProblem:
+    """Return the validated problem that `tune` solves, for single gaits or another method.
+
+    Raises: TypeError, ValueError: an invalid argument, described in one sentence.
+    """
+    check_single_wheel(params, "tune one after the other")
+    names, lower, upper = _check_bounds(params, free, bounds)
+    checked_model = check_model(model)
+    finder = make_finder(
+        check_model(resolve_model(params, checked_model)),
+        params.n_legs,
+        cycle_options=cycle_options,
+        step_options=options,
+    )
+    if not finder.model.is_compliant:
+        raise TypeError(
+            f"model is {model!r}, but what is tuned has compliant legs: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
+    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    reader, label = _parse_objective(objective, finder)
+    if (
+        constraints is None
+        and checked_model.fallback_model is not checked_model
+        and finder.supports_cold_start
+    ):
+        constraints = tuple(SELECTION_MARGINS)
+    margins = parse_margins(params, constraints, finder)
+    objective_and_constraints = ObjectiveAndConstraints(
+        reader, type(finder).read_measure, tuple(margins)
+    )
+    if callable(objective):  # checked before compilation
+        cycle = jax.eval_shape(finder.find_cycle, params)
+        x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
+        step = jax.eval_shape(finder.model.take_step, params, x, finder.step_options)
+        jax.eval_shape(objective_and_constraints, cycle, step)
+    return TuneProblem(
+        params, names, lower, upper, margins, label, objective_and_constraints, finder
+    )
+
+
+def _parse_objective(
+    objective: ObjectiveSpec, finder: AbstractGaitFinder
+) -> tuple[MeasureFunction, str]:
+    if not (callable(objective) or isinstance(objective, str | Mapping)):
+        raise TypeError(
+            f"objective is {format_value(objective)}, but it is a measure's name, weights of several or a "
+            'function of the cycle: give "dls_fraction", say.'
+        )
+    if callable(objective):
+        if not finder.supports_cold_start:
+            raise TypeError(
+                "objective is a function, but with contact it must be a measure's name or "
+                f"weights of several: choose from {', '.join(finder.differentiable_measures)}."
+            )
+        label = getattr(objective, "__name__", "objective")
+        arguments = inspect.signature(objective).parameters
+        return (objective if len(arguments) >= 2 else CycleObjective(objective)), label
+    weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
+    if not weights:
+        raise ValueError(
+            "objective is an empty mapping, but something must be maximised: "
+            'give a measure such as "dls_fraction".'
+        )
+    for name, weight in weights.items():
+        check_known_name(name, finder.readable_measures, "measure for objective")
+        check_real(f"the weight of {name}", weight)
+        if MEASURES[name].dimension:
+            raise ValueError(
+                f"{name} has one value for each locked leg, but an objective is one number: "
+                "give a function of the cycle and the step that reduces it."
+            )
+    label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
+    return WeightedSum(type(finder).read_measure, tuple(weights.items())), label.replace(
+        "+ -", "- "
+    )
+
+
+def _check_bounds(
+    params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    names = check_names("free", free)
+    check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"free is {names}, which names one twice: name each once.")
+    if not names:
+        raise ValueError(
+            f"free names no parameter, but at least one must move: choose from "
+            f"{', '.join(PARAMETER_NAMES)}."
+        )
+    for name in (*names, *bounds):
+        check_known_name(name, PARAMETER_NAMES, "parameter of the wheel")
+    for name in bounds:
+        if name not in names:
+            raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")
+    for name in names:
+        if name not in bounds:
+            raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
+        low, high = check_range(f"the range of {name}", bounds[name])
+        for end in (low, high):
+            if not PARAMETER_DOMAINS[name].contains(end):
+                raise ValueError(
+                    f"the bounds of {name} reach {end:g}, but {PARAMETER_DOMAINS[name].description} must lie "
+                    f"in {PARAMETER_DOMAINS[name]}: keep them inside."
+                )
+        value = float(getattr(params, name))
+        if not low <= value <= high:
+            raise ValueError(
+                f"the start has {name} {value:g}, outside its bounds ({low:g}, {high:g}): "
+                "widen the bounds or start inside them."
+            )
+    ends = np.array([[float(v) for v in bounds[name]] for name in names])
+    return names, ends[:, 0], ends[:, 1]

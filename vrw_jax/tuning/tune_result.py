@@ -1,0 +1,125 @@
+"""Result of tuning: the gait, how it was found, and the constraints that are active."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from vrw_jax.measures import MEASURES, get_measure
+from vrw_jax.printing import format_html_table, format_text
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.tuning.exploration import Exploration
+from vrw_jax.tuning.maximization import TuneStatus
+from vrw_jax.wheel import Outcome, WheelParams
+
+
+class ActiveConstraint(NamedTuple):
+    """Active constraint or bound at the optimum.
+
+    - `name`: of the constraint (with the leg, if it has one), or of the parameter;
+    - `limit`: its margin, or the bound;
+    - `price`: gain of the objective per unit of a relaxed limit.
+    """
+
+    name: str
+    limit: float
+    unit: str
+    price: float
+
+
+class WalkValidation(NamedTuple):
+    """Validation of the tuned wheel by a walk from a slightly displaced start.
+
+    - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
+    - `is_feasible`: whether every step satisfied every constraint on a margin, within 1e-3 of its
+      value and 1e-2 of its default margin.
+    """
+
+    n_steps: int
+    outcome: Outcome
+    distance: float
+    is_feasible: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneResult:
+    """Result of tuning: the gait, how it was found, and the constraints that are active.
+
+    - `params`: the wheel;
+    - `status`: of the maximization at its end;
+    - `objective`, `value`, `start_value`: its name, its value here and at the start;
+    - `active`: constraints and bounds that are active, each with its price;
+    - `validation`: a walk of ten steps of the wheel;
+    - `cycle`: LimitCycle, or ReturnMapCycle with unilateral contact;
+    - `step`: StepResult, or UnilateralStep;
+    - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
+    - `violated_margins`: violated margins that are not constraints;
+    - `path`: every gait that was evaluated, in order;
+    - `n_evaluations`: number of limit cycles, each with one step;
+    - `n_backtracks`: number of trials that lost the gait or its branch;
+    - `seconds`: total time;
+    - `compile_seconds`: the part for compiling, and for exploring if there are many starts;
+    - `exploration`: results of many starts before the maximization.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(f"{result.params.damping:.1f} N s/m, {bool(result.cycle.found)}")
+        215.0 N s/m, True
+    """
+
+    params: WheelParams
+    status: TuneStatus
+    objective: str
+    value: float
+    start_value: float
+    cycle: Any
+    step: Any
+    active: tuple[ActiveConstraint, ...]
+    kkt_residual: float
+    violated_margins: tuple[str, ...]
+    validation: WalkValidation
+    path: xr.Dataset
+    n_evaluations: int
+    n_backtracks: int
+    seconds: float
+    compile_seconds: float
+    exploration: Exploration | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Return whether the maximization ended at an optimum."""
+        return self.status == TuneStatus.CONVERGED
+
+    def describe(self) -> dict[str, str]:
+        """Return the printed lines of the result by label."""
+        free_names = self.path.attrs["free"].split()
+        parameter_texts = [
+            f"{n} {MEASURES[n].format_with_unit(getattr(self.params, n))}" for n in free_names
+        ]
+        feasibility = (
+            "every constraint kept" if self.validation.is_feasible else "a constraint broken"
+        )
+        feasibility = feasibility if self.path.sizes["constraint"] else "no constraint to keep"
+        active_texts = [
+            f"{a.name} at {get_measure(a.name).format_with_unit(a.limit)}" for a in self.active
+        ]
+        return {
+            "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
+            "wheel": ", ".join(parameter_texts),
+            "ending": f"{self.status.name}: {self.status.meaning}",
+            "held by": ", ".join(active_texts)
+            or "nothing: a maximum inside all bounds and constraints",
+            "not asked for, and broken": ", ".join(self.violated_margins) or "none",
+            "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
+            f"{self.validation.distance:.1e} from the cycle at last; {feasibility}",
+            "cost": f"{self.n_evaluations} gaits, {self.n_backtracks} steps shortened, "
+            f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
+            "compile",
+        }
+
+    def __repr__(self) -> str:
+        return format_text("TuneResult", self.describe().items())
+
+    def _repr_html_(self) -> str:
+        return format_html_table("TuneResult gait", self.describe().items())
