@@ -1,4 +1,4 @@
-"""Every line of Python on every page runs as it stands, and prints what stands below it."""
+"""Every block of Python on every page runs unchanged, and prints the text block below it."""
 
 import re
 from pathlib import Path
@@ -9,10 +9,10 @@ import vrw_jax as vrw
 
 ROOT = Path(__file__).parent.parent
 ELSEWHERE_MARKER = "<!-- runs elsewhere"
-"""Stands before a block that needs a cluster or an editor; it is compiled only."""
+"""Marks a block that needs a cluster or an editor; it is compiled only."""
 BLOCK = re.compile(
     r"^(?P<note><!-- runs elsewhere[^\n]*\n)?```python\n(?P<code>.*?)^```"
-    r"(?:\n\n```text\n(?P<told>.*?)^```)?",
+    r"(?:\n\n```text\n(?P<output>.*?)^```)?",
     re.MULTILINE | re.DOTALL,
 )
 PAGES = [
@@ -29,7 +29,7 @@ SLOW_PAGES = {
 
 
 def run_page(page, capsys, tmp_path, monkeypatch):
-    """Runs a page from top to bottom in an empty folder."""
+    """Run a page from top to bottom in an empty folder."""
     monkeypatch.setattr(vrw, "start_jax", lambda: None)  # it has started
     monkeypatch.chdir(tmp_path)
     names: dict = {}
@@ -40,8 +40,8 @@ def run_page(page, capsys, tmp_path, monkeypatch):
             continue
         capsys.readouterr()
         exec(code, names)
-        if block["told"]:
-            assert capsys.readouterr().out.split() == block["told"].split()
+        if block["output"]:
+            assert capsys.readouterr().out.split() == block["output"].split()
     return names
 
 

@@ -15,20 +15,21 @@ VALID_CODE = """
 import numpy as np
 
 tuned = vrw.tune(params, "dls_fraction", ["damping"], {"damping": (100.0, 200.0)})
-print(tuned.step.monitors.contraction, tuned.cycle.speed)
+print(tuned.step.margins.contraction, tuned.cycle.speed)
 batch = vrw.WheelParams(damping=np.linspace(1.0, 2.0, 3), slope=0.3)
-print(vrw.steps(batch, np.ones((3, 3)), engine="lanes").n_stepped)
-print(vrw.Options(solver="Tsit5", rtol=1e-8).rtol, vrw.UnilateralWheel(friction=0.7).friction)
+print(vrw.step_batch(batch, np.ones((3, 3)), engine="lanes").n_stepped)
+print(vrw.StepOptions(solver="Tsit5", rtol=1e-8).rtol)
+print(vrw.UnilateralWheel(friction=0.7).friction)
 """
 """Lines of other pages."""
 
 INVALID_CODE = """import vrw_jax as vrw
 
 vrw.WheelParams(damping="fast")
-vrw.steps(vrw.WheelParams(), vrw.paper_start()[None], engine="lane")
-vrw.Options(solver="RK4")
-vrw.Options(rtol="small")
-vrw.CycleOptions(steps=(1, 2))
+vrw.step_batch(vrw.WheelParams(), vrw.paper_start()[None], engine="lane")
+vrw.StepOptions(solver="RK4")
+vrw.StepOptions(rtol="small")
+vrw.CycleOptions(mesh_intervals=(1, 2))
 vrw.UnilateralWheel(stoppers="none")
 vrw.UnilateralWheel(friction="high")
 vrw.step(vrw.WheelParams(), vrw.paper_start(), options=vrw.CycleOptions())
@@ -69,7 +70,7 @@ def is_line_refused(checked_folder: Path, command: list[str], line: str) -> dict
     ("command", "line"),
     [
         (
-            # As the library itself is checked, for what was read of it then to be read again.
+            # With the settings of the library's own check, so that its cache is used again.
             [
                 "mypy",
                 "--config-file",

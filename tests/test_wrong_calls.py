@@ -1,4 +1,4 @@
-"""Every wrong use of the library gets one sentence: what was given, what is allowed, what to do."""
+"""Every wrong use of the library raises one sentence: the given, the allowed and the remedy."""
 
 import json
 import os
@@ -15,7 +15,7 @@ wrong_calls.register_wrong_calls()
 
 @pytest.fixture(scope="module")
 def wrong_call_messages(tmp_path_factory) -> dict[str, tuple[str, str, str]]:
-    """What came of each, in a process that starts as a user's does; it may write nothing."""
+    """Results of all calls, in a process that starts as a user's does and may write nothing."""
     folder = tmp_path_factory.mktemp("empty")
     cache = os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache")
     run = subprocess.run(
@@ -39,5 +39,5 @@ def test_a_wrong_call_is_refused_in_one_sentence(wrong_call_messages, name):
     assert expected.expected_words in sentence
     assert sentence.endswith(".")
     assert "\n" not in sentence
-    assert ": " in sentence  # what to do stands behind it
+    assert ": " in sentence  # the remedy follows
     assert "vrw_jax" in refused_in

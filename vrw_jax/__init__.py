@@ -56,7 +56,7 @@ from vrw_jax.tolerance import (
     multifidelity_mean,
 )
 from vrw_jax.tuning import TuneResult, tune
-from vrw_jax.validation import suggest_name
+from vrw_jax.validation import RENAMED_IN_PACKAGE, describe_renamed, suggest_name
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -135,6 +135,8 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
+    if sentence := describe_renamed("vrw_jax", name, RENAMED_IN_PACKAGE):
+        raise AttributeError(sentence)
     raise AttributeError(
         f"vrw_jax has no {name!r}{suggest_name(name, __all__)}: dir(vrw_jax) lists what it has."
     )

@@ -115,15 +115,27 @@ def list_output_rows(n_legs: int) -> list[str]:
         for name, measure in PAGE_MARGINS.items()
     ]
     return [
-        "theta_touchdown", "dtheta_touchdown", "dL1_touchdown",
-        "theta_post_impact", "dtheta_post_impact",
-        "duration_dls", "duration_sls1", "duration_sls2", "step_length",
-        *_field_names(DoubleSupportIndicators), *(name for names in margins for name in names), *_field_names(EnergyLoss),
-    ]  # fmt: skip
+        "theta_touchdown",
+        "dtheta_touchdown",
+        "dL1_touchdown",
+        "theta_post_impact",
+        "dtheta_post_impact",
+        "duration_dls",
+        "duration_sls1",
+        "duration_sls2",
+        "step_length",
+        *_field_names(DoubleSupportIndicators),
+        *(name for names in margins for name in names),
+        *_field_names(EnergyLoss),
+    ]
 
 
 def _field_names(result: Any) -> list[str]:
-    return [result.named.get(name, name) for name in result.__annotations__ if name != "named"]
+    return [
+        result.measure_names.get(name, name)
+        for name in result.__annotations__
+        if name != "measure_names"
+    ]
 
 
 def facts() -> dict[str, Any]:
@@ -133,7 +145,7 @@ def facts() -> dict[str, Any]:
     ).stdout.strip()
     evaluate = lambda m: {
         "label": m.long_name, "symbol": m.symbol, "unit": m.display_unit,
-        "meaning": m.description, "breaks": m.breaks,
+        "meaning": m.description, "breaks": m.violation,
     }  # fmt: skip
     default = vrw.WheelParams()
     return {

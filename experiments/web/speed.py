@@ -100,9 +100,11 @@ def in_node() -> dict[str, Any]:
     )
     code = read_page_content(page, CODE)
     given = {
-        "facts": read_page_content(page, FACTS), "packed": [code[SHARED_MODULE_NAME], code["8"]], "moved": N_SLIDER_MOVES,
+        "facts": read_page_content(page, FACTS),
+        "packed": [code[SHARED_MODULE_NAME], code["8"]],
+        "moved": N_SLIDER_MOVES,
         "source": source.replace('"use strict";', ""),
-    }  # fmt: skip
+    }
     node = ["node", "-e", IN_NODE]
     run_result = subprocess.run(
         node, input=json.dumps(given), check=True, capture_output=True, text=True

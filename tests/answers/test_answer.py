@@ -1,4 +1,4 @@
-"""Answers to within a tolerance: by which rung, how wrong, and what is refused."""
+"""Answers to within a tolerance: by which model, how wrong, and what is refused."""
 
 import math
 
@@ -16,7 +16,7 @@ FRICTIONS = np.geomspace(8.0, 80.0, 24)
 
 @pytest.fixture(scope="module")
 def exact_measures():
-    """What the iteration on real ground converges to, as the truth of looser answers."""
+    """What the iteration with unilateral contact converges to, as the truth of looser answers."""
     return vrw.measure_to_tolerance(
         ["speed", "dls_fraction", "period"], WHEELS_NEAR_TABLE_1, 1e-10, friction=FRICTIONS
     )
@@ -141,23 +141,23 @@ def test_a_missing_gait_is_reported_instead_of_a_small_number():
     assert not measured.found
     assert math.isnan(measured.value)
     assert math.isinf(measured.error)
-    assert measured.why.startswith("no such gait on real ground: ")
+    assert measured.why.startswith("no such gait with unilateral contact: ")
 
 
 def test_a_measure_result_prints_one_line():
     text = repr(vrw.measure_to_tolerance(["speed", "dls_fraction"], TABLE_1, 1e-2, friction=50.0))
     assert "\n" not in text
     assert "m/s ± " in text
-    assert "checked by one step on real ground" in text
+    assert "checked by one step with unilateral contact" in text
     assert text.endswith(" ms")
 
 
 def test_unsupported_requests_are_refused_in_one_sentence():
-    with pytest.raises(ValueError, match="'spead' is no measure that every rung tells"):
+    with pytest.raises(ValueError, match="'spead' is no measure that every model has"):
         vrw.measure_to_tolerance("spead", TABLE_1, 1e-3)
     with pytest.raises(ValueError, match="tol is 0, but it must be positive"):
         vrw.measure_to_tolerance("speed", TABLE_1, 0.0)
-    with pytest.raises(ValueError, match="lanes have one axis"):
+    with pytest.raises(ValueError, match="a batch has one axis"):
         vrw.measure_to_tolerance("speed", WHEELS_NEAR_TABLE_1, 1e-3, friction=np.ones(3))
     with pytest.raises(TypeError, match="inside jit"):
         jax.jit(

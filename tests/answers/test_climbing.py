@@ -19,7 +19,7 @@ def test_the_error_bound_holds_if_differences_span_a_jump(side):
     and makes 1,600 of its slope. By that hardly anything is left to correct of it, and corrections
     come down as the second one does."""
 
-    def step(lanes, x):
+    def step(indices, x):
         off = x[:, :2] - [POINT, 0.0]
         y = x.copy()
         y[:, :2] = off @ SLOPES.T + [POINT, 0.0]
@@ -28,9 +28,14 @@ def test_the_error_bound_holds_if_differences_span_a_jump(side):
         return StepQuantities(y, result, np.full(len(x), int(vrw.Outcome.STEPPED)))
 
     ground = Mock(
-        GroundBatch, n=1, options=vrw.StepOptions(rtol=1e-10, atol=1e-10), step=step, consistent=lambda x: x,
-        free=lambda x: np.ones((len(x), 2), bool), shortest=lambda lanes: np.zeros(len(lanes)),
-    )  # fmt: skip
+        GroundBatch,
+        n_legs=1,
+        options=vrw.StepOptions(rtol=1e-10, atol=1e-10),
+        take_steps=step,
+        complete_states=lambda x: x,
+        free_coordinates=lambda x: np.ones((len(x), 2), bool),
+        min_dip_duration=lambda indices: np.zeros(len(indices)),
+    )
     begin = np.array([[POINT + side * 2e-6, 4e-6, 0.0]])
     chord = BroydenIteration.from_states(ground, np.arange(1), begin, None)
     solution = refine(chord, ("theta_touchdown",), lambda values: np.full_like(values, 1e-2), 1)

@@ -40,7 +40,7 @@ chunk = 6
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate_arithmetically)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # leave the suite's own as it is
@@ -130,12 +130,12 @@ def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> No
 def test_a_stopped_scan_names_the_command_that_continues_it(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: CountingEngine(failing_call=3))
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: CountingEngine(failing_call=3))
     stopped = run_command("scan", config)
     assert stopped.exit_code == 130
     assert "run the same to go on" in " ".join(stopped.stderr.split())
     rest = CountingEngine()
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: rest)
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: rest)
     assert run_command("scan", config).exit_code == 0
     assert rest.n_calls == 2
     second_result = run_command("scan", config)
@@ -218,12 +218,12 @@ def test_an_installed_wheel_brings_the_example_configs() -> None:
 def test_verify_reports_whether_a_store_is_complete_and_intact(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: CountingEngine(failing_call=3))
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: CountingEngine(failing_call=3))
     assert run_command("scan", config, "--no-picture").exit_code == 130
     result = run_command("scan", config, "--verify")
     assert result.exit_code == 0
     assert "lacks 2 of 4 chunks" in result.stdout
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate_arithmetically)
     assert run_command("scan", config, "--no-picture").exit_code == 0
     assert "is complete and sound" in run_command("scan", config, "--verify").stdout
     file = config.parent / "results" / "small" / "scan.zarr" / "speed" / "c" / "1" / "0" / "0"
@@ -233,7 +233,7 @@ def test_verify_reports_whether_a_store_is_complete_and_intact(
     assert "1 damaged chunk (number 1): run the same without --verify" in result.stderr
     assert not file.exists()
     rest = CountingEngine()
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: rest)
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: rest)
     second_result = run_command("scan", config, "--no-picture")
     assert second_result.exit_code == 0
     assert "1 damaged chunk (number 1): computed again" in second_result.stderr
@@ -261,28 +261,28 @@ MODEL_CASES = {
 }
 
 
-@pytest.mark.parametrize("rung", MODEL_CASES)
-def test_a_config_names_any_model_and_its_friction(rung: str) -> None:
-    settings, friction = MODEL_CASES[rung]
-    model = parse_config(f'[model]\nrung = "{rung}"\n{settings}').make_model()
-    assert model.model_name == {"auto": "ladder"}.get(rung, rung)
+@pytest.mark.parametrize("model_name", MODEL_CASES)
+def test_a_config_names_any_model_and_its_friction(model_name: str) -> None:
+    settings, friction = MODEL_CASES[model_name]
+    model = parse_config(f'[model]\nname = "{model_name}"\n{settings}').make_model()
+    assert model.model_name == {"auto": "ladder"}.get(model_name, model_name)
     assert float(model.friction) == friction
 
 
-@pytest.mark.parametrize("rung", ["unilateral", "auto"])
-def test_friction_is_swept_for_the_unilateral_and_the_automatic_model(rung: str) -> None:
+@pytest.mark.parametrize("model_name", ["unilateral", "auto"])
+def test_friction_is_swept_for_the_unilateral_and_the_automatic_model(model_name: str) -> None:
     result = parse_config(
-        f'[model]\nrung = "{rung}"\n[grid]\nfriction = [0.4, 0.8]\nslope = [0.3]\n'
+        f'[model]\nname = "{model_name}"\n[grid]\nfriction = [0.4, 0.8]\nslope = [0.3]\n'
         '[scan]\nmeasures = ["slip", "d speed / d damping"]'
     )
     planned = scanning.plan_config_scan(result, None)
     assert planned.design.names == ("friction", "slope")
     assert planned.requested_measures == ("slip", "d speed / d damping")
-    assert planned.request.model.model_name == {"auto": "ladder"}.get(rung, rung)
+    assert planned.request.model.model_name == {"auto": "ladder"}.get(model_name, model_name)
 
 
 def test_a_gait_of_rigid_legs_is_printed(config: Path) -> None:
-    config.write_text('[wheel]\nslope = 0.1\n[model]\nrung = "rigid"\n[gait]\nsteps = 3\n')
+    config.write_text('[wheel]\nslope = 0.1\n[model]\nname = "rigid"\n[gait]\nsteps = 3\n')
     result = run_command("gait", config)
     assert result.exit_code == 0, result.output
     assert "Walked 3 steps" in result.stdout
@@ -295,7 +295,7 @@ def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
     config: Path, friction: float, serves: str
 ) -> None:
     config.write_text(
-        f'[wheel]\ndamping = 180.0\n[model]\nrung = "auto"\nfriction = {friction}\n'
+        f'[wheel]\ndamping = 180.0\n[model]\nname = "auto"\nfriction = {friction}\n'
         "[gait]\nsteps = 2\n"
     )
     result = run_command("gait", config)
@@ -308,7 +308,7 @@ def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
 INTERRUPTED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from vrw_jax.scans.planning import Plan
+from vrw_jax.scans.planning import ScanPlan
 def slow(columns):
     while True:
         try:
@@ -317,9 +317,9 @@ def slow(columns):
         except KeyboardInterrupt:
             print("stopping", flush=True)
             time.sleep(60)
-Plan.engine = lambda _: slow
+ScanPlan.build_engine = lambda _: slow
 sys.argv = ["vrw", "scan", {config!r}]
-from vrw_jax.app import main
+from vrw_jax.cli.commands import main
 main()
 """
 

@@ -47,7 +47,7 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
         "did you mean 'count'",
     ),
     "columns of two lengths": ("[samples]\ndamping = [1.0]\nslope = [0.1, 0.2]", "one length"),
-    "no number of samples": ("[sobol]\ndamping = [1.0, 2.0]", "says not how many"),
+    "no number of samples": ("[sobol]\ndamping = [1.0, 2.0]", "has no number of samples"),
     "range of three": ("[sobol]\nn = 4\ndamping = [1.0, 2.0, 3.0]", "range of two numbers"),
     "range upside down": ("[uniform]\nn = 4\ndamping = [2.0, 1.0]", "holds nothing"),
     "negative seed": ("[uniform]\nn = 4\nseed = -1\ndamping = [1.0, 2.0]", "at least 0"),
@@ -77,37 +77,54 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "a solver misspelt": ('[options]\nsolver = "Dopri9"', "solver is"),
     "a solver without an error": ('[options]\nsolver = "Euler"', "solver is"),
     "no time": ("[options]\nmax_phase_time = 0.0", "must be positive"),
+    "an old name of the model": ('[model]\nrung = "auto"', "write name in its place"),
+    "an old first step": ("[options]\nfirst_step = 1e-3", "write dt0 in its place"),
+    "old event steps": (
+        "[options]\nevent_steps = 50",
+        "write max_event_iterations in its place",
+    ),
+    "old monitor steps": (
+        "[options]\nmonitor_steps = 4",
+        "write max_margin_search_iterations in its place",
+    ),
+    "an old largest step": (
+        '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nlargest_step = 0.1',
+        "write max_ds in its place",
+    ),
     "part of a step": ("[options]\nmax_solver_steps = 2.5", "whole number"),
-    "no events": ("[options]\nevent_steps = 0", "at least 1"),
+    "no events": ("[options]\nmax_event_iterations = 0", "at least 1"),
     "tolerance as text": ('[options]\nrtol = "1e-9"', "must be a finite number"),
     "tolerance true": ("[options]\natol = true", "must be a finite number"),
-    "unknown rung": ('[model]\nrung = "unilaterl"', "did you mean 'unilateral'"),
-    "rung as number": ("[model]\nrung = 2", "choose from viscoelastic"),
-    "rung as list": ('[model]\nrung = ["rigid"]', "choose from viscoelastic"),
-    "another rung's setting": ('[model]\nrung = "auto"\nstoppers = "one-sided"', "unknown key"),
-    "a setting of real ground": ("[model]\nmax_events = 5", "unknown key 'max_events'"),
+    "unknown model": ('[model]\nname = "unilaterl"', "did you mean 'unilateral'"),
+    "model as number": ("[model]\nname = 2", "choose from viscoelastic"),
+    "model as list": ('[model]\nname = ["rigid"]', "choose from viscoelastic"),
+    "another model's setting": ('[model]\nname = "auto"\nstoppers = "one-sided"', "unknown key"),
+    "a setting of unilateral contact": ("[model]\nmax_events = 5", "unknown key 'max_events'"),
     "stoppers of a third kind": (
-        '[model]\nrung = "unilateral"\nstoppers = "none"',
+        '[model]\nname = "unilateral"\nstoppers = "none"',
         "one of 'bilateral', 'one-sided'",
     ),
-    "friction below zero": ('[model]\nrung = "unilateral"\nfriction = -1.0', "must be positive"),
-    "friction nan": ('[model]\nrung = "auto"\nfriction = nan', "must be a finite number"),
+    "friction below zero": ('[model]\nname = "unilateral"\nfriction = -1.0', "must be positive"),
+    "friction nan": ('[model]\nname = "auto"\nfriction = nan', "must be a finite number"),
     "friction as text": ('[model]\nfriction = "high"', "must be a finite number"),
-    "no events on ground": ('[model]\nrung = "unilateral"\nmax_events = 0', "at least 1"),
-    "part of an event": ('[model]\nrung = "unilateral"\nmax_events = 2.5', "whole number"),
+    "no events on ground": ('[model]\nname = "unilateral"\nmax_events = 0', "at least 1"),
+    "part of an event": ('[model]\nname = "unilateral"\nmax_events = 2.5', "whole number"),
     "a misspelt setting": ("[model]\nfricton = 0.5", "did you mean 'friction'"),
     "a switch as text": ('[model]\nstop_at_lift_off = "yes"', "true or false"),
-    "friction swept, not felt": ("[grid]\nfriction = [0.5, 0.7]", "does not feel"),
-    "friction sampled, not felt": ("[sobol]\nn = 4\nfriction = [0.5, 0.7]", "does not feel"),
+    "friction swept, not used": ("[grid]\nfriction = [0.5, 0.7]", "does not affect this model"),
+    "friction sampled, not used": (
+        "[sobol]\nn = 4\nfriction = [0.5, 0.7]",
+        "does not affect this model",
+    ),
     "friction swept below zero": (
-        '[model]\nrung = "auto"\n[grid]\nfriction = [0.5, -0.7]',
+        '[model]\nname = "auto"\n[grid]\nfriction = [0.5, -0.7]',
         "must be positive",
     ),
-    "a measure of another rung": (
-        '[model]\nrung = "unilateral"\n[scan]\nmeasures = ["lambda_I4"]',
+    "a measure of another model": (
+        '[model]\nname = "unilateral"\n[scan]\nmeasures = ["lambda_I4"]',
         "is no measure of a scan",
     ),
-    "a measure of real ground": ('[scan]\nmeasures = ["slip"]', "is no measure of a scan"),
+    "a measure of unilateral contact": ('[scan]\nmeasures = ["slip"]', "is no measure of a scan"),
     "a measure as number": ("[scan]\nmeasures = [3]", "list of names"),
     "a derivative by friction": (
         '[scan]\nmeasures = ["d speed / d friction"]',
@@ -141,8 +158,8 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "a start of text": ('[gait]\nstart = ["a", "b", "c"]', "must be a finite number"),
     "a start nowhere": ("[gait]\nstart = [nan, 1.0, 0.0]", "must be a finite number"),
     "unknown in gait": ("[gait]\nstep = 3", "did you mean 'steps'"),
-    "nothing may move": ("[tune]", "lets no parameter move"),
-    "bounds as list": ("[tune]\nbounds = [1.0, 2.0]", "lets no parameter move"),
+    "nothing may move": ("[tune]", "has no free parameter"),
+    "bounds as list": ("[tune]\nbounds = [1.0, 2.0]", "has no free parameter"),
     "bounds of what": ("[tune.bounds]\ndampin = [1.0, 2.0]", "did you mean 'damping'"),
     "bounds of one": ("[tune.bounds]\ndamping = [1.0]", "range of two numbers"),
     "bounds out of the domain": ("[tune.bounds]\nslope = [0.1, 2.0]", "must lie in"),
@@ -165,7 +182,7 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "a branch along what": ('[branch]\nparameter = "dampin"', "did you mean 'damping'"),
     "a branch along friction": (
         '[branch]\nparameter = "friction"\nbounds = [0.5, 1.0]',
-        "a branch of this rung runs along",
+        "a branch of this model runs along",
     ),
     "a branch without bounds": ('[branch]\nparameter = "damping"', "has no bounds"),
     "a branch upside down": (
@@ -179,7 +196,7 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     ),
     "no period": ('[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nperiod = 0', "at least 1"),
     "no step": (
-        '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nlargest_step = 0.0',
+        '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nmax_ds = 0.0',
         "be positive",
     ),
 }
@@ -265,12 +282,12 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "rigid legs scanned": (
         ("scan", "my.toml"),
-        GRID_TABLE + '[model]\nrung = "rigid"',
+        GRID_TABLE + '[model]\nname = "rigid"',
         "this command takes viscoelastic",
     ),
-    "a map of real ground": (
+    "a map of unilateral contact": (
         ("map", "my.toml"),
-        GRID_TABLE + '[model]\nrung = "unilateral"',
+        GRID_TABLE + '[model]\nname = "unilateral"',
         "this command takes viscoelastic: write that",
     ),
     "a map over one parameter": (
@@ -285,17 +302,17 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "rigid legs tuned": (
         ("tune", "my.toml"),
-        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nrung = "rigid"',
+        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nname = "rigid"',
         "takes viscoelastic",
     ),
     "the ladder tuned": (
         ("tune", "my.toml"),
-        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nrung = "auto"',
+        TUNE_TABLE.format("speed", BOUNDS_LINE) + '[model]\nname = "auto"',
         "takes viscoelastic",
     ),
     "the ladder followed": (
         ("continue", "my.toml"),
-        BRANCH_TABLE.format("100.0, 300.0") + '[model]\nrung = "auto"',
+        BRANCH_TABLE.format("100.0, 300.0") + '[model]\nname = "auto"',
         "takes viscoelastic",
     ),
     "an objective of nothing": (
@@ -308,7 +325,7 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
         TUNE_TABLE.format("locked_stopper_force", BOUNDS_LINE),
         "one value for each locked leg",
     ),
-    "an objective of another rung": (
+    "an objective of another model": (
         ("tune", "my.toml"),
         TUNE_TABLE.format("slip", BOUNDS_LINE),
         "is no measure for objective",
@@ -330,8 +347,8 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "a step beyond the range": (
         ("continue", "my.toml"),
-        BRANCH_TABLE.format("4.0, 230.0") + "largest_step = 5.0",
-        "largest_step",
+        BRANCH_TABLE.format("4.0, 230.0") + "max_ds = 5.0",
+        "max_ds",
     ),
 }
 
@@ -339,8 +356,8 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
 @pytest.fixture
 def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A place with a letter, and with what is no store; a second is enough for a scheduler."""
-    monkeypatch.setattr(ScanPlan, "engine", lambda _: evaluate_arithmetically)
-    monkeypatch.setattr("vrw_jax.scans.dask.ANSWER", "1s")
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr("vrw_jax.scans.dask.SCHEDULER_TIMEOUT", "1s")
     monkeypatch.chdir(tmp_path)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)

@@ -111,7 +111,7 @@ def test_branches_continued_together_equal_single_ones_with_two_iterations_per_p
         np.testing.assert_array_equal(every.n_points[i], single_result.n_points[0])
         # One program is for one branch, the other for eight: last digits may differ.
         np.testing.assert_allclose(every.points.p[i], single_result.points.p[0], rtol=0, atol=1e-10)
-    assert every.passes.sum() < 2.3 * every.n_points.sum()
+    assert every.n_linearizations.sum() < 2.3 * every.n_points.sum()
 
 
 def special_points_by_kind(branch):

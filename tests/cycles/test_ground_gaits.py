@@ -96,7 +96,7 @@ def test_a_gait_within_a_compiled_program_has_the_derivatives_of_sensitivities(
 def test_measures_that_unilateral_contact_lacks_are_refused_in_one_sentence():
     with pytest.raises(ValueError, match="choose among these"):
         vrw.sensitivities(SLOW_WHEEL, measures=("lambda_4",), model=GROUND_MODEL)
-    with pytest.raises(ValueError, match="does not feel"):
+    with pytest.raises(ValueError, match="does not affect"):
         vrw.scan(vrw.grid(friction=[0.5, 0.7]))
     with pytest.raises(ValueError, match="is no parameter"):
         vrw.continue_branch(vrw.WheelParams(), "friction", (0.5, 1.0))
@@ -502,7 +502,7 @@ def test_a_batched_step_has_measures_and_derivatives_of_a_single_wheel(scene, st
                  "energy_damping", "energy_friction", "step_length", "mode_durations"):  # fmt: skip
         result = getattr(step, name)[0]
         # One-sided, shares of modes and losses: the least dip lasts 3e-7 s, and rounding says in
-        # which mode. Where the step leads, and when, does not feel it.
+        # which mode. Where the step leads, and when, does not affect it.
         share = shared and name.startswith(("durations", "mode", "energy", "slip"))
         near = 5e-7 if share else 1e-8
         np.testing.assert_allclose(
@@ -534,7 +534,7 @@ def test_batched_newton_steps_back_from_states_without_a_complete_step(monkeypat
             by_input, None
         )
 
-    monkeypatch.setattr(on_ground, "step_lanes", step)
+    monkeypatch.setattr(on_ground, "step_batch_with_jacobian", step)
     a, begin = np.array([[0.25], [0.75], [-9.0]]), np.array([[1.9, 0.0], [1.5, 0.0], [0.0, 0.0]])
     solution = on_ground._find_fixed_points(None, 1, vrw.StepOptions(), 1, a, begin, True)
     assert solution.converged.tolist() == [True, True, False]  # the last has no fixed point
@@ -560,7 +560,7 @@ def test_batched_newton_finds_a_repeating_state_next_to_a_jump_of_the_map(monkey
             by_input, None
         )
 
-    monkeypatch.setattr(on_ground, "step_lanes", step)
+    monkeypatch.setattr(on_ground, "step_batch_with_jacobian", step)
     given = np.zeros((1, 1)), np.array([[begin, 0.0]]), True
     solution = on_ground._find_fixed_points(
         None, 1, vrw.StepOptions(rtol=1e-10, atol=1e-10), 1, *given

@@ -209,7 +209,7 @@ def test_a_gait_that_the_mesh_does_not_resolve_is_not_reported_as_found():
 def test_every_measure_of_a_cycle_can_be_differentiated():
     def measures(params):
         cycle = vrw.limit_cycle(params)
-        names = ("stability_margin", "jury_margins", "condition", "mesh_error", "indicators")
+        names = ("stability_margin", "jury_margins", "condition_number", "mesh_error", "indicators")
         return [getattr(cycle, name) for name in names]
 
     jax.eval_shape(jax.jacrev(measures), vrw.WheelParams())  # traced, which is what can fail
@@ -274,7 +274,7 @@ def test_causes_of_a_missing_gait_have_different_outcomes(changes, outcome, word
 
 def test_a_missing_gait_is_nan_in_value_and_derivative_on_request():
     fraction = lambda c, **how: vrw.limit_cycle(vrw.WheelParams(damping=c), **how).dls_fraction
-    both_values = jax.value_and_grad(lambda c: fraction(c, lost="nan"))
+    both_values = jax.value_and_grad(lambda c: fraction(c, on_failure="nan"))
     assert all(map(np.isnan, both_values(240.0)))
     np.testing.assert_array_equal(both_values(150.0), jax.value_and_grad(fraction)(150.0))
     assert [float(x) for x in jax.value_and_grad(fraction)(240.0)] == [0.0, 0.0]

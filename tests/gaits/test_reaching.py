@@ -27,7 +27,7 @@ def test_gaits_outside_the_fitted_box_are_found_on_a_refined_mesh(cycles):
     assert np.asarray(cycles.found).tolist() == [True, True, True, False]
     np.testing.assert_allclose(cycles.durations[:3], REFERENCE_DURATIONS, atol=2e-3)
     assert np.all(cycles.mesh_error <= REFINE_ABOVE_MESH_ERROR)
-    assert cycles.system.options.steps > vrw.CycleOptions().mesh_intervals
+    assert cycles.system.options.mesh_intervals > vrw.CycleOptions().mesh_intervals
 
 
 def test_gaits_outside_the_fitted_box_repeat_in_a_walk(cycles):

@@ -22,7 +22,7 @@ def test_the_papers_model_is_chosen_at_sufficient_friction():
     choice = vrw.choose_model(vrw.WheelParams(), START, friction=50.0)
     assert int(choice.model_code) == VISCOELASTIC_MODEL
     assert isinstance(choice.model, vrw.ViscoelasticWheel)
-    assert "premises hold" in choice.why
+    assert "margins hold" in choice.why
 
 
 def test_the_unilateral_model_is_chosen_with_a_reason_at_low_friction():
@@ -63,10 +63,10 @@ def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
         UNILATERAL_MODEL,
         VISCOELASTIC_MODEL,
     ]
-    rows = [describe_reason(int(reason)) for reason in step.choice.reason]
-    assert ["premises hold" in text for text in rows] == [True, False, False, True]
+    rows = [describe_reason(int(reason)) for reason in step.choice.reason_code]
+    assert ["margins hold" in text for text in rows] == [True, False, False, True]
     assert "scuffs" in rows[1]
-    assert list(SELECTION_MARGINS)[int(step.choice.reason[1]) - 1] == "clearance_sls1"
+    assert list(SELECTION_MARGINS)[int(step.choice.reason_code[1]) - 1] == "clearance_sls1"
     assert "slide" in rows[2]
 
 

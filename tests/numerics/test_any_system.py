@@ -209,7 +209,7 @@ def test_event_times_of_implicit_solvers_are_within_their_stated_errors(stiff, r
         wrong = np.abs(result.times[:n] - truth[:n])
         assert n > 1
         assert np.all(wrong <= stated[:n]), tolerance
-        outside_values.append(np.max(wrong / result.resolution[:n]))
+        outside_values.append(np.max(wrong / result.time_tolerance[:n]))
     # One event's resolution is no bound: errors add up, and the solver's estimate leaves some out.
     assert max(outside_values) > 3.0
 

@@ -55,7 +55,7 @@ class ComplementarityWheel(NamedTuple):
         return self.m_hub + N * self.m
 
     @property
-    def has_friction(self) -> np.ndarray:
+    def friction_by_foot(self) -> np.ndarray:
         return np.broadcast_to(self.friction, (N,))
 
 
@@ -143,7 +143,7 @@ def _contact_rows(w, q, v, mode):
     for j in range(N):
         if mode[j] == CONTACT_OFF:
             continue
-        drag = -SLIP_DIRECTIONS.get(mode[j], 0.0) * w.rough[j]
+        drag = -SLIP_DIRECTIONS.get(mode[j], 0.0) * w.friction_by_foot[j]
         rows.append(feet[j, 1])
         tangential_part.append(feet[j, 1] + drag * feet[j, 0])
         bias.append(extra_values[j, 1])
@@ -217,7 +217,7 @@ def _enumerate_solutions(w, problem, signs):
         sign = np.where(
             modes[:, i] == SLIP_DOWNHILL, 1.0, np.where(modes[:, i] == SLIP_UPHILL, -1.0, 0.0)
         )
-        lhs[sign != 0.0, 2 * i, 2 * i + 1] = w.rough[j] * sign[sign != 0.0]
+        lhs[sign != 0.0, 2 * i, 2 * i + 1] = w.friction_by_foot[j] * sign[sign != 0.0]
     regular = np.abs(np.linalg.det(lhs)) > 1e-12 * np.prod(np.linalg.norm(lhs, axis=2), axis=1)
     lhs[~regular] = np.eye(d)
     p = np.linalg.solve(lhs, rhs[..., None])[..., 0]
@@ -228,9 +228,9 @@ def _enumerate_solutions(w, problem, signs):
         m, t, n = modes[:, i], 2 * i, 2 * i + 1
         wrong = worse(m == CONTACT_OFF, -after[:, n] / A)
         wrong = worse(m == CONTACT_STICK, -p[:, n] / F)
-        dragged = -max(1.0, w.rough[j]) * p[:, n]  # a pull of rounding may drag by more
+        dragged = -max(1.0, w.friction_by_foot[j]) * p[:, n]  # a pull of rounding may drag by more
         wrong = worse((m == SLIP_DOWNHILL) | (m == SLIP_UPHILL), dragged / F)
-        wrong = worse(m == CONTACT_STICK, (np.abs(p[:, t]) - w.rough[j] * p[:, n]) / F)
+        wrong = worse(m == CONTACT_STICK, (np.abs(p[:, t]) - w.friction_by_foot[j] * p[:, n]) / F)
         if CONTACT_STICK in may[i]:  # else it slides, and may speed up or slow down
             wrong = worse(m == SLIP_DOWNHILL, -after[:, t] / A)
             wrong = worse(m == SLIP_UPHILL, after[:, t] / A)
@@ -309,7 +309,7 @@ def _process_event(w, place, struck_foot, struck_leg):
         retained = {*problem.locked, *itertools.compress(problem.legs, is_active)}
         legs = [j for j in legs if j in retained or v[3 + j] > -REST_SPEED]
     is_unfinished = [j for j in feet if abs(speeds[j, 0]) < REST_SPEED]
-    drag = [0.0 if j in is_unfinished else -np.sign(speeds[j, 0]) * w.rough[j] for j in feet]
+    drag = [0.0 if j in is_unfinished else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet]
     pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
     others = [rows[is_unfinished, 0], _locked_rows(legs)]
     v = _bring_to_rest(
@@ -359,7 +359,7 @@ def _short_time_margin(w, q, v, mode, held_values, feet, is_unfinished, legs):
         t, n = on_feet[j]
         minimum = min(minimum, z / A if mode[j] == CONTACT_OFF else n / F)
         if mode[j] == CONTACT_STICK:
-            minimum = min(minimum, (w.rough[j] * n - abs(t)) / F)
+            minimum = min(minimum, (w.friction_by_foot[j] * n - abs(t)) / F)
         elif mode[j] != CONTACT_OFF and j in is_unfinished:
             minimum = min(minimum, SLIP_DIRECTIONS[mode[j]] * x / A)
     for j in legs:
@@ -392,8 +392,8 @@ def _make_guards(w, place):
             "gap": _gaps(w, q),
             "room": w.L0 - q[3:],
             "normal": on_feet[:, 1],
-            "cone up": w.rough * on_feet[:, 1] - on_feet[:, 0],
-            "cone down": w.rough * on_feet[:, 1] + on_feet[:, 0],
+            "cone up": w.friction_by_foot * on_feet[:, 1] - on_feet[:, 0],
+            "cone down": w.friction_by_foot * on_feet[:, 1] + on_feet[:, 0],
             "speed": np.array([SLIP_DIRECTIONS.get(m, 0.0) for m in mode]) * speeds,
             "stopper": on_legs,
         }

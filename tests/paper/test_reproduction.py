@@ -40,7 +40,7 @@ def reproduction_result(
 ) -> tuple[Path, bool, list[float]]:
     folder, result = tmp_path_factory.mktemp("reproduced"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reproduce, "collect", lambda progress: evidence)
+        patch.setattr(reproduce, "collect_evidence", lambda on_progress: evidence)
         table = reproduce.reproduce(folder, lambda share, what: result.append(share))
     return folder, all(fact.holds for fact in table), result
 
@@ -85,8 +85,8 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     branch = evidence.damping_branch.copy(deep=True)
     branch.lambda_4_plus.loc[{"damping": 219.0}] = -0.01
     broken = dataclasses.replace(evidence, damping_branch=branch)
-    monkeypatch.setattr(reproduce, "collect", lambda progress: broken)
-    monkeypatch.setattr(reproduce, "draw", lambda evidence, folder: [])
+    monkeypatch.setattr(reproduce, "collect_evidence", lambda on_progress: broken)
+    monkeypatch.setattr(reproduce, "draw_figures", lambda evidence, folder: [])
     monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.FACT_FAILED_EXIT_CODE

@@ -27,7 +27,7 @@ TABLE_1, START = vrw.WheelParams(), vrw.paper_start()
             lambda: jax.tree.map(jnp.negative, TABLE_1),
             ("a gradient or a difference", "by damping c, N s/m: -200"),
         ),
-        (vrw.StepOptions, ("solver: Dopri8", "rtol: 1e-10", "first_step: 0.005 s")),
+        (vrw.StepOptions, ("solver: Dopri8", "rtol: 1e-10", "dt0: 0.005 s")),
         (lambda: vrw.step(TABLE_1, START), ("DLS fraction T_DLS/T: 0.53", "N s, broken")),
         (lambda: vrw.step(TABLE_1, START).margins, ("min λ2: 103.", " N")),
         (lambda: vrw.step(TABLE_1, START).indicators, ("λ_I4: 1.96", "N s")),
@@ -85,14 +85,14 @@ def test_traced_results_print_their_shapes():
     ("thing", "words"),
     [
         (vrw.WheelParams, "`damping`: c, viscous damping of each leg"),
-        (vrw.StepOptions, "`first_step`: of each phase, s"),
-        (vrw.CycleOptions, "`stages`: of a homotopy"),
+        (vrw.StepOptions, "`dt0`: first solver step of each phase, s"),
+        (vrw.CycleOptions, "`homotopy_steps`: of a homotopy"),
         (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
         (vrw.Margins, "`contraction`:"),
         (vrw.StepBatchResult, "`solver_steps`: tried by the integrator"),
-        (vrw.LimitCycle, "`passes`: linearised passes"),
-        (vrw.TuneResult, "`evaluations`: limit cycles"),
-        (vrw.UnilateralStep, "`slip`: path of sliding feet, m"),
+        (vrw.LimitCycle, "`n_newton_iterations`: number of linearized passes"),
+        (vrw.TuneResult, "`n_evaluations`: number of limit cycles"),
+        (vrw.UnilateralStep, "`slip`: path length of sliding feet, m"),
     ],
 )
 def test_help_describes_the_fields(thing, words):

@@ -70,8 +70,8 @@ def test_an_edit_that_changes_no_trace_compiles_nothing(cache_folder, fresh_proc
         first = make_function(traced)
         by_jax = set(cache_folder.glob("*-cache"))
         fresh_process.reset_registry()
-        monkeypatch.setattr(store, "code_digest", lambda: "of the library with another docstring")
-        monkeypatch.setattr(code, "compiled", None)  # would fail
+        monkeypatch.setattr(store, "source_digest", lambda: "of the library with another docstring")
+        monkeypatch.setattr(code, "compile_native", None)  # would fail
         np.testing.assert_array_equal(make_function(traced), first)
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
@@ -91,7 +91,7 @@ def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, mon
     run = lambda: compile_exported(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
     run(), run()
     assert len(traced) == 1
-    monkeypatch.setattr(simd, "processor", lambda: ("x86_64", "another", ""))
+    monkeypatch.setattr(simd, "describe_processor", lambda: ("x86_64", "another", ""))
     run()
     assert len(traced) == 2
 

@@ -1,4 +1,4 @@
-"""Scans to within a tolerance tell what `vrw.answer` does, sample by sample."""
+"""Scans to within a tolerance give what `vrw.measure_to_tolerance` gives, sample by sample."""
 
 from pathlib import Path
 
@@ -43,9 +43,9 @@ def test_a_scan_to_a_tolerance_has_value_error_and_model(tmp_path: Path) -> None
 
 
 def test_a_tolerance_requires_the_unilateral_model() -> None:
-    with pytest.raises(ValueError, match="kept towards real ground"):
+    with pytest.raises(ValueError, match="refers to unilateral contact"):
         vrw.scan(TOLERANCE_DESIGN, ["speed"], model="auto", tol=1e-2)
-    with pytest.raises(ValueError, match="kept towards real ground"):
+    with pytest.raises(ValueError, match="refers to unilateral contact"):
         vrw.scan(TOLERANCE_DESIGN, ["speed"], model=vrw.UnilateralWheel(restitution=0.1), tol=1e-2)
     with pytest.raises(ValueError, match="scan without tol"):
         vrw.scan(TOLERANCE_DESIGN, ["d speed / d damping"], model=REFERENCE_MODEL, tol=1e-2)
@@ -55,7 +55,7 @@ def test_a_tolerance_requires_the_unilateral_model() -> None:
 
 def test_a_config_names_the_tolerance(tmp_path: Path) -> None:
     path = tmp_path / "one.toml"
-    text = '[model]\nrung = "unilateral"\n[scan]\nmeasures = ["speed"]\ntol = 1e-3\n'
+    text = '[model]\nname = "unilateral"\n[scan]\nmeasures = ["speed"]\ntol = 1e-3\n'
     path.write_text(text + "[grid]\ndamping = [150.0]\n")
     assert config.load_config(path).scan.tol == 1e-3
     path.write_text(text.replace("1e-3", "-1.0"))

@@ -138,7 +138,7 @@ def test_settings_of_every_model_can_be_stored(wheel):
 def test_the_two_stability_margins_of_version_0_1_are_distinguished(
     tmp_path: Path, kind: str
 ) -> None:
-    """There `stability_margin` was labelled 1 - rho, and was that on real ground alone."""
+    """There `stability_margin` was labelled 1 - rho, and was that with unilateral contact alone."""
     radius, rung = np.array([0.5, 0.9]), np.array([1, 2], np.int8)
     held_values = np.where(rung == 1, 0.123, 1.0 - radius)
     label = {"symbol": "1 - ρ", "units": "1"}
@@ -175,9 +175,9 @@ jax.config.update("jax_enable_x64", True)
 from support import scanning
 def slow(columns):
     time.sleep(0.15)
-    return scanning.arithmetic(columns)
+    return scanning.evaluate_arithmetically(columns)
 print("ready", flush=True)
-scanning.run(scanning.planned(1), {store!r}, evaluate=slow)
+scanning.run_plan(scanning.make_plan(1), {store!r}, evaluate=slow)
 """
 
 
@@ -191,7 +191,7 @@ def test_a_store_whose_creation_was_killed_is_created_again(
         fill(place, *rest)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(scan_store, "_fill", killed)
+    monkeypatch.setattr(scan_store, "_create_arrays", killed)
     monkeypatch.setattr(scan_store.shutil, "rmtree", lambda *_, **__: None)  # nothing cleans up
     with pytest.raises(KeyboardInterrupt):
         run_plan(make_plan(), path, evaluate=evaluate_arithmetically)
@@ -273,12 +273,12 @@ def test_an_unfinished_scan_is_not_continued_by_other_code(
     store = tmp_path / "s.zarr"
     with pytest.raises(KeyboardInterrupt):
         run_plan(make_plan(), store, evaluate=CountingEngine(2))
-    monkeypatch.setattr(planning, "code_digest", lambda: "other")
+    monkeypatch.setattr(planning, "source_digest", lambda: "other")
     with pytest.raises(ValueError, match="the library's code differs"):
         run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
     monkeypatch.undo()
     run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
-    monkeypatch.setattr(planning, "code_digest", lambda: "other")
+    monkeypatch.setattr(planning, "source_digest", lambda: "other")
     run_plan(
         make_plan(), store, evaluate=CountingEngine(1)
     )  # finished: nothing is computed, all is there
@@ -336,7 +336,7 @@ def test_progress_counts_samples_failures_and_reused_samples(tmp_path: Path) -> 
         run_plan(make_plan(), tmp_path / "s.zarr", evaluate=CountingEngine(2))
     told: list[ScanProgress] = []
     result = run_plan(
-        make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically, report=told.append
+        make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically, on_progress=told.append
     )
     assert (told[0].n_done, told[0].n_samples, told[0].n_reused) == (0, 16, 4)
     assert (told[-1].n_done, told[-1].n_samples) == (16, 16)
@@ -462,7 +462,7 @@ def test_a_cycle_that_the_step_does_not_confirm_has_an_outcome(
     engine: CollocationEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine({"damping": np.array([200.0])})
-    monkeypatch.setattr(finder, "AGREEMENT", 0.0)
+    monkeypatch.setattr(finder, "STATE_AGREEMENT_TOLERANCE", 0.0)
     told = engine({"damping": np.array([200.0])})
     assert told["outcome"] == Outcome.MESH_TOO_COARSE
     assert np.isnan(told["speed"])
@@ -510,18 +510,17 @@ import os, sys
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
-from vrw_jax.scans.collocation_engine import LANES
+from vrw_jax.scans.collocation_engine import WHEELS_PER_BATCH, CollocationEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning
-of = scanning.planned()
-engine = scanning.Engine(of.for_engine)
-columns = scanning.GRID.block((slice(None), slice(None)))
-size = LANES + scanning.GRID.size
-told = engine({{name: np.resize(column, size) for name, column in columns.items()}})
-devices = {{engine._free.get().device.id for _ in range(engine._workers)}}
+engine = CollocationEngine(scanning.make_plan().request)
+columns = scanning.SMALL_GRID.sample_block((slice(None), slice(None)))
+size = WHEELS_PER_BATCH + scanning.SMALL_GRID.size
+results = engine({{name: np.resize(column, size) for name, column in columns.items()}})
+devices = {{engine._free_programs.get().device.id for _ in range(engine._n_workers)}}
 assert devices == {{0, 1}}, devices
-np.savez({place!r}, **told)
+np.savez({place!r}, **results)
 """
 
 
@@ -559,7 +558,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
-        connect_workers(cluster.scheduler_address) as path_modules,
+        connect_workers(cluster.scheduler_address) as executor,
     ):
         places = client.run(os.getpid)
 
@@ -572,7 +571,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
                     killed.append(places[victim])
                     os.kill(places[victim], signal.SIGKILL)
 
-        result = run_plan(make_plan(1), shared, report=report, through=path_modules)
+        result = run_plan(make_plan(1), shared, on_progress=report, executor=executor)
         assert len(killed) == 1
         assert killed[0] not in client.run(os.getpid).values()
     assert told[-1].n_done == SMALL_GRID.size
@@ -601,7 +600,7 @@ def compute_backwards(planned: ScanPlan, missing: Sequence[int]) -> Iterator[Chu
 
 def test_chunks_may_be_computed_in_any_order(tmp_path: Path) -> None:
     run_plan(make_plan(), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)
-    run_plan(make_plan(), tmp_path / "backwards.zarr", through=compute_backwards)
+    run_plan(make_plan(), tmp_path / "backwards.zarr", executor=compute_backwards)
     assert list_files(tmp_path / "backwards.zarr") == list_files(tmp_path / "whole.zarr")
 
 
@@ -613,21 +612,21 @@ def test_workers_with_another_environment_are_refused(
 
     scan_dask = dask
     told = iter([{"code": "ours"}])
-    monkeypatch.setattr(scan_dask, "origin", lambda: next(told, {"code": "theirs"}))
-    monkeypatch.setattr(scan_dask, "_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(scan_dask, "describe_environment", lambda: next(told, {"code": "theirs"}))
+    monkeypatch.setattr(scan_dask, "_make_engine_once", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
-        connect_workers(cluster.scheduler_address) as path_modules,
+        connect_workers(cluster.scheduler_address) as executor,
         pytest.raises(ValueError, match="the library's code differs"),
     ):
-        run_plan(make_plan(), tmp_path / "s.zarr", through=path_modules)
+        run_plan(make_plan(), tmp_path / "s.zarr", executor=executor)
     assert np.all(open_scan(tmp_path / "s.zarr").outcome.values == -1)
 
 
 def test_an_address_without_a_scheduler_gets_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(dask, "ANSWER", "1s")
+    monkeypatch.setattr(dask, "SCHEDULER_TIMEOUT", "1s")
     for address in ("nonsense://there", "tcp://127.0.0.1:9"):
         with pytest.raises(ValueError, match="no dask scheduler answers"), connect_workers(address):
             pass

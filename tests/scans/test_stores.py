@@ -143,7 +143,7 @@ def test_a_damaged_chunk_is_not_recomputed_by_other_code(
     complete_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (complete_store / "speed" / CHUNK_FILE).unlink()
-    monkeypatch.setattr(planning, "code_digest", lambda: "other")
+    monkeypatch.setattr(planning, "source_digest", lambda: "other")
     with pytest.raises(ValueError, match=r"lacks 1 of 5 chunks \(1 of them damaged\)"):
         run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
 
@@ -252,7 +252,7 @@ def test_of_two_simultaneous_scans_one_creates_the_store(
         fill(*arguments)
         joint_result.wait()
 
-    monkeypatch.setattr(scan_store, "_fill", filled)
+    monkeypatch.setattr(scan_store, "_create_arrays", filled)
     ends: list[object] = []
 
     def scan() -> None:

@@ -18,7 +18,7 @@ def arm_machine(monkeypatch):
     """Machine code is for arm64 from here on."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    monkeypatch.setattr(machine, "processor", lambda: ARM_TARGET)
+    monkeypatch.setattr(machine, "describe_processor", lambda: ARM_TARGET)
 
 
 def compute_roots(a, b):

@@ -22,8 +22,8 @@ LANES, X = [np.arange(4.0)], np.arange(4.0)
 class MemoryStore(dict):
     """A store in memory."""
 
-    load_content = dict.get
-    store_content = dict.__setitem__
+    load_bytes = dict.get
+    save_bytes = dict.__setitem__
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_a_later_start_neither_traces_nor_compiles(monkeypatch, fresh_process):
     double, traces = make_counted_function()
     store = MemoryStore()
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    monkeypatch.setattr(code, "compiled", None)  # would fail
+    monkeypatch.setattr(code, "compile_native", None)  # would fail
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     fresh_process.reset_registry()
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
@@ -71,7 +71,7 @@ def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, fresh_pro
         fresh_process.reset_registry()
     else:
         store = None
-    monkeypatch.setattr(code, "compiled", None)  # would fail
+    monkeypatch.setattr(code, "compile_native", None)  # would fail
     assert run_program(double, ("double", "after an edit of its docstring"), store) == [
         0.0,
         2.0,
@@ -90,7 +90,7 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
     store = MemoryStore()
     assert run_program(make_counted_function(2.0)[0], 2, store)[3] == 6.0
     assert run_program(make_counted_function(3.0)[0], 3, store)[3] == 9.0
-    monkeypatch.setattr(code, "how_compiled", lambda: "by another processor")
+    monkeypatch.setattr(code, "compilation_key", lambda: "by another processor")
     double, traces = make_counted_function()
     assert run_program(double, 2, store)[3] == 6.0
     assert len(traces) == 1
@@ -100,7 +100,7 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
 
 def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatch):
     may, compiled = threading.Event(), code.compile_native
-    monkeypatch.setattr(code, "compiled", lambda text: may.wait(60) and compiled(text))
+    monkeypatch.setattr(code, "compile_native", lambda text: may.wait(60) and compiled(text))
     evaluate_both = lambda x: run_two_programs(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
     traced = jax.jit(evaluate_both).trace(X)
     may.set()
@@ -109,7 +109,7 @@ def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatc
     def refuse(text):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(code, "compiled", refuse)
+    monkeypatch.setattr(code, "compile_native", refuse)
     traced = jax.jit(
         lambda x: run_two_programs(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)
     ).trace(X)
@@ -159,15 +159,15 @@ def test_code_is_loaded_by_its_name(fresh_process):
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
     result = """
         import jax, jax.numpy as jnp
-        from vrw_jax.simd import code, kernel
+        from vrw_jax.simd import code_cache, kernel
         def step(x, table):
             f = lambda k: {name: jnp.sin(k * x[0]) for name in ("beta", "alpha", "gamma")}
             sums = jax.tree.map(lambda y: y + jnp.sum(x * table[:, None], 0), f(2.0) | f(0.5))
             turn = lambda i, z: z + table[i] * sums["beta"]
             return {"loop": jax.lax.fori_loop(0, 9, turn, x[1]), **sums}
         shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
-        closed = code.traced(lambda x: step(x, jnp.arange(9.0)), shape)
-        print(code._digest(kernel.module_text(closed, 8).encode()))
+        closed = code_cache.trace_for_machine_code(lambda x: step(x, jnp.arange(9.0)), shape)
+        print(code_cache._digest(kernel.write_module(closed, 8).encode()))
     """
     lines = "\n".join(line[8:] for line in result.splitlines())
     method_names = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]

@@ -77,7 +77,7 @@ def relocate(memory: bytearray, address: int, kind: int, target: int) -> None:
 def run_compiled_lanes(
     code: bytes, inputs: list[np.ndarray], output_shapes: list[np.ndarray], width: int
 ) -> None:
-    """`lanes(given, told, n, 0, n / width)` of `simd.kernel`, into the arrays `told`."""
+    """Run the kernel of `simd.kernel` on `inputs`; write its results into `output_shapes`."""
     from unicorn import UC_ARCH_ARM64, UC_MODE_ARM, Uc
     from unicorn import arm64_const as arm
 

@@ -1,4 +1,4 @@
-"""A process that forgets its machine code, as another would not know it."""
+"""A registry of machine code that can be emptied, as in another process."""
 
 import jax
 
@@ -6,11 +6,11 @@ from vrw_jax.simd import code_cache as code
 from vrw_jax.simd import ffi_primitive as ffi
 from vrw_jax.simd import program
 
-_REGISTERED = ffi.LOADED_BY_NAME  # XLA never lets go, and takes one code of a name: it is the same
+_REGISTERED = ffi.LOADED_BY_NAME  # XLA never releases code and accepts one code per name
 
 
 class CodeRegistrySpy:
-    """`names` of machine code as it is registered; `forget()`, and all is as in another process."""
+    """Records `names` of registered code; `reset_registry()` gives the state of a new process."""
 
     def __init__(self, monkeypatch):
         self.names, self._monkeypatch = [], monkeypatch
@@ -19,10 +19,10 @@ class CodeRegistrySpy:
         self.reset_registry()
 
     def reset_registry(self):
-        self._monkeypatch.setattr(code, "_made", {})
+        self._monkeypatch.setattr(code, "_code_by_name", {})
         registered = PersistentRegistry()
         for module in (ffi, program):
-            self._monkeypatch.setattr(module, "registered", registered)
+            self._monkeypatch.setattr(module, "LOADED_BY_NAME", registered)
 
     def _register(self, name, *rest, **options):
         self.names.append(name)
@@ -31,7 +31,7 @@ class CodeRegistrySpy:
 
 
 class PersistentRegistry(dict):
-    """What is registered, which outlives the test."""
+    """Loaded code by name; registrations outlive the test."""
 
     def __setitem__(self, name, library):
         _REGISTERED.setdefault(name, library)

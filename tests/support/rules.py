@@ -1,22 +1,23 @@
-"""The rules of the house: each takes a package as read and tells, line by line, what breaks it."""
+"""Rules for imports between modules: each returns the violations in an import graph as lines."""
 
 import ast
 from collections.abc import Iterable, Iterator
 
-from support.rooms import PACKAGE_LAYERS, ImportEdge, ImportGraph, find_loaded_module
-
-MAX_MODULE_LINES, MAX_FUNCTION_LINES = 500, 60
+from support.package_graph import PACKAGE_LAYERS, ImportEdge, ImportGraph, find_loaded_module
 
 ALLOWED_IMPORTERS = {
     "diffrax": ("hybrid.phase_integration",), "llvmlite": ("simd",), "matplotlib": ("figures",),
     "PIL": ("figures",), "rich": ("cli",), "typer": ("cli",), "zarr": ("scans.store",),
     "anywidget": ("web",),
 }  # fmt: skip
-"""Who may know a library: modules or rooms. Faces only hand on."""
+"""Modules or packages that may import a library; an `__init__` file may re-export it."""
+
+MODEL_PACKAGES = ("models", "contact", "selection")
+"""Packages that define models. Only these may test which model an object is."""
 
 
 def find_import_cycles(import_graph: ImportGraph) -> list[str]:
-    """Modules that lead back to themselves; a face leads to what it hands out."""
+    """Return the import cycles of modules; an `__init__` file imports what it exports."""
     graph: dict[str, list[str]] = {module: [] for module in import_graph.paths}
     for edge in import_graph.edges:
         if edge.target in graph:
@@ -40,10 +41,10 @@ def find_import_cycles(import_graph: ImportGraph) -> list[str]:
 
 
 def find_upward_imports(import_graph: ImportGraph) -> list[str]:
-    """Imports against the flow, and rooms that the flow does not know."""
+    """Return the imports against the import order, and the packages outside that order."""
     layer_index = {package: index for index, row in enumerate(PACKAGE_LAYERS) for package in row}
     violations = [
-        f"{package} stands nowhere in the flow"
+        f"{package} is missing in PACKAGE_LAYERS"
         for package in import_graph.packages
         if package not in layer_index
     ]
@@ -54,17 +55,17 @@ def find_upward_imports(import_graph: ImportGraph) -> list[str]:
         if layer_index.get(target, len(PACKAGE_LAYERS)) >= layer_index.get(
             source, len(PACKAGE_LAYERS)
         ):
-            violations.append(f"{_format_location(edge)} knows {edge.target}")
+            violations.append(f"{_format_location(edge)} imports {edge.target}")
     return sorted(set(violations))
 
 
 def find_bypassed_init_files(import_graph: ImportGraph) -> list[str]:
-    """Imports that enter another room past its face."""
+    """Return the imports from another package that bypass its `__init__`."""
     return sorted(
         {
-            f"{_format_location(a)} fetches {a.imported_name.replace(':', '.')}"
-            for a in import_graph.edges
-            if _bypasses_init_file(import_graph, a)
+            f"{_format_location(edge)} imports {edge.imported_name.replace(':', '.')}"
+            for edge in import_graph.edges
+            if _bypasses_init_file(import_graph, edge)
         }
     )
 
@@ -86,41 +87,41 @@ def _bypasses_init_file(import_graph: ImportGraph, edge: ImportEdge) -> bool:
 
 
 def find_misplaced_external_imports(import_graph: ImportGraph) -> list[str]:
-    """Libraries known outside their room, and libraries loaded by names not written out."""
+    """Return the imports of libraries outside `ALLOWED_IMPORTERS`, or by a computed name."""
     violations, lazy = [], f"{import_graph.name}.runtime.lazy_import"
     for edge in import_graph.edges:
         places = [
             f"{import_graph.name}.{place}"
             for place in ALLOWED_IMPORTERS.get(edge.target.split(".")[0], ())
         ]
-        hands_on = import_graph.is_init_module(edge.source)
-        at_home = any(f"{edge.source}.".startswith(f"{place}.") for place in places)
-        if places and not hands_on and not at_home:
-            violations.append(f"{_format_location(edge)} knows {edge.target.split('.')[0]}")
-        inner, outer = (
+        is_init = import_graph.is_init_module(edge.source)
+        is_allowed = any(f"{edge.source}.".startswith(f"{place}.") for place in places)
+        if places and not is_init and not is_allowed:
+            violations.append(f"{_format_location(edge)} imports {edge.target.split('.')[0]}")
+        source_in_simd, target_in_simd = (
             import_graph.package_of(module) == "simd" for module in (edge.source, edge.target)
         )
-        if inner and not outer and edge.target in import_graph.paths:
+        if source_in_simd and not target_in_simd and edge.target in import_graph.paths:
             violations.append(
-                f"{_format_location(edge)} knows {edge.target}: simd knows nothing of the rest"
+                f"{_format_location(edge)} imports {edge.target}: simd imports no other package"
             )
     for module, tree in import_graph.trees.items():
         if module != lazy and any(
             find_loaded_module(node, import_graph.names[module]) == "" for node in ast.walk(tree)
         ):
-            violations.append(f"{module} loads a module by a name that is not written out")
+            violations.append(f"{module} imports a module by a computed name")
     return sorted(set(violations))
 
 
 def find_model_type_tests(import_graph: ImportGraph) -> list[str]:
-    """Questions above `models` which rung, or which rung's step, a thing is.
+    """Return the tests outside `MODEL_PACKAGES` for the class or name of one model or its step.
 
-    A rung is a class of `models` that extends an abstract one; `AbstractWheel` itself may be
-    asked for: whether a thing is a rung at all.
+    A model is a class of these packages that extends an abstract class. A test for the abstract
+    class itself, such as `AbstractWheel`, is allowed.
     """
     model_classes, violations = _find_model_classes(import_graph), []
     for module, tree in import_graph.trees.items():
-        if import_graph.package_of(module) in {"models", ""}:
+        if import_graph.package_of(module) in {*MODEL_PACKAGES, ""}:
             continue
         constants = {
             target.id: node.value
@@ -131,17 +132,18 @@ def find_model_type_tests(import_graph: ImportGraph) -> list[str]:
         }
         for node in ast.walk(tree):
             if _tests_class_name(node):
-                violations.append(f"{module}:{node.lineno} asks for {ast.unparse(node)}")
+                violations.append(f"{module}:{node.lineno} tests for {ast.unparse(node)}")
             for tested_names in _tested_expressions(node):
                 for name in _find_class_names(tested_names, constants):
                     if import_graph.find_definition(module, name) in model_classes:
-                        violations.append(f"{module}:{node.lineno} asks for {ast.unparse(name)}")
+                        violations.append(f"{module}:{node.lineno} tests for {ast.unparse(name)}")
     return sorted(set(violations))
 
 
 def _find_model_classes(import_graph: ImportGraph) -> set[str]:
     bases: dict[str, list[str]] = {}
-    for module in import_graph.modules_of("models"):
+    model_modules = [m for package in MODEL_PACKAGES for m in import_graph.modules_of(package)]
+    for module in model_modules:
         for node in ast.walk(import_graph.trees[module]):
             if isinstance(node, ast.ClassDef):
                 bases[f"{module}.{node.name}"] = [
@@ -155,7 +157,7 @@ def _find_model_classes(import_graph: ImportGraph) -> set[str]:
 
 
 def _tested_expressions(node: ast.AST) -> Iterator[ast.AST]:
-    """Parts of a node that ask of what class a thing is."""
+    """Yield the parts of a node that are compared with an object's class."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         if node.func.id in {"isinstance", "issubclass"} and len(node.args) == 2:
             yield node.args[1]
@@ -171,21 +173,21 @@ def _tested_expressions(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _tests_class_name(node: ast.AST) -> bool:
-    """Whether it compares the name that a rung bears with one written out."""
+    """Return whether a node compares the name of a model with a literal."""
     if not isinstance(node, ast.Compare):
         return False
     sides = [node.left, *node.comparators]
     has_name_attribute = any(isinstance(part, ast.Constant) and isinstance(part.value, str)
                   for side in sides for part in ast.walk(side))  # fmt: skip
     return has_name_attribute and any(
-        isinstance(x, ast.Attribute) and x.attr == "rung" for x in sides
+        isinstance(x, ast.Attribute) and x.attr == "model_name" for x in sides
     )
 
 
 def _find_class_names(
     node: ast.AST, constants: dict[str, ast.expr]
 ) -> Iterator[ast.Name | ast.Attribute]:
-    """Names in an expression; a module's constant counts as what it holds."""
+    """Yield the names in an expression; a module's constant is replaced by its value."""
     for inner in ast.walk(node):
         if isinstance(inner, ast.Name) and inner.id in constants:
             value_node = {name: value for name, value in constants.items() if name != inner.id}
@@ -194,67 +196,30 @@ def _find_class_names(
             yield inner
 
 
-def find_hidden_modules(import_graph: ImportGraph) -> list[str]:
-    """Functions and classes that bear the name of their module, or hide a module in a face."""
-    violations = []
-    for module, tree in import_graph.trees.items():
-        last = module.split(".")[-1]
-        for node in tree.body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == last:
-                violations.append(f"{module}:{node.lineno} defines its own name")
-            defined = isinstance(
-                node, ast.FunctionDef | ast.ClassDef
-            ) and import_graph.is_init_module(module)
-            if defined and f"{module}.{node.name}" in import_graph.paths:
-                violations.append(f"{module}:{node.lineno} hides its module {node.name}")
-        for name, origin in (
-            import_graph.names[module].items() if import_graph.is_init_module(module) else ()
-        ):
-            inner = f"{module}.{name}"
-            if inner in import_graph.paths and import_graph.resolve_path(origin)[-1] != inner:
-                violations.append(f"{module} hides its module {name} by {origin}")
-    return sorted(set(violations))
-
-
-def find_long_code(import_graph: ImportGraph) -> list[str]:
-    """Modules and functions past their number of lines; a function's docstring is not counted."""
-    violations = []
-    for module, tree in import_graph.trees.items():
-        if (lines := import_graph.count_lines(module)) > MAX_MODULE_LINES:
-            violations.append(f"{module} has {lines} lines")
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length_text = ast.get_docstring(node, clean=False) or ""
-                lines = (node.end_lineno or 0) - node.lineno + 1 - length_text.count("\n")
-                if lines > MAX_FUNCTION_LINES:
-                    violations.append(f"{module}:{node.lineno} {node.name} has {lines} lines")
-    return violations
-
-
 def find_unused_exports(
     import_graph: ImportGraph, outside_sources: Iterable[str] = ()
 ) -> list[str]:
-    """Names that a face hands out and nobody fetches there, or that are private.
+    """Return the exports of `__init__` files that nothing imports, or that are private.
 
-    `outside` is source that uses the package: tests and experiments. The package's own face is for
-    its users, who are not here.
+    `outside_sources` use the package: tests and experiments. The top package's own `__init__` is
+    for users and is not checked.
     """
     imported_names = {
-        written_text
-        for text in outside_sources
-        for written_text in import_graph.find_imports_in(text)
+        name for text in outside_sources for name in import_graph.find_imports_in(text)
     }
     violations = []
-    for face in import_graph.paths:
-        if not import_graph.is_init_module(face) or face == import_graph.name:
+    for init in import_graph.paths:
+        if not import_graph.is_init_module(init) or init == import_graph.name:
             continue
-        strangers = (a for a in import_graph.edges if not f"{a.source}.".startswith(f"{face}."))
-        used = imported_names | {arrow.imported_name for arrow in strangers}
-        for name in import_graph.names[face]:
-            if not any(f"{written_text}.".startswith(f"{face}:{name}.") for written_text in used):
-                violations.append(f"{face} hands out {name}, which nobody fetches there")
+        outside_edges = (
+            edge for edge in import_graph.edges if not f"{edge.source}.".startswith(f"{init}.")
+        )
+        used_names = imported_names | {edge.imported_name for edge in outside_edges}
+        for name in import_graph.names[init]:
+            if not any(f"{used_name}.".startswith(f"{init}:{name}.") for used_name in used_names):
+                violations.append(f"{init} exports {name}, which nothing imports from there")
             if name.startswith("_"):
-                violations.append(f"{face} hands out {name}, which is private")
+                violations.append(f"{init} exports {name}, which is private")
     return violations
 
 
@@ -268,6 +233,4 @@ IMPORT_RULES = (
     find_bypassed_init_files,
     find_misplaced_external_imports,
     find_model_type_tests,
-    find_hidden_modules,
-    find_long_code,
 )

@@ -29,10 +29,12 @@ def evaluate_arithmetically(columns: SampleColumns) -> Mapping[str, np.ndarray]:
 
 
 class CountingEngine:
-    """The stand-in, counting its calls and failing at the call that it is told to."""
+    """The stand-in, counting its calls and failing at one of them."""
 
-    def __init__(self, fails_at: int | None = None, error: type[BaseException] = KeyboardInterrupt):
-        self.n_calls, self.failing_call, self.error = 0, fails_at, error
+    def __init__(
+        self, failing_call: int | None = None, error: type[BaseException] = KeyboardInterrupt
+    ) -> None:
+        self.n_calls, self.failing_call, self.error = 0, failing_call, error
 
     def __call__(self, columns: SampleColumns) -> Mapping[str, np.ndarray]:
         self.n_calls += 1
@@ -57,7 +59,7 @@ def run_plan(
             )
 
     return running.run_scan(
-        plan_of_scan, store, **({"through": compute_in_order} if evaluate else {}) | keywords
+        plan_of_scan, store, **({"executor": compute_in_order} if evaluate else {}) | keywords
     )
 
 

@@ -24,7 +24,7 @@ class PageCode:
         self.facts = self.modules[0].facts
 
     def __call__(self, name: str, *given: Any) -> list[np.ndarray]:
-        """See `Module`."""
+        """Call the function; see `WasmModule`."""
         [owner] = [module for module in self.modules if name in module]
         return owner(name, *given)
 
@@ -76,7 +76,7 @@ class WasmModule:
     def __call__(
         self, name: str, numbers: list[float], arrays: list[np.ndarray], output_sizes: list[Any]
     ) -> list[np.ndarray]:
-        """`told`: the results' rows and kinds."""
+        """Return the results; `output_sizes` holds the rows and number type of each."""
         n = arrays[0].shape[-1]
         lanes = n + n % 2
         padded = [np.concatenate([x, x[..., -1:]], -1)[..., :lanes] for x in arrays]

@@ -1,7 +1,7 @@
-"""Wrong uses of the library, each with the kind of error and words of its sentence.
+"""Wrong uses of the library, each with the type of its error and words of its message.
 
-Run as a program it tries them all in a process of its own, where nothing checks annotations as the
-tests do, and prints what came: {name: [kind, sentence, file that refused]}.
+As a program it runs them all in a process without the annotation checks of the tests, and prints
+{name: [error type, message, file that raised it]}.
 """
 
 import json
@@ -43,7 +43,7 @@ def register_wrong_calls() -> None:
     import xarray as xr
 
     import vrw_jax as vrw
-    from vrw_jax import numerics
+    from vrw_jax import hybrid
 
     table_1, start = vrw.WheelParams(), vrw.paper_start()
     several = vrw.WheelParams(damping=np.linspace(100.0, 200.0, 3))
@@ -102,21 +102,21 @@ def register_wrong_calls() -> None:
     )
 
     # Options
-    for name in ("rtol", "atol", "max_phase_time", "first_step"):
+    for name in ("rtol", "atol", "max_phase_time", "dt0"):
         add_wrong_calls(
-            f"Options {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), positive, name
+            f"StepOptions {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), positive, name
         )
-    for name in ("max_solver_steps", "event_steps"):
+    for name in ("max_solver_steps", "max_event_iterations"):
         add_wrong_calls(
-            f"Options {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), full_values, name
+            f"StepOptions {name}", lambda v, n=name: vrw.StepOptions(**{n: v}), full_values, name
         )
     solvers = not_numbers | {
         "an object of diffrax": (diffrax.Tsit5(), "TypeError"), "typo": ("Tsit6", "ValueError"),
         "for noise": ("ShARK", "ValueError"),
     }  # fmt: skip
     del solvers["text"], solvers["digits"]
-    add_wrong_calls("Options solver", lambda v: vrw.StepOptions(solver=v), solvers, "solver")
-    for name in ("iterations", "block"):
+    add_wrong_calls("StepOptions solver", lambda v: vrw.StepOptions(solver=v), solvers, "solver")
+    for name in ("max_newton_iterations", "batch_size"):
         add_wrong_calls(
             f"CycleOptions {name}", lambda v, n=name: vrw.CycleOptions(**{n: v}), full_values, name
         )
@@ -127,10 +127,10 @@ def register_wrong_calls() -> None:
         "two": (1, 2), "fractions": (1.5, 2, 3), "text": "abcd", "one": 5, "zeros": (0, 1, 1)
     }.items():  # fmt: skip
         add_wrong_call(
-            f"CycleOptions steps: {label}",
+            f"CycleOptions mesh_intervals: {label}",
             lambda v=value: vrw.CycleOptions(mesh_intervals=v),
             "ValueError",
-            "steps",
+            "mesh_intervals",
         )
     add_wrong_calls(
         "ArclengthOptions max_points",
@@ -139,22 +139,25 @@ def register_wrong_calls() -> None:
         "max_points",
     )
     add_wrong_calls(
-        "ArclengthOptions turn", lambda v: vrw.ArclengthOptions(max_turn_angle=v), positive, "turn"
+        "ArclengthOptions max_turn_angle",
+        lambda v: vrw.ArclengthOptions(max_turn_angle=v),
+        positive,
+        "max_turn_angle",
     )
     add_wrong_call(
-        "steps of a branch out of order",
+        "step_batch of a branch out of order",
         lambda: vrw.ArclengthOptions(initial_ds=1.0),
         "ValueError",
         "order",
     )
 
-    # Rungs
+    # Models
     frictions = not_numbers | {
         "negative": (-1.0, "ValueError"), "nan": (float("nan"), "ValueError")
     }  # fmt: skip
-    for rung in (vrw.UnilateralWheel, vrw.ViscoelasticWheel, vrw.RigidWheel, vrw.LadderWheel):
+    for model in (vrw.UnilateralWheel, vrw.ViscoelasticWheel, vrw.RigidWheel, vrw.LadderWheel):
         add_wrong_calls(
-            f"{rung.__name__} friction", lambda v, r=rung: r(friction=v), frictions, "friction"
+            f"{model.__name__} friction", lambda v, m=model: m(friction=v), frictions, "friction"
         )
     add_wrong_calls(
         "UnilateralWheel max_events",
@@ -188,7 +191,9 @@ def register_wrong_calls() -> None:
         "return_map": lambda: vrw.return_map(table_1, start, model=grounds),
         "walk of three steps": lambda: vrw.walk(table_1, start, 3, model=grounds),
         "simulate": lambda: vrw.simulate(table_1, start, model=grounds),
-        "steps of three lanes": lambda: vrw.step_batch(several, np.tile(start, (3, 1)), model=grounds),
+        "step_batch of three wheels": lambda: vrw.step_batch(
+            several, np.tile(start, (3, 1)), model=grounds
+        ),
         "limit_cycle": lambda: vrw.limit_cycle(table_1, model=grounds),
         "limit_cycles": lambda: vrw.limit_cycles(several, model=grounds),
         "sensitivities": lambda: vrw.sensitivities(table_1, model=grounds),
@@ -250,21 +255,21 @@ def register_wrong_calls() -> None:
     rows = given | {"three numbers": (np.ones(3), "ValueError"),
                     "four columns": (np.ones((2, 4)), "ValueError")}  # fmt: skip
     rows.pop("a row")
-    add_wrong_calls("steps states", lambda v: vrw.step_batch(table_1, v), rows, "states")
+    add_wrong_calls("step_batch states", lambda v: vrw.step_batch(table_1, v), rows, "states")
     add_wrong_call(
         "step by options of a cycle",
         lambda: vrw.step(table_1, start, options=vrw.CycleOptions()),
         "TypeError",
-        "must be an Options: give vrw.Options",
+        "must be a StepOptions: give vrw.StepOptions",
     )
     add_wrong_call(
-        "a rung that is a class",
+        "a model that is a class",
         lambda: vrw.step(table_1, start, model=vrw.RigidWheel),
         "TypeError",
         "model",
     )
     add_wrong_call(
-        "a rung by another name",
+        "a model by another name",
         lambda: vrw.step(table_1, start, model="rigid"),
         "TypeError",
         "auto",
@@ -291,41 +296,43 @@ def register_wrong_calls() -> None:
     # Batches
     ones = np.asarray(start)[None]
     add_wrong_calls(
-        "steps n_steps", lambda v: vrw.step_batch(table_1, ones, v), full_values, "n_steps"
+        "step_batch n_steps", lambda v: vrw.step_batch(table_1, ones, v), full_values, "n_steps"
     )
     add_wrong_call(
-        "steps engine",
+        "step_batch engine",
         lambda: vrw.step_batch(table_1, ones, engine="lane"),
         "ValueError",
         "did you mean 'lanes'",
     )
     add_wrong_call(
-        "steps engine none",
+        "step_batch engine none",
         lambda: vrw.step_batch(table_1, ones, engine=None),
         "TypeError",
         "engine",
     )
     add_wrong_call(
-        "steps of another number of wheels",
+        "step_batch of another number of wheels",
         lambda: vrw.step_batch(several, ones),
         "ValueError",
         "one for each",
     )
-    add_wrong_call("steps of a table", lambda: vrw.step_batch({}, ones), "TypeError", "WheelParams")
     add_wrong_call(
-        "steps by options of a cycle",
-        lambda: vrw.step_batch(table_1, ones, options=vrw.CycleOptions()),
-        "TypeError",
-        "vrw.Options",
+        "step_batch of a table", lambda: vrw.step_batch({}, ones), "TypeError", "WheelParams"
     )
     add_wrong_call(
-        "steps by collocation without durations",
+        "step_batch by options of a cycle",
+        lambda: vrw.step_batch(table_1, ones, options=vrw.CycleOptions()),
+        "TypeError",
+        "vrw.StepOptions",
+    )
+    add_wrong_call(
+        "step_batch by collocation without durations",
         lambda: vrw.step_batch(table_1, ones, engine="collocation"),
         "ValueError",
         "durations",
     )
     add_wrong_call(
-        "steps of single numbers",
+        "step_batch of single numbers",
         lambda: vrw.step_batch(single, ones),
         "ValueError",
         "vrw.start_jax()",
@@ -333,7 +340,8 @@ def register_wrong_calls() -> None:
 
     # Inside transformations
     for name, call in {
-        "steps": lambda p: vrw.step_batch(p, ones), "simulate": lambda p: vrw.simulate(p, start),
+        "step_batch": lambda p: vrw.step_batch(p, ones),
+        "simulate": lambda p: vrw.simulate(p, start),
         "tune": lambda p: vrw.tune(p, "speed", ["damping"], {"damping": (100.0, 300.0)}),
         "sensitivities": lambda p: vrw.sensitivities(p),
         "continue_branch": lambda p: vrw.continue_branch(p, "damping", (100.0, 300.0)),
@@ -368,21 +376,21 @@ def register_wrong_calls() -> None:
         "guess",
     )
     add_wrong_call(
-        "lost gaits as a number",
+        "on_failure as a number",
         lambda: vrw.limit_cycle(table_1, on_failure=0.0),
         "TypeError",
-        "lost",
+        "on_failure",
     )
     add_wrong_call(
-        "lost gaits misspelt",
+        "on_failure misspelt",
         lambda: vrw.limit_cycle(table_1, on_failure="NaN"),
         "ValueError",
-        "lost",
+        "on_failure",
     )
     asks = lambda **given: vrw.measure_to_tolerance(
         **{"measures": "speed", "params": table_1, "tol": 1e-3, "friction": 20.0} | given
     )
-    add_wrong_calls("answer tol", lambda v: asks(tol=v), positive, "tol")
+    add_wrong_calls("measure_to_tolerance tol", lambda v: asks(tol=v), positive, "tol")
     wrong = (
         ("measure misspelt", {"measures": "spead"}, "ValueError", "did you mean 'speed'"),
         ("measure of a step alone", {"measures": "slip"}, "ValueError", "every rung tells"),
@@ -390,7 +398,7 @@ def register_wrong_calls() -> None:
         ("measures as numbers", {"measures": [1.0]}, "TypeError", "measures"),
         ("a number as the wheel", {"params": 150.0}, "TypeError", "WheelParams"),
         ("frictions of other lanes", {"friction": [1.0, 2.0], "params": several}, "ValueError",
-         "lanes have one axis"),
+         "a batch has one axis"),
         ("negative friction", {"friction": -1.0}, "ValueError", "friction"),
         ("relative as text", {"relative": "yes"}, "TypeError", "relative"),
         ("stoppers misspelt", {"stoppers": "onesided"}, "ValueError", "stoppers"),
@@ -398,23 +406,37 @@ def register_wrong_calls() -> None:
         ("which between places", {"which": 0.5}, "ValueError", "which is 0.5"),
     )  # fmt: skip
     for label, given, kind, words in wrong:
-        add_wrong_call(f"answer: {label}", lambda given=given: asks(**given), kind, words)
+        add_wrong_call(
+            f"measure_to_tolerance: {label}", lambda given=given: asks(**given), kind, words
+        )
     mean = lambda params=several, **given: vrw.multifidelity_mean(
         given.pop("measure", "speed"), params, given.pop("tol", 1e-3), friction=20.0, **given
     )
     add_wrong_call(
-        "average of one wheel", lambda: mean(table_1), "ValueError", "more wheels than its pilot"
+        "multifidelity_mean of one wheel",
+        lambda: mean(table_1),
+        "ValueError",
+        "more wheels than its pilot",
     )
-    add_wrong_call("average of few wheels", mean, "ValueError", "there are 3 wheels")
-    add_wrong_call("average: a small pilot", lambda: mean(pilot=2), "ValueError", "pilot")
-    add_wrong_call("average: tol negative", lambda: mean(tol=-1.0), "ValueError", "tol")
+    add_wrong_call("multifidelity_mean of few wheels", mean, "ValueError", "there are 3 wheels")
     add_wrong_call(
-        "average: unknown measure", lambda: mean(measure="sped"), "ValueError", "every rung tells"
+        "multifidelity_mean: a small pilot", lambda: mean(pilot=2), "ValueError", "pilot"
     )
-    add_wrong_call("average: several", lambda: mean(measure=["speed"]), "TypeError", "measure")
-    add_wrong_call("average: a state", lambda: mean(start), "TypeError", "WheelParams")
-    add_wrong_call("average: stoppers", lambda: mean(stoppers="none"), "ValueError", "stoppers")
-    add_wrong_call("average: seed", lambda: mean(seed="one"), "TypeError", "seed")
+    add_wrong_call("multifidelity_mean: tol negative", lambda: mean(tol=-1.0), "ValueError", "tol")
+    add_wrong_call(
+        "multifidelity_mean: unknown measure",
+        lambda: mean(measure="sped"),
+        "ValueError",
+        "every rung tells",
+    )
+    add_wrong_call(
+        "multifidelity_mean: several", lambda: mean(measure=["speed"]), "TypeError", "measure"
+    )
+    add_wrong_call("multifidelity_mean: a state", lambda: mean(start), "TypeError", "WheelParams")
+    add_wrong_call(
+        "multifidelity_mean: stoppers", lambda: mean(stoppers="none"), "ValueError", "stoppers"
+    )
+    add_wrong_call("multifidelity_mean: seed", lambda: mean(seed="one"), "TypeError", "seed")
 
     add_wrong_call(
         "limit_cycle of a batch", lambda: vrw.limit_cycle(several), "ValueError", "jax.vmap"
@@ -486,19 +508,19 @@ def register_wrong_calls() -> None:
         "no gait",
     )
     add_wrong_call(
-        "newton_cycle of no function",
+        "solve_fixed_point of no function",
         lambda: vrw.solve_fixed_point(3.0, start),
         "TypeError",
         "function",
     )
     add_wrong_calls(
-        "newton_cycle period_n",
+        "solve_fixed_point period_n",
         lambda v: vrw.solve_fixed_point(lambda x: x, start, period_n=v),
         full_values,
         "period_n",
     )
     add_wrong_call(
-        "newton_cycle from text",
+        "solve_fixed_point from text",
         lambda: vrw.solve_fixed_point(lambda x: x, "abc"),
         "TypeError",
         "start",
@@ -506,34 +528,42 @@ def register_wrong_calls() -> None:
 
     # Any field, guards and resets
     fall = lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]])
-    floor = numerics.Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -0.8 * y[1]]))
-    ball = numerics.Mode(fall, (floor,))
-    compute_walked = lambda modes, **other: numerics.simulate_hybrid(
+    floor = hybrid.Guard(lambda y: y[0], lambda y: jnp.stack([0.0 * y[0], -0.8 * y[1]]))
+    ball = hybrid.Mode(fall, (floor,))
+    run_hybrid = lambda modes, **other: hybrid.simulate_hybrid(
         modes, [1.0, 0.0], **{"events": 2} | other
     )
     add_wrong_calls(
-        "walk events", lambda v: compute_walked([ball], events=v), full_values, "events is"
+        "simulate_hybrid events", lambda v: run_hybrid([ball], events=v), full_values, "events is"
     )
     for name, call, kind, words in (
-        ("more events than fit", lambda: compute_walked([ball], events=10**12), "ValueError", "fewer"),
-        ("options of a cycle", lambda: compute_walked([ball], options=vrw.CycleOptions()), "TypeError",
-         "vrw.Options()"),
-        ("a mode that there isn't", lambda: compute_walked([ball], mode=3), "ValueError", "mode is 3"),
-        ("a mode in no list", lambda: compute_walked(ball), "TypeError", "a mode is"),
-        ("a field as mode", lambda: compute_walked([fall]), "TypeError", "give Mode(field, guards)"),
-        ("no field", lambda: compute_walked([ball._replace(field=None)]), "TypeError", "a function"),
-        ("a guard in no tuple", lambda: compute_walked([ball._replace(guards=floor)]), "TypeError",
+        ("more events than fit", lambda: run_hybrid([ball], events=10**12), "ValueError", "fewer"),
+        ("options of a cycle", lambda: run_hybrid([ball], options=vrw.CycleOptions()), "TypeError",
+         "vrw.StepOptions()"),
+        ("a mode that there isn't", lambda: run_hybrid([ball], mode=3), "ValueError", "mode is 3"),
+        ("a mode in no list", lambda: run_hybrid(ball), "TypeError", "a mode is"),
+        ("a field as mode", lambda: run_hybrid([fall]), "TypeError", "give Mode(field, guards)"),
+        ("no field", lambda: run_hybrid([ball._replace(field=None)]), "TypeError", "a function"),
+        ("a guard in no tuple", lambda: run_hybrid([ball._replace(guards=floor)]), "TypeError",
          "give Guard("),
-        ("a function as guard", lambda: compute_walked([ball._replace(guards=(fall,))]), "TypeError",
+        ("a function as guard", lambda: run_hybrid([ball._replace(guards=(fall,))]), "TypeError",
          "give Guard("),
-        ("a field of one row less", lambda: compute_walked([ball._replace(field=lambda y: y[:1])]),
+        ("a field of one row less", lambda: run_hybrid([ball._replace(field=lambda y: y[:1])]),
          "ValueError", "the field of mode 0"),
     ):  # fmt: skip
-        add_wrong_call(f"walk with {name}", call, kind, words)
-    add_wrong_call("newton_cycle of a map elsewhere", lambda: vrw.solve_fixed_point(lambda x: x[:1], start),
-        "ValueError", "its like")  # fmt: skip
-    add_wrong_call("contacts that are no number", lambda: numerics.enumerate_lcp_solutions([[np.nan]], [1.0]),
-        "ValueError", "not finite")  # fmt: skip
+        add_wrong_call(f"simulate_hybrid with {name}", call, kind, words)
+    add_wrong_call(
+        "solve_fixed_point of a map elsewhere",
+        lambda: vrw.solve_fixed_point(lambda x: x[:1], start),
+        "ValueError",
+        "its like",
+    )
+    add_wrong_call(
+        "contacts that are no number",
+        lambda: hybrid.enumerate_lcp_solutions([[np.nan]], [1.0]),
+        "ValueError",
+        "not finite",
+    )
 
     # Branches
     bounds = {
@@ -562,7 +592,7 @@ def register_wrong_calls() -> None:
         "no parameter",
     )
     add_wrong_call(
-        "continue_branch along friction nobody feels",
+        "continue_branch along friction without effect",
         lambda: evaluate_along(name="friction"),
         "ValueError",
         "no parameter",
@@ -601,7 +631,7 @@ def register_wrong_calls() -> None:
         "continue_branch by options of a mesh in the step's place",
         lambda: evaluate_along(step_options=vrw.CycleOptions()),
         "TypeError",
-        "vrw.Options",
+        "vrw.StepOptions",
     )
     add_wrong_call(
         "continue_branch by options of a step in the mesh's place",
@@ -657,17 +687,17 @@ def register_wrong_calls() -> None:
             "dtheta_touchdown",
         )
     add_wrong_calls(
-        "basin most_steps",
+        "basin max_steps",
         lambda v: vrw.basin(table_1, grid, max_steps=v),
         full_values,
-        "most_steps",
+        "max_steps",
     )
     add_wrong_call("basin of a batch", lambda: vrw.basin(several, grid), "ValueError", "one wheel")
     add_wrong_call(
         "basin by options of a cycle",
         lambda: vrw.basin(table_1, grid, options=vrw.CycleOptions()),
         "TypeError",
-        "vrw.Options",
+        "vrw.StepOptions",
     )
     add_wrong_call(
         "basin of single numbers", lambda: vrw.basin(single, grid), "ValueError", "start_jax"
@@ -748,7 +778,7 @@ def register_wrong_calls() -> None:
         "tune by options of a mesh",
         lambda: tune(options=vrw.CycleOptions()),
         "TypeError",
-        "vrw.Options",
+        "vrw.StepOptions",
     )
 
     # Designs and scans
@@ -822,7 +852,7 @@ def register_wrong_calls() -> None:
         "scan by options of a mesh",
         lambda: scan(options=vrw.CycleOptions()),
         "TypeError",
-        "vrw.Options",
+        "vrw.StepOptions",
     )
     add_wrong_call(
         "scan by options of a step in the mesh's place",
@@ -831,7 +861,7 @@ def register_wrong_calls() -> None:
         "CycleOptions",
     )
     add_wrong_call(
-        "scan over friction nobody feels",
+        "scan over friction without effect",
         lambda: scan(design=vrw.grid(friction=[0.5, 0.7])),
         "ValueError",
         "friction",
@@ -855,7 +885,7 @@ def register_wrong_calls() -> None:
     )
     add_wrong_call("explore a table", lambda: vrw.explore(dataset={}), "TypeError", "dataset is {}")
     add_wrong_calls(
-        "newton_cycle tolerance",
+        "solve_fixed_point tolerance",
         lambda v: vrw.solve_fixed_point(lambda x: x, start, tolerance=v),
         positive,
         "tolerance",
@@ -872,14 +902,14 @@ def register_wrong_calls() -> None:
         "misspelt": (("dampin", "slope"), "ValueError"),
         "friction": (("slope", "friction"), "ValueError"),
     }  # fmt: skip
-    add_wrong_calls("border_curve of", lambda v: curve(parameters=v), pairs, "parameter")
+    add_wrong_calls("continue_special_point of", lambda v: curve(parameters=v), pairs, "parameter")
     boxes = {
         "list": ([1.0, 2.0], "TypeError"), "one number": ({"slope": 0.3}, "TypeError"),
         "misspelt": ({"slop": (0.1, 0.2)}, "ValueError"),
         "empty": ({"slope": (0.3, 0.3)}, "ValueError"),
     }  # fmt: skip
-    add_wrong_calls("border_curve bounds", lambda v: curve(bounds=v), boxes, "")
-    add_wrong_call("border_curve of a wheel", curve, "TypeError", "cycle is")
+    add_wrong_calls("continue_special_point bounds", lambda v: curve(bounds=v), boxes, "")
+    add_wrong_call("continue_special_point of a wheel", curve, "TypeError", "cycle is")
 
     # Pictures
     plot = vrw.plot

@@ -60,7 +60,7 @@ def test_gradients_of_objective_and_all_constraints_agree_with_central_differenc
 
 
 def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_result):
-    assert max_dls_result.ending == TuneStatus.CONVERGED
+    assert max_dls_result.status == TuneStatus.CONVERGED
     assert max_dls_result.kkt_residual < 1e-6
     assert {a.name for a in max_dls_result.active} >= {"takeoff_acceleration", "slope"}
     assert all(a.price > 0.0 for a in max_dls_result.active)
@@ -118,15 +118,15 @@ def test_without_margins_the_optimum_of_double_support_scuffs(
 
 
 def test_the_tuned_wheel_walks_and_satisfies_its_margins_on_every_step(max_dls_result):
-    walk_result = max_dls_result.walked
+    walk_result = max_dls_result.validation
     assert walk_result.outcome == vrw.Outcome.STEPPED
-    assert walk_result.steps == 10
-    assert walk_result.kept
+    assert walk_result.n_steps == 10
+    assert walk_result.is_feasible
     assert walk_result.distance < 1e-7
 
 
 def test_tuning_evaluates_few_gaits(max_dls_result):
-    assert max_dls_result.evaluations <= 12
+    assert max_dls_result.n_evaluations <= 12
 
 
 def test_a_lost_gait_shortens_the_step_and_is_reported():
@@ -163,7 +163,7 @@ def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(max_dls_res
     assert_netcdf_round_trip(max_dls_result.path, tmp_path)
     path = max_dls_result.path
     assert path.damping.attrs["units"] == "N s/m"
-    assert path.sizes["evaluation"] == max_dls_result.evaluations
+    assert path.sizes["evaluation"] == max_dls_result.n_evaluations
     assert path.attrs["ending"] == "CONVERGED"
     assert "takeoff_acceleration" in repr(max_dls_result)
     assert "<table>" in max_dls_result._repr_html_()
@@ -221,7 +221,7 @@ def test_a_start_without_a_gait_is_refused():
         tune(vrw.WheelParams(damping=500.0), "dls_fraction", ["damping"], bounds, {})
 
 
-# Real ground --------------------------------------------------------------------------------------
+# Unilateral contact
 
 
 def test_constraints_of_a_unilateral_gait_are_lower_bounds_or_ranges():

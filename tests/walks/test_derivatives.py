@@ -71,10 +71,10 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         return jax.lax.scan(rk4, y, None, length=2000)[0]
 
     def through(phase, y, duration):
-        ending = lambda y: (flow(phase.field, y, duration),) * 2
+        ending = lambda y: (flow(phase.vector_field, y, duration),) * 2
         matrix, end = jax.jacfwd(ending, has_aux=True)(y)
-        gradient = jax.grad(lambda y: phase.watched.values(y)[0])(end)
-        f = phase.field(end)
+        gradient = jax.grad(lambda y: phase.guards.values(y)[0])(end)
+        f = phase.vector_field(end)
         return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
 
     def landed(x):

@@ -48,7 +48,7 @@ def flatten_derivatives(by_input):
 def results_of_both_engines():
     params, states = draw_box(N, 0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "MAPPED", N)  # not filled up to more
+        patch.setattr(batch, "DIFFRAX_BATCH_SIZE", N)  # not filled up to more
         lanes, diffrax = (
             vrw.step_batch(
                 params, states, options=TIGHT_OPTIONS, engine=engine, derivatives=ALL_INPUT_NAMES
@@ -146,7 +146,7 @@ def test_a_jacobian_within_jit_compiles_only_its_own_machine_code(monkeypatch):
     def code_of(function, shapes, key, *rest):
         raise AskedError(repr(key))
 
-    monkeypatch.setattr("vrw_jax.simd.program.code_of", code_of)
+    monkeypatch.setattr("vrw_jax.simd.program.get_machine_code", code_of)
     unknown = vrw.StepOptions(max_solver_steps=12_345)  # nothing is traced for it yet
     state = lambda x: vrw.step(vrw.WheelParams(), x, options=unknown).section_state
     with pytest.raises(AskedError, match="gait step with derivatives"):

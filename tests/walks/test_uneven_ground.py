@@ -98,8 +98,8 @@ def test_a_batch_on_uneven_ground_equals_single_wheels():
         ({"n_steps": 4}, r"slope has shape \(3, 3\), but there are 3 states and 4 steps: give one"),
         ({"params": vrw.WheelParams(damping=[1.0, 2.0])}, r"damping has shape \(2,\), but there"),
         ({"derivatives": ("slope",)}, "without derivatives: leave engine and derivatives out"),
-        ({"engine": "lanes"}, "is walked by vrw.UnilateralWheel and 'diffrax'"),
-        ({"model": None}, "is walked by vrw.UnilateralWheel and 'diffrax'"),
+        ({"engine": "lanes"}, "needs vrw.UnilateralWheel and 'diffrax'"),
+        ({"model": None}, "needs vrw.UnilateralWheel and 'diffrax'"),
     ],
 )
 def test_uneven_ground_unsupported_by_batches_is_refused_in_one_sentence(changes, sentence):

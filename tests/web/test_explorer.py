@@ -34,8 +34,8 @@ def test_parameters_are_read_and_set(widget):
     assert widget.friction == 0.8
     widget.friction = 0.7
     assert widget.values["friction"] == 0.7
-    assert widget.rung == "viscoelastic"
-    widget.rung = "rigid"
+    assert widget.model_name == "viscoelastic"
+    widget.model_name = "rigid"
     widget.params = vrw.WheelParams(slope=0.2)
     assert widget.values["rung"] == "rigid"
 
@@ -84,7 +84,7 @@ def test_a_dataset_becomes_the_map():
         ({"params": vrw.WheelParams(damping=np.ones(3))}, "show one after the other"),
         ({"friction": -1.0}, "a coefficient of friction is at least 0"),
         ({"height": 0}, "height"),
-        ({"rung": "rigit"}, "did you mean 'rigid'|must be one of"),
+        ({"model_name": "rigit"}, "did you mean 'rigid'|must be one of"),
     ],
 )
 def test_invalid_arguments_of_explore_are_refused_in_one_sentence(wrong, sentence):

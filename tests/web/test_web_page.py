@@ -258,7 +258,12 @@ def test_nothing_is_clipped_and_every_element_has_a_name(page, size, scheme, tmp
 def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
     shown_values = browser.new_page()
     shown_values.set_content("<div id='cell'></div>")
-    traits = {"page": PAGE_PATH.read_text(encoding="utf-8"), "height": 800, "map": {}, "told": {}}
+    traits = {
+        "page": PAGE_PATH.read_text(encoding="utf-8"),
+        "height": 800,
+        "map": {},
+        "measures": {},
+    }
     traits["values"] = explorer._page_values(vrw.WheelParams(damping=150.0), 0.9, "viscoelastic")
     shown_values.evaluate(
         """traits => {
@@ -278,13 +283,15 @@ def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
         f"() => {{ {render}; render({{ model, el: document.getElementById('cell') }}) }}"
     )
     shown_values.wait_for_function(
-        "model.get('told').speed > 0 && model.get('values').damping === 150"
+        "model.get('measures').speed > 0 && model.get('values').damping === 150"
     )
-    result = shown_values.evaluate("model.get('told')")
+    result = shown_values.evaluate("model.get('measures')")
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
     assert abs(result["speed"] - float(cycle.speed)) < 1e-8
     shown_values.evaluate("model.fromPython('values', { ...model.get('values'), damping: 170 })")
-    shown_values.wait_for_function(f"Math.abs(model.get('told').speed - {result['speed']}) > 1e-4")
+    shown_values.wait_for_function(
+        f"Math.abs(model.get('measures').speed - {result['speed']}) > 1e-4"
+    )
     inside = shown_values.frames[1]
     assert inside.input_value("#number-damping") == "170"
     inside.fill("#number-damping", "180")

@@ -1,4 +1,4 @@
-"""The phases of the paper's step: what they promise to every engine, and that each reads them."""
+"""The phases of the paper's step keep their interface, and every engine uses them."""
 
 import jax
 import jax.numpy as jnp
@@ -50,10 +50,12 @@ def make_state_at(index, distance=STATE_DISTANCE, stop_at_lift_off=True):
 @each
 def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
     phase, q, v = make_state_at(index)
-    motion = phase.at(q, v)
-    own_values = phase.acceleration(motion)[: phase.n]
-    np.testing.assert_allclose(phase.residual(motion, own_values), 0.0, atol=1e-12)
-    shifted_rows = [phase.residual(motion, tuple(a + k for a in own_values)) for k in (1.0, 2.0)]
+    motion = phase.motion_at(q, v)
+    own_values = phase.acceleration(motion)[: phase.n_dof]
+    np.testing.assert_allclose(phase.dynamics_residual(motion, own_values), 0.0, atol=1e-12)
+    shifted_rows = [
+        phase.dynamics_residual(motion, tuple(a + k for a in own_values)) for k in (1.0, 2.0)
+    ]
     assert np.min(np.abs(shifted_rows[0])) > 0.1
     np.testing.assert_allclose(shifted_rows[1], 2.0 * np.asarray(shifted_rows[0]), rtol=1e-12)
 
@@ -61,10 +63,10 @@ def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
 @each
 def test_dependent_coordinates_follow_those_of_the_phase(index):
     phase, q, v = make_state_at(index)
-    own_values = phase.acceleration(phase.at(q, v))[: phase.n]
-    evaluate_along = lambda q, v: jnp.stack(phase.at(q, v))
+    own_values = phase.acceleration(phase.motion_at(q, v))[: phase.n_dof]
+    evaluate_along = lambda q, v: jnp.stack(phase.motion_at(q, v))
     motion, rates = jax.jvp(evaluate_along, (q, v), (v, own_values))
-    m = phase.at(q, v)
+    m = phase.motion_at(q, v)
     np.testing.assert_allclose(rates[:2], [m.cos * m.dtheta, -m.sin * m.dtheta], rtol=1e-14)
     np.testing.assert_allclose(rates[2:4], motion[5:], rtol=1e-12, atol=1e-15)
     for complete in (phase.complete_acceleration(m, own_values), phase.acceleration(m)):
@@ -74,7 +76,7 @@ def test_dependent_coordinates_follow_those_of_the_phase(index):
 @each
 def test_phase_coordinates_reproduce_the_motion(index):
     phase, q, v = make_state_at(index)
-    assert phase.own(q[0], phase.at(q, v)) == (q, v)
+    assert phase.own_coordinates(q[0], phase.motion_at(q, v)) == (q, v)
 
 
 def test_forces_agree_with_the_equations_of_motion():
@@ -95,14 +97,14 @@ def test_forces_agree_with_the_equations_of_motion():
 @each
 def test_guards_have_meanings_and_margins_have_names(index, stop_at_lift_off):
     phase, q, v = make_state_at(index, stop_at_lift_off=stop_at_lift_off)
-    current_value = PhaseInstant(phase, phase.at(q, v), None)
-    guards, premises = phase.guards(current_value), phase.margins(current_value)
-    assert len(guards) == len(phase.outcomes)
-    assert phase.outcomes[0] == Outcome.STEPPED
-    assert guards[0] == phase.end(current_value)
-    assert (Outcome.LEG_1_LIFTED_OFF in phase.outcomes) == stop_at_lift_off
-    assert len(premises) == len(phase.counts_at_start)
-    named = PhaseMargins.from_values(premises, SYMBOLS.n)
+    current_value = PhaseInstant(phase, phase.motion_at(q, v), None)
+    guards, margins = phase.guards(current_value), phase.margins(current_value)
+    assert len(guards) == len(phase.all_guard_outcomes)
+    assert phase.all_guard_outcomes[0] == Outcome.STEPPED
+    assert guards[0] == phase.end_guard(current_value)
+    assert (Outcome.LEG_1_LIFTED_OFF in phase.all_guard_outcomes) == stop_at_lift_off
+    assert len(margins) == len(phase.margins_counted_at_start)
+    named = PhaseMargins.from_values(margins, SYMBOLS.n)
     assert named.fore_foot_force == current_value.fore_force.normal
     assert len(named.locked_stopper_force) == SYMBOLS.n - 2
     assert (named.rear_clearance is None) == (index == 0)
@@ -118,7 +120,8 @@ def test_double_support_is_the_three_equations_restricted_to_its_circle(n_legs):
     random = np.random.default_rng(0)
     select = lambda low, high: random.uniform(low, high, 1000)
     s = vrw.WheelParams(
-        damping=select(5, 400), stiffness=select(200, 1200), natural_length=select(1, 1.1), slope=select(0, 0.5),
+        damping=select(5, 400), stiffness=select(200, 1200),
+        natural_length=select(1, 1.1), slope=select(0, 0.5),
         leg_mass=select(0.3, 2), leg_com=select(0.1, 0.9), hub_mass=select(1, 20), n_legs=n_legs,
     ).symbols()  # fmt: skip
     distance, theta, dtheta = select(0.3, 1.2), select(-1, 0.5), select(-2, 3)
@@ -139,11 +142,13 @@ def test_double_support_is_the_three_equations_restricted_to_its_circle(n_legs):
 @each
 def test_the_outcome_of_a_phase_end_matches_its_guard(index):
     phase, _, _ = make_state_at(index)
-    guards = jnp.arange(-1, len(phase.outcomes), dtype=jnp.int32)
-    expected = [Outcome.SOLVER_FAILED, *phase.outcomes]
-    np.testing.assert_array_equal(phase.outcome(guards, guards > 99), expected)
-    late_values = phase.outcome(guards, guards == -1)
-    np.testing.assert_array_equal(late_values, [Outcome.NO_TOUCHDOWN_IN_TIME, *phase.outcomes])
+    guards = jnp.arange(-1, len(phase.all_guard_outcomes), dtype=jnp.int32)
+    expected = [Outcome.SOLVER_FAILED, *phase.all_guard_outcomes]
+    np.testing.assert_array_equal(phase.outcome_of_guard(guards, guards > 99), expected)
+    late_values = phase.outcome_of_guard(guards, guards == -1)
+    np.testing.assert_array_equal(
+        late_values, [Outcome.NO_TOUCHDOWN_IN_TIME, *phase.all_guard_outcomes]
+    )
 
 
 def test_guards_are_positive_along_a_gait_until_the_end():
@@ -175,7 +180,7 @@ def test_resets_agree_with_the_collisions():
     np.testing.assert_array_equal(following.v, [hit.dtheta, hit.dL1])
 
 
-# --- Every engine reads the very same phase.
+# --- Every engine uses the same phase.
 
 
 def end_by_diffrax():
@@ -239,5 +244,5 @@ def test_every_engine_ends_the_phase_at_its_guard(engine, monkeypatch):
 
     assert abs(height()) < 1e-8
     sooner = lambda self, now: landing_foot_height(self.s, now.motion) - 0.01
-    monkeypatch.setattr(PAPER_PHASES[2], "end", sooner)
+    monkeypatch.setattr(PAPER_PHASES[2], "end_guard", sooner)
     assert abs(height() - 0.01) < 1e-8

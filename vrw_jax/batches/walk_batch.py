@@ -7,7 +7,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vrw_jax.printing import AbstractPrintable, TextRow, format_outcome_counts, format_quantity
+from vrw_jax.printing import (
+    AbstractPrintable,
+    TextRow,
+    describe_ending,
+    format_outcome_counts,
+    format_quantity,
+)
 from vrw_jax.wheel import Outcome
 
 
@@ -53,6 +59,11 @@ class StepBatchResult(AbstractPrintable):
     engine: str = eqx.field(static=True)
     solver_names: tuple[str, ...] = eqx.field(static=True)
     derivatives: dict[str, StepSensitivity] = eqx.field(default_factory=dict)
+
+    @property
+    def ending(self) -> str:
+        """Return how the walks ended, as a sentence; for a batch, each sentence with its count."""
+        return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))

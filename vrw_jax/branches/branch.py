@@ -57,7 +57,7 @@ class SpecialPoint:
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
-        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
         >>> print(branch.special_points[0].kind, branch.special_points[0].ends_branch)
         period_doubling False
     """
@@ -97,7 +97,7 @@ class Branch:
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
-        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
         >>> branch.parameter, branch.ends
         ('parameter', ("The parameter's range ended.", "The parameter's range ended."))
     """
@@ -122,6 +122,13 @@ class Branch:
     def stable(self) -> np.ndarray:
         """Return whether the gait at each point is stable."""
         return self.dataset.spectral_radius.values < 1.0
+
+    @property
+    def ending(self) -> str:
+        """Return why the branch ends at its first and its last point, in one text."""
+        if not self.values.size:
+            return self.outcome.meaning
+        return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
         if not self.values.size:
@@ -195,6 +202,11 @@ class SpecialPointCurve:
     def values(self) -> np.ndarray:
         """Return the two parameters at each point, (point, 2)."""
         return np.stack([self.dataset[name].values for name in self.parameters], -1)
+
+    @property
+    def ending(self) -> str:
+        """Return why the curve ends at its first and its last point, in one text."""
+        return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
         first, second = self.parameters

@@ -154,7 +154,7 @@ def continue_branch(
 
     Every special point is located to 1e-9 in the parameter, if the continuation step
     (options.max_ds) does not hide it: two changes of sign within one step cancel. The gaits use the
-    cycle options, at least `CycleOptions.with_tight_tolerances()` by default. Each is checked by
+    cycle options, at least `CycleOptions.tight()` by default. Each is checked by
     one event-driven step, which also gives indicators and margins.
 
     For other models the gaits are fixed points of their return map, as accurate as `step_options`.
@@ -383,7 +383,7 @@ def _label_branch(
 
 def _section_component_names(n_components: int, n_legs: int) -> list[str]:
     """Return names of a section state's components: the paper's, or
-    `unilateral_section.FullState`."""
+    `contact.FullState`."""
     if n_components == 3:
         return ["theta", "dtheta", "dL1"]
     legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n_legs + 1)]
@@ -455,7 +455,7 @@ def continue_map(
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
-        >>> branch = vrw.continue_fixed_points(logistic, [0.6], 2.5, (2.0, 3.5))
+        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
         >>> [(point.kind, round(point.value, 6)) for point in branch.special_points]
         [('period_doubling', 3.0)]
     """

@@ -313,7 +313,7 @@ class CurveTracer(NamedTuple):
             )
         )
         lower, upper = map(float, self.parameter_ranges[1])
-        fraction_of = lambda seed: jnp.asarray((seed.at[1] - lower) / (upper - lower))
+        fraction_of = lambda seed: jnp.asarray((seed.parameter_values[1] - lower) / (upper - lower))
         z = stack_trees(*(TestFunctionPoint(seed.z, fraction_of(seed)) for seed in padded_seeds))
         continuation_options = self.model, self.step_options, system.n_legs
         gait_continuation = GaitContinuation(
@@ -445,7 +445,7 @@ class CurveTracer(NamedTuple):
             for parameter, value in zip(self.parameters, values, strict=True)
         }
         origin = provenance(seed.gait.params, self.model, self.step_options)
-        title = {"title": f"Border {seed.name} over {' and '.join(self.parameters)}"}
+        title = {"title": f"Curve of {seed.name} over {' and '.join(self.parameters)}"}
         dataset = xr.Dataset(data, labels, title | origin)
         return SpecialPointCurve(seed.name, self.parameters, dataset, codim2_points, branch.ends)
 

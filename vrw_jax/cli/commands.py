@@ -103,7 +103,7 @@ def root(
 
       [cyan]vrw tune configs/tune_dls.toml[/cyan]        the most double support without scuffing
 
-      [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits and its borders
+      [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits, special points
 
     [bold]What is written[/bold]   init: configs. gait: nothing. reproduce: figures and tables into
     its folder. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures,
@@ -178,7 +178,9 @@ def explore(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
     ] = None,
-    rung: Annotated[str, typer.Option(help="viscoelastic, rigid or unilateral.")] = "viscoelastic",
+    model_name: Annotated[
+        str, typer.Option("--model", help="viscoelastic, rigid or unilateral.")
+    ] = "viscoelastic",
 ) -> None:
     """Open an interactive page of the wheel in your browser; the page computes by itself."""
     with report_errors():
@@ -186,7 +188,7 @@ def explore(
         from vrw_jax.web import make_page_address
 
         params = _load_config(None).make_wheel(dict(parse_assignment(t) for t in changes or []))
-        address = make_page_address(params, rung)
+        address = make_page_address(params, model_name)
         webbrowser.open(address)
         print(address)
 
@@ -350,7 +352,7 @@ def map_special_points(
 
     with (
         report_errors(),
-        stderr_console.status("following borders (the first time compiles for minutes)"),
+        stderr_console.status("following special points (the first time compiles for minutes)"),
     ):
         printing.print_written_paths(write_map(dataset, settings, folder))
 
@@ -491,8 +493,8 @@ def _load_config_for(
     supported = SUPPORTED_MODELS[command or table]
     if settings.model_name not in supported:
         raise ValueError(
-            f"{settings.file_name} names the rung {settings.model_name}, but this command takes "
-            f"{', '.join(supported)}: write {'one of these' if len(supported) > 1 else 'that'} below "
-            "[model]."
+            f"{settings.file_name} names the model {settings.model_name}, but this command takes "
+            f"{', '.join(supported)}: write {'one of these' if len(supported) > 1 else 'that'} "
+            "below [model]."
         )
     return settings, Path("results") / path.stem if folder is None else folder

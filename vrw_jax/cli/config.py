@@ -6,7 +6,7 @@ An error in a file is reported in one sentence: what was given, what is allowed 
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,17 @@ MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
 
+RENAMED_KEYS = {
+    "[model]": {"rung": "name"},
+    "[options]": {
+        "first_step": "dt0",
+        "event_steps": "max_event_iterations",
+        "monitor_steps": "max_margin_search_iterations",
+    },
+    "[branch]": {"largest_step": "max_ds"},
+}
+"""Old keys by table, and their present names, which a config must use instead."""
+
 
 @dataclass(frozen=True)
 class ScanConfig:
@@ -42,7 +53,7 @@ class ScanConfig:
 
     - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
     - `chunk`: number of samples that are written at a time; 4,096 by default;
-    - `tol`: permitted error of each measure with unilateral contact (`rung = "unilateral"`), in its
+    - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in its
       unit. Each sample uses the simplest model that permits it.
     """
 
@@ -174,7 +185,8 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
     design_kinds = [kind for kind in DESIGN_KINDS if kind in tables]
     if len(design_kinds) > 1:
         raise ValueError(
-            f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one design: keep one."
+            f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one "
+            "design: keep one."
         )
     model_name, model = _parse_model(_get_table(tables, "model"))
     names = MODEL_CLASSES[model_name].parameter_names
@@ -184,11 +196,11 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
         else None
     )
     wheel = _parse_wheel(_get_table(tables, "wheel"))
-    fixed_and_swept = [key for key in wheel if design is not None and key in design.names]
-    if fixed_and_swept:
+    doubly_given = [key for key in wheel if design is not None and key in design.names]
+    if doubly_given:
         raise ValueError(
-            f"{fixed_and_swept[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can only be one: "
-            "drop one of the two."
+            f"{doubly_given[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can "
+            "only be one: drop one of the two."
         )
     config = Config(
         wheel_values=wheel,
@@ -244,19 +256,21 @@ def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
 
 def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
     """Return the name and the settings of the model of `[model]`."""
-    model_name = table.get("rung", Config.model_name)
-    check_known_name(model_name, tuple(MODEL_CLASSES), "rung")
+    _refuse_renamed_keys(table, "[model]")
+    model_name = table.get("name", Config.model_name)
+    check_known_name(model_name, tuple(MODEL_CLASSES), "model")
     assert isinstance(model_name, str)
-    settings = MODEL_CLASSES[model_name].__dataclass_fields__
-    _require_known_keys(table, ("rung", *settings), f"[model] of the rung {model_name}", "settings")
-    model_settings = {name: value for name, value in table.items() if name != "rung"}
-    return model_name, _parse_like_defaults(
-        model_settings, {name: settings[name].default_measures for name in settings}
+    defaults = {setting.name: setting.default for setting in fields(MODEL_CLASSES[model_name])}
+    _require_known_keys(
+        table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
     )
+    model_settings = {name: value for name, value in table.items() if name != "name"}
+    return model_name, _parse_like_defaults(model_settings, defaults)
 
 
 def _parse_options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]:
     """Return the options of `[options]`."""
+    _refuse_renamed_keys(table, "[options]")
     _require_known_keys(table, _OPTION_KEYS, "[options]", "options")
     defaults = StepOptions()
     return _parse_like_defaults(table, {key: getattr(defaults, key) for key in _OPTION_KEYS})
@@ -362,27 +376,28 @@ def _parse_tune(table: Mapping[str, object]) -> TuneConfig:
 
 def _parse_branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
     """Return the settings of `[branch]` along one of the parameters `names`."""
+    _refuse_renamed_keys(table, "[branch]")
     _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     parameter = table.get("parameter")
-    check_known_name(parameter, names, "parameter that a branch of this rung runs along")
+    check_known_name(parameter, names, "parameter that a branch of this model runs along")
     assert isinstance(parameter, str)
     if "bounds" not in table:
         raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
     bounds = check_range(
         "bounds", _parse_range("bounds of " + parameter, table["bounds"], parameter)
     )
-    max_ds = table.get("largest_step")
-    if max_ds is not None and _parse_number(max_ds, "largest_step", must_be_positive=True) > 1.0:
-        raise ValueError(
-            f"largest_step is {max_ds:g}, but it is a share of the range: give 0.02, say."
-        )
+    max_ds = None
+    if "max_ds" in table:
+        max_ds = _parse_number(table["max_ds"], "max_ds", must_be_positive=True)
+        if max_ds > 1.0:
+            raise ValueError(
+                f"max_ds is {max_ds:g}, but it is a share of the range: give 0.02, say."
+            )
     return BranchConfig(
         parameter=parameter,
         bounds=bounds,
         period=_parse_int(table.get("period", BranchConfig.period), "period", 1),
-        max_ds=None
-        if max_ds is None
-        else _parse_number(max_ds, "largest_step", must_be_positive=True),
+        max_ds=max_ds,
     )
 
 
@@ -394,7 +409,7 @@ def _parse_design(
     if FRICTION_NAME in table and FRICTION_NAME not in names:
         raise ValueError(
             f"[{kind}] sweeps friction, which does not affect this model: write [model] "
-            'and below it rung = "unilateral" or rung = "auto".'
+            'and below it name = "unilateral" or name = "auto".'
         )
     _require_known_keys(table, (*design_keys, *names), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in design_keys}
@@ -424,7 +439,8 @@ def _parse_axis(name: str, value: object) -> np.ndarray:
     count = _parse_int(value["count"], f"count of {name}", 1)
     if count > MAX_LISTED_SAMPLES:
         raise ValueError(
-            f"the axis of {name} has {count:,} values, but {MAX_LISTED_SAMPLES:,} is the most: give fewer."
+            f"the axis of {name} has {count:,} values, but {MAX_LISTED_SAMPLES:,} is the most: "
+            "give fewer."
         )
     return np.linspace(lower, upper, count)
 
@@ -479,6 +495,13 @@ def _require_known_keys(
                 f"{location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
             )
+
+
+def _refuse_renamed_keys(table: Mapping[str, object], location: str) -> None:
+    """Raise if a table has an old key."""
+    for key, new_key in RENAMED_KEYS[location].items():
+        if key in table:
+            raise ValueError(f"{location} has the old key '{key}': write {new_key} in its place.")
 
 
 def _make_error(name: str, value: object, requirement: str) -> ValueError:

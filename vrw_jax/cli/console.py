@@ -248,9 +248,9 @@ def _print_margins(result: "StepResult") -> None:
             label += f" (broken at legs {', '.join(legs)})"
         rows.append((mark, label, measure.symbol, f"{least_margin:.4g}", measure.display_unit))
     headings = ("", "margin of", "symbol", "least", "unit")
-    print_table("Premises of the paper's rung", rows, headings, ("least",))
+    print_table("Margins of the paper's model", rows, headings, ("least",))
     n, n_broken = len(rows), sum("broken[" in mark for mark, *_ in rows)
     stdout_console.print(
-        f"{n - n_broken} of {n} premises hold, {n_broken} are broken. The rung walks on regardless: "
-        "it measures what it does not model."
+        f"{n - n_broken} of {n} margins hold, {n_broken} are broken. The model walks on "
+        "regardless: it measures what it does not model."
     )

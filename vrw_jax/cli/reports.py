@@ -168,11 +168,12 @@ def format_branch_summary(branch: Branch) -> str:
     if not branch.values.size:
         return "\n".join(lines)
     radius, dls_fraction = branch.dataset.spectral_radius.values, branch.dataset.dls_fraction.values
-    special_points = [
-        (f"{special_point.value:.9f}", special_point.kind.replace("_", " ") + (" (ends the branch)" * special_point.ends_branch),
-         special_point.name, describe_violation(special_point.name))
-        for special_point in branch.special_points
-    ]  # fmt: skip
+    rows = []
+    for special_point in branch.special_points:
+        kind = special_point.kind.replace("_", " ")
+        kind += " (ends the branch)" * special_point.ends_branch
+        violation = describe_violation(special_point.name)
+        rows.append((f"{special_point.value:.9f}", kind, special_point.name, violation))
     return "\n".join([
         *lines,
         *(f"- at {branch.values[i]:.6g}: {branch.ends[i]}" for i in (0, -1)),
@@ -180,6 +181,6 @@ def format_branch_summary(branch: Branch) -> str:
         f"{dls_fraction.min():.4f} to {dls_fraction.max():.4f}",
         f"- walked, every gait repeats within {np.max(branch.dataset.closure.values):.1e}",
         "",
-        *format_markdown_table((branch.parameter, "kind", "name", "what happens there"), special_points),
+        *format_markdown_table((branch.parameter, "kind", "name", "what happens there"), rows),
         "",
     ])  # fmt: skip

@@ -49,7 +49,8 @@ def verify_store(plan: "ScanPlan", store: Path) -> None:
         raise ValueError(f"there is no store {store} to verify: run the same without --verify.")
     if zarr_store.damage_description:
         print_error(
-            f"{zarr_store.damage_description}: run the same without --verify, which computes these again."
+            f"{zarr_store.damage_description}: run the same without --verify, which computes "
+            "these again."
         )
         raise typer.Exit(DAMAGED_EXIT_CODE)
     n, missing = plan.layout.n_chunks, len(zarr_store.find_missing_chunks())

@@ -542,7 +542,7 @@ def _earliest_dip_fraction(tableau: ButcherTableau, values: list[Array], is_own:
     """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
     none.
 
-    See `numerics.find_dip`. A guard that starts at its own event is not considered.
+    See `integrator.find_dip`. A guard that starts at its own event is not considered.
     """
     has_dip, fraction = find_dip(tableau, values)
     return jnp.min(jnp.where(has_dip & (values[0] > 0.0) & ~is_own, fraction, 1.0), axis=0)

@@ -223,7 +223,7 @@ class ContactQuantities(NamedTuple):
     tangential: SlotPair
     stopper: SlotPair
     slip_speed: SlotPair  # of the slots' feet along the slope
-    painleve_determinant: Array  # see `contacts.ContactSolution`
+    painleve_determinant: Array  # see `contact_modes.ContactSolution`
     airborne_stopper: LegArray | None  # stopper force of legs in the air, if stoppers are one-sided
 
 
@@ -280,7 +280,7 @@ def evaluate_guards(
     coefficient = stack_friction(finite_friction(dynamics.friction))
     normal, tangential = jnp.stack(quantities.normal), jnp.stack(quantities.tangential)
     # In the limit of large friction a resting foot begins to slide where its normal force
-    # vanishes, see `events.resolve_event`; a sliding foot lifts where its friction vanishes.
+    # vanishes, see `impacts.resolve_event`; a sliding foot lifts where its friction vanishes.
     is_limit = stack_friction(dynamics.friction) == jnp.inf
     direction = jnp.stack(slip_sign(dynamics.contact))
     pressure = jnp.where(is_limit & (direction != 0.0), -direction * tangential, normal)

@@ -57,7 +57,7 @@ class ContactConfiguration(NamedTuple):
 
 
 class ForceSolution(NamedTuple):
-    """Forces of ground and slots' stoppers and the hub's motion: see `contacts.ContactSolution`."""
+    """Forces of ground and slots' stoppers and the hub's motion: see `contact_modes.ContactSolution`."""
 
     tangential: SlotPair
     normal: SlotPair

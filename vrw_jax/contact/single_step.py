@@ -156,7 +156,7 @@ def build_contact_step_jacobian(
 class IntervalLog(NamedTuple):
     """Start and duration of each interval of a step between two events."""
 
-    state: Array  # (intervals, dim), see `motion.PackedState`
+    state: Array  # (intervals, dim), see `contact_state.PackedState`
     contact: Array  # (intervals, legs)
     locked: Array
     duration: Array  # s
@@ -253,7 +253,7 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
         def record_interval_end(state: tuple) -> tuple:
             previous, log = state
             lane, row = advance_compiled(leaves, previous)
-            index = previous.counters.events
+            index = previous.counters.n_events
             index = jnp.where(lane.counters.n_events > index, index, wheel.max_events)
             write_row = lambda old, new: old.at[index].set(new, mode="drop")
             return lane, jax.tree.map(write_row, log, row)
@@ -298,6 +298,6 @@ def _unpack_samples(n: int, log: IntervalLog, rows: Array) -> tuple[Array, Array
     q, v, accumulators, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)
     state = [q[..., :3], v[..., :3], q[..., 3:], v[..., 3:], clock[..., None], accumulators]
     slots = jax.vmap(lambda contact: find_slots(contact != CONTACT_OFF))(log.contact)
-    scatter_to_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.spread(pair), (None, 0)))
+    scatter_to_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.scatter(pair), (None, 0)))
     normal, tangential = (scatter_to_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
     return jnp.concatenate(state, -1), tangential, normal

@@ -177,7 +177,7 @@ class _PointLinearization(NamedTuple):
             return _UnitLengthResponse(
                 residual.legs,
                 residual.hub,
-                (slots.of(residual.legs), residual.foot_e, residual.foot_u, speed),
+                (slots.gather(residual.legs), residual.foot_e, residual.foot_u, speed),
             )
 
         return respond_to("L"), respond_to("dL")

@@ -72,7 +72,12 @@ from vrw_jax.numerics import (
     enable_all_ad_modes,
     opaque_condition,
 )
-from vrw_jax.validation import check_choice, check_int, check_reals
+from vrw_jax.validation import (
+    check_choice,
+    check_int,
+    check_reals,
+    refuse_renamed_arguments,
+)
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
@@ -88,7 +93,7 @@ class UnilateralTrajectory(eqx.Module):
     """
 
     time: Float[Array, "phases n"]  # from the landing, s
-    state: Float[Array, "phases n dim"]  # see `motion.unpack_state`
+    state: Float[Array, "phases n dim"]  # see `contact_state.unpack_state`
     contact: Int[Array, "phases legs"]  # mode of every foot
     locked: Bool[Array, "phases legs"]  # on the stopper
     tangential: Float[Array, "phases n legs"]  # force on every foot, N
@@ -135,6 +140,7 @@ def _convert_restitution(value: Any) -> Array | None:
     return restitution
 
 
+@refuse_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractWheel):
     """Feet push on the ground and slide by Coulomb's law; no leg has a fixed role.
 
@@ -147,7 +153,7 @@ class UnilateralWheel(AbstractWheel):
       allows; None has the effect of 0 and compiles to a smaller program;
     - `infinite_friction_rule`: meaning of infinite friction: the limit of large friction, or with
       "paper" the rule of the paper, (A1) to (A4), continued to where it stops;
-    - `uneven_ground`: what differs between footholds; `vrw.walk` sets it from slopes and friction
+    - `uneven`: what differs between footholds; `vrw.walk` sets it from slopes and friction
       over steps.
 
     Examples:

@@ -360,7 +360,7 @@ def _evaluate_stages(
     other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
     stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
     row_tangents = tangents.map_tangents(
-        lambda k, _: _unpack_at(tangents.rows, k, template).slope,
+        lambda k, _: _unpack_at(tangents.rows, k, template).dynamics_rows,
         tangents.allocate((last_stage + 1) * size),
     )
     # The first stage is the last one of the previous step, except after an event.

@@ -20,13 +20,24 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import Scalar, StatusCode, tree_where, value_and_jacobian
-from vrw_jax.validation import check_int, check_positive
+from vrw_jax.validation import (
+    check_int,
+    check_positive,
+    refuse_renamed_arguments,
+)
 
 Unknowns = Any
 """A pytree of float arrays with everything that Newton's method corrects."""
 SectionVector = Float[Array, " n"]
 
 
+@refuse_renamed_arguments(
+    first_step="initial_ds",
+    largest_step="max_ds",
+    smallest_step="min_ds",
+    iterations="max_newton_iterations",
+    turn="max_turn_angle",
+)
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
     """Numerical options of a continuation; each change compiles again.

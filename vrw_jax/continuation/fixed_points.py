@@ -12,7 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
 from vrw_jax.printing import format_numbers, format_quantity, format_text
-from vrw_jax.validation import check_callable, check_int, check_positive, check_reals
+from vrw_jax.validation import (
+    check_callable,
+    check_int,
+    check_positive,
+    check_reals,
+    refuse_renamed_arguments,
+)
 
 
 class FixedPointResult(NamedTuple):
@@ -35,9 +41,17 @@ class FixedPointResult(NamedTuple):
     converged: Bool[Array, ""]
     n_iterations: Int[Array, ""]
 
+    @property
+    def ending(self) -> str:
+        """Return whether Newton's method converged, as a sentence."""
+        iterations = f"after {int(self.n_iterations)} iterations"
+        if bool(self.converged):
+            return f"Newton's method converged {iterations}."
+        return f"Newton's method did not converge {iterations}: start nearer to the fixed point."
+
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
-            return f"SectionCycle{tuple(self)}"
+            return f"FixedPointResult{tuple(self)}"
         rows = (
             ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
             ("x", format_numbers(self.x)),
@@ -51,6 +65,7 @@ MAX_NEWTON_ITERATIONS = 30
 """Default limit of Newton's iterations."""
 
 
+@refuse_renamed_arguments(iterations="max_iterations")
 def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],

@@ -8,12 +8,9 @@ from vrw_jax.cycles import (
     unilateral_finder,
 )
 from vrw_jax.cycles.attracting_gaits import (
-    START_DISTANCE,
-    compute_fallback_starts,
     compute_walk_starts,
     find_attracting_gaits,
     find_slow_gaits,
-    find_slowest_indices,
 )
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import (
@@ -35,10 +32,7 @@ from vrw_jax.cycles.finder import (
     is_same_branch,
 )
 from vrw_jax.cycles.finder_selection import (
-    Guess,
-    check_guess,
     make_finder,
-    resolve_finder,
     resolve_model,
     resolve_model_with_reason,
 )

@@ -12,7 +12,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
-from vrw_jax.printing import AbstractPrintable, TextRow, format_numbers, format_outcome_counts
+from vrw_jax.printing import (
+    AbstractPrintable,
+    TextRow,
+    describe_ending,
+    format_numbers,
+    format_outcome_counts,
+)
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -79,9 +85,14 @@ class AbstractCycle(AbstractPrintable):
         return self.outcome == Outcome.STEPPED
 
     @property
+    def ending(self) -> str:
+        """Return how it ended, as a sentence; for a batch, each sentence with its count."""
+        return describe_ending(self.outcome, Outcome)
+
+    @property
     def why(self) -> str:
-        """Return why there is no cycle, as a sentence. The cycle must be that of one wheel."""
-        return Outcome(int(self.outcome)).meaning
+        """Return the reason why there is no cycle: the same as `ending`."""
+        return self.ending
 
     @property
     def period(self) -> Array:
@@ -133,7 +144,7 @@ class AbstractCycle(AbstractPrintable):
         return self._mask_missing(jnp.linalg.cond(matrix))
 
     def measure(self, name: str) -> Array:
-        """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `results.ALL_MEASURES`. Batch
+        """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `measures.MEASURES`. Batch
         axes come first.
 
         Durations are sums over the cycle's steps, and indicators are minima.

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vrw_jax import cycles
 from vrw_jax.batches import step_batch
 from vrw_jax.cycles.attracting_gaits import (
     START_DISTANCE,
@@ -26,13 +25,19 @@ from vrw_jax.cycles.attracting_gaits import (
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
 from vrw_jax.cycles.finder import AbstractGaitFinder
-from vrw_jax.cycles.finder_selection import Guess
+from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, resolve_model
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_choice, check_int, check_not_traced, is_traced
+from vrw_jax.validation import (
+    check_choice,
+    check_int,
+    check_not_traced,
+    is_traced,
+    refuse_renamed_arguments,
+)
 from vrw_jax.wheel import Outcome, WheelParams, stack_parameters
 
 RETRY_OUTCOMES = (
@@ -91,6 +96,7 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
+@refuse_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
     *,
@@ -113,7 +119,7 @@ def limit_cycle(
     If the search fails, walks and finer meshes are tried. Under `jax.jit` and `jax.vmap` neither is
     possible; the search then runs alone, on the mesh of the options. See `limit_cycles`.
 
-    If no gait is found, `outcome` and `explanation` give the reason, and numbers and derivatives
+    If no gait is found, `outcome` and `why` give the reason, and numbers and derivatives
     are zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
     unnoticed.
 
@@ -150,17 +156,15 @@ def limit_cycle(
         0.000115 per N s/m
     """
     parse_gait_choice(which)
-    model = cycles.resolve_model(params, model)
-    finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
-    uses_nan = check_choice("lost", on_failure, FAILURE_VALUES) == "nan"
+    model = resolve_model(params, model)
+    finder = resolve_finder(params, model, options, check_int("period_n", period_n))
+    uses_nan = check_choice("on_failure", on_failure, FAILURE_VALUES) == "nan"
     if guess is None and period_n > 1 and not finder.is_multistable:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle: Any = _search_with_fallbacks(
-        finder, params, cycles.check_guess(guess), options is None, which
-    )
+    cycle: Any = _search_with_fallbacks(finder, params, check_guess(guess), options is None, which)
     return cycle.replace_missing_by_nan(params) if uses_nan else cycle
 
 
@@ -199,8 +203,8 @@ def limit_cycles(
     parse_gait_choice(which)
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not shape:
-        model = cycles.resolve_model(params, model)
-        finder = cycles.resolve_finder(params, model, options, check_int("period_n", period_n))
+        model = resolve_model(params, model)
+        finder = resolve_finder(params, model, options, check_int("period_n", period_n))
         if finder.is_multistable:
             check_not_traced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
             return find_attracting_gaits(finder, finder.model.parameter_values(params)[None])[1]
@@ -208,7 +212,7 @@ def limit_cycles(
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
     single_params = jax.tree.map(lambda x: x[0], params)
-    finder = cycles.resolve_finder(single_params, model, options, check_int("period_n", period_n))
+    finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
     cycle: Any = _search_with_fallbacks(finder, params, None, options is None, which)
     return cycle
 
@@ -230,7 +234,9 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
     n_wheels, rank = params.damping.shape[0], parse_gait_choice(which)
-    wheel_index, gaits = find_attracting_gaits(finder, jax.vmap(finder.model.values)(params))
+    wheel_index, gaits = find_attracting_gaits(
+        finder, jax.vmap(finder.model.parameter_values)(params)
+    )
     n_gaits_per_wheel = np.bincount(wheel_index, minlength=n_wheels)
     too_few = n_gaits_per_wheel[(rank >= n_gaits_per_wheel) | (rank < -n_gaits_per_wheel)]
     if len(too_few):

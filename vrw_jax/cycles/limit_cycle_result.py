@@ -154,13 +154,16 @@ class LimitCycle(AbstractCycle):
         return self._map_over_batch(margins_of_step)(self.parameters, self.section_state)
 
     @property
-    def why(self) -> str:
-        if self.outcome not in (Outcome.EVENT_ORDER_MISMATCH, Outcome.BRANCH_ENDS_BEFORE_TARGET):
-            return super().why
+    def ending(self) -> str:
+        if jnp.ndim(self.outcome) or self.outcome not in (
+            Outcome.EVENT_ORDER_MISMATCH,
+            Outcome.BRANCH_ENDS_BEFORE_TARGET,
+        ):
+            return super().ending
         check = ADMISSIBILITY_CHECKS[
             int(self.collocation_state.failed_check - 1) % len(ADMISSIBILITY_CHECKS)
         ]
-        return f"{super().why} Broken: {check}."
+        return f"{super().ending} Broken: {check}."
 
     def model_rows(self) -> list[TextRow]:
         forces = self.indicators

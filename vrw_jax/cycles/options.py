@@ -5,9 +5,22 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.validation import check_int, check_positive, format_value
+from vrw_jax.validation import (
+    check_int,
+    check_positive,
+    format_value,
+    refuse_renamed_arguments,
+)
 
 
+@refuse_renamed_arguments(
+    steps="mesh_intervals",
+    growth="mesh_grading",
+    iterations="max_newton_iterations",
+    first_iterations="first_newton_iterations",
+    stages="homotopy_steps",
+    block="batch_size",
+)
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
     """Numerical choices of `limit_cycle`. Each change compiles the search again.

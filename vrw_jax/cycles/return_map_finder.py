@@ -56,7 +56,7 @@ class ReturnMapCycle(AbstractCycle):
     - `n_iterations`: of Newton's method.
 
     Examples:
-        >>> wheel = vrw.RigidWheel(holds_rear_foot=True)
+        >>> wheel = vrw.RigidWheel(held_landing=True)
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(slope=0.1), model=wheel, guess=[0.39, 1.5, 0.0])
         >>> print(f"{cycle.period:.3f} s")
         0.425 s

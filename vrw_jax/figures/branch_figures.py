@@ -83,7 +83,7 @@ def branch_figure(branch: Branch) -> Figure:
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
-        >>> figure = vrw.plot.draw_branch(branch)
+        >>> figure = vrw.plot.branch_figure(branch)
     """
     check_type("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
     values, data = branch.values, branch.dataset
@@ -173,7 +173,8 @@ def _add_legend(figure: Figure, special_points: list[SpecialPoint], parameter: s
     """Add a legend of the special points and of the line styles."""
     handles = []
     for i, special_point in enumerate(special_points):
-        text = f"{format_value_label(parameter, special_point.value, 6)}: {typeset_symbols(describe_violation(special_point.name))}"
+        violation = typeset_symbols(describe_violation(special_point.name))
+        text = f"{format_value_label(parameter, special_point.value, 6)}: {violation}"
         text = f"{i + 1}  {text}" + (" (ends here)" if special_point.ends_branch else "")
         handles.append(
             Line2D(
@@ -208,7 +209,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
         >>> starts |= {"dL1_touchdown": [-0.1, 0.0]}
         >>> basins = vrw.basin(vrw.WheelParams(), starts)
-        >>> figure = vrw.plot.draw_basins([basins], ["Table 1"])
+        >>> figure = vrw.plot.basin_figure([basins], ["Table 1"])
     """
     require_variables_of_all(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
@@ -219,7 +220,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     max_steps = max(float(r.steps.where(r.attractor >= 0).max()) for r in results)
     for axes, result, title in zip(panels, results, titles, strict=True):
         y, x = (str(d) for d in result.attractor.dims)
-        steps = result.steps.source(result.attractor >= 0)
+        steps = result.steps.where(result.attractor >= 0)
         image = axes.pcolormesh(
             result[x], result[y], steps, cmap="Greys_r", vmin=0.0, vmax=2.2 * max_steps
         )

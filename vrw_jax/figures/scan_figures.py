@@ -66,7 +66,7 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 
     Examples:
         >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
-        >>> sorted(vrw.plot.draw_scan(gaits))
+        >>> sorted(vrw.plot.scan_figures(gaits))
         ['scan']
     """
     require_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
@@ -395,7 +395,7 @@ def _outcome_codes(scan: xr.Dataset) -> xr.DataArray:
     codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
         return codes
-    return codes.source(~(scan.spectral_radius >= 1.0), UNSTABLE_CODE)
+    return codes.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CODE)
 
 
 def _draw_margin_zeros(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
@@ -454,7 +454,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
 
     Examples:
         >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
-        >>> figure = vrw.plot.draw_map(vrw.scan(grid, ["speed"]), "speed", [])
+        >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
     """
     require_variables(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
@@ -487,9 +487,14 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
         [codim2_point.values for curve in curves for codim2_point in curve.codim2_points]
     )
     axes.plot(
-        *codim2_points.reshape(-1, 2).T, "o", color="black", markersize=2.5, markerfacecolor="white",
-        markeredgewidth=0.6, label="two borders at once",
-    )  # fmt: skip
+        *codim2_points.reshape(-1, 2).T,
+        "o",
+        color="black",
+        markersize=2.5,
+        markerfacecolor="white",
+        markeredgewidth=0.6,
+        label="two special points at once",
+    )
     axes.set_xlim(*scan[x].values[[0, -1]])
     axes.set_ylim(*scan[y].values[[0, -1]])
     axes.set_xlabel(format_axis_label(x))

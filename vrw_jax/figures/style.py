@@ -1,6 +1,6 @@
 """Style of all figures: journal widths, colors for every eye, vector output, labels with units.
 
-Figures are created inside `figure_style()` and written by `save_figure`. No global setting of
+Figures are created inside `figure_style()` and written by `save`. No global setting of
 matplotlib changes, and no window opens.
 """
 
@@ -77,7 +77,7 @@ OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
     Outcome.THREE_FEET_LOADED: ("three feet loaded", "#3B8FBB"),
     Outcome.MESH_TOO_COARSE: ("mesh too coarse", "#646464"),
     Outcome.EVENT_ORDER_MISMATCH: ("other order of events", "#BABABA"),
-    Outcome.BRANCH_ENDS_BEFORE_TARGET: ("border on the way", "#454545"),
+    Outcome.BRANCH_ENDS_BEFORE_TARGET: ("branch ends on the way", "#454545"),
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
 }
 """Label and color of each outcome."""
@@ -113,7 +113,7 @@ def figure_style() -> Iterator[None]:
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> with vrw.plot.figure_style():
-        ...     figure = vrw.plot.draw_sticks(gait)
+        ...     figure = vrw.plot.sticks(gait)
     """
     with mpl.rc_context(MATPLOTLIB_STYLE):
         yield
@@ -135,8 +135,8 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure, folder = vrw.plot.draw_sticks(gait), Path(tempfile.mkdtemp())
-        >>> [path.suffix for path in vrw.plot.save_figure(figure, folder, "sticks")]
+        >>> figure, folder = vrw.plot.sticks(gait), Path(tempfile.mkdtemp())
+        >>> [path.suffix for path in vrw.plot.save(figure, folder, "sticks")]
         ['.svg', '.png']
     """
     folder.mkdir(parents=True, exist_ok=True)

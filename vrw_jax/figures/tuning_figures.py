@@ -41,7 +41,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
         >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> figure = vrw.plot.draw_tuning(tuned)
+        >>> figure = vrw.plot.tuning_figure(tuned)
     """
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path

@@ -78,7 +78,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.draw_gait(gait)
+        >>> figure = vrw.plot.gait_panels(gait)
     """
     require_variables("gait", gait, ("phase", *FORCE_NAMES), GAIT_REMEDY)
     time, theta, L1, L2, z2, *forces = insert_landing_gaps(
@@ -137,7 +137,7 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.draw_sticks(gait, interval=0.1)
+        >>> figure = vrw.plot.sticks(gait, interval=0.1)
     """
     require_variables("gait", gait, ("phase", "foot_1_x"), GAIT_REMEDY)
     tones = ("#A0A0A0", SKY, "#000000")
@@ -194,14 +194,14 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
     Args:
         gaits: datasets of `vrw.simulate` over one step, one per line.
-        varied: name of the parameter in which the gaits differ, used in the legend.
+        vary: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
         Figure: two panels over the time since the landing, in s.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.draw_foot_height([gait])
+        >>> figure = vrw.plot.foot_height([gait])
     """
     require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), GAIT_REMEDY)
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
@@ -243,14 +243,14 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
     Args:
         gaits: datasets of `vrw.simulate` over one step, one per line.
-        varied: name of the parameter in which the gaits differ, used in the legend.
+        vary: name of the parameter in which the gaits differ, used in the legend.
 
     Returns:
         Figure: one panel over the time since the landing, in s.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.draw_rear_force([gait])
+        >>> figure = vrw.plot.rear_force([gait])
     """
     require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), GAIT_REMEDY)
     figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 2.5))
@@ -289,7 +289,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
             `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
             `parameter_slope` is the slope in rad.
-        marker_interval: parameter values that are multiples of it have symbols, and so have both
+        every: parameter values that are multiples of it have symbols, and so have both
             ends.
 
     Returns:
@@ -301,7 +301,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
         >>> over = {name: ("damping", values) for name, values in columns.items()}
         >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
-        >>> figure = vrw.plot.draw_indicators(gaits)
+        >>> figure = vrw.plot.indicators(gaits)
     """
     require_variables(
         "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
@@ -358,14 +358,14 @@ def walk_frames(
     Args:
         step: dataset of `vrw.simulate` over one step of a gait.
         n_frames: number of frames of the step.
-        slowdown: factor of slow motion; 2 plays at half speed.
+        slow: factor of slow motion; 2 plays at half speed.
 
     Returns:
         tuple[list[Image], int]: images of Pillow, and the milliseconds per frame.
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
+        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
         >>> len(frames)
         2
     """
@@ -455,7 +455,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
     """Write frames as a looping GIF with one shared palette of 32 colors.
 
     Args:
-        frames: images as `draw_walk_frames` returns them.
+        frames: images as `walk_frames` returns them.
         milliseconds: duration of a frame, in ms.
         path: path of the GIF.
 
@@ -467,7 +467,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
 
     Examples:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> frames, milliseconds = vrw.plot.draw_walk_frames(gait, n_frames=2)
+        >>> frames, milliseconds = vrw.plot.walk_frames(gait, n_frames=2)
         >>> path = Path(tempfile.mkdtemp(), "walk.gif")
         >>> vrw.plot.save_animation(frames, milliseconds, path).name
         'walk.gif'

@@ -3,10 +3,8 @@
 from vrw_jax.hybrid.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.hybrid.minima import (
     GUARD_ROUNDOFF_EPS,
-    MINIMUM_LOCATION_TOLERANCE,
     MonitoredFunctions,
     StateVector,
-    find_cubic_minimum,
 )
 from vrw_jax.hybrid.phase_integration import (
     PhaseEnd,

@@ -7,12 +7,11 @@ secant steps on the margin's rate locate the minimum, one margin after the other
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics import Scalar
+from vrw_jax.numerics import MINIMUM_LOCATION_TOLERANCE, Scalar, find_cubic_minimum
 
 StateVector = Float[Array, " dim"]
 MonitorFn = Callable[[StateVector], Float[Array, " n_watched"]]
@@ -91,35 +90,6 @@ class MinimumRefinement(NamedTuple):
     best_length: Scalar  # time with the smallest rate so far, from the step's start, s
     best_rate: Scalar
     lowest_values: Float[Array, " n"]  # refined minima, and the values at the phase's start
-
-
-def evaluate_cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
-    """Return the cubic Hermite interpolant on [0, 1]; the rates are multiplied by the length."""
-    return (
-        (1 + 2 * x) * (1 - x) ** 2 * v0
-        + x * (1 - x) ** 2 * r0
-        + x * x * (3 - 2 * x) * v1
-        + x * x * (x - 1) * r1
-    )
-
-
-@jax.jit  # traced once for all margins
-def find_cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
-    """Return location in (0, 1) and value of the cubic's interior minimum; the value is inf if none
-    exists.
-    """
-    a = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)
-    b = 2.0 * (-3.0 * v0 - 2.0 * r0 + 3.0 * v1 - r1)
-    discriminant = b * b - 4.0 * a * r0
-    root = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
-    # The minimum is the root with positive curvature, written without cancellation.
-    denominator = jnp.where(b >= 0.0, -(b + root), 2.0 * a)
-    numerator = jnp.where(b >= 0.0, 2.0 * r0, root - b)
-    safe_denominator = jnp.where(denominator == 0.0, 1.0, denominator)
-    x = jnp.where(denominator == 0.0, -1.0, numerator / safe_denominator)
-    exists = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
-    x = jnp.where(exists, x, 0.5)
-    return x, jnp.where(exists, evaluate_cubic(x, v0, r0, v1, r1), jnp.inf)
 
 
 def empty_minimum(monitored_functions: MonitoredFunctions, start: StateVector) -> InteriorMinimum:
@@ -244,6 +214,3 @@ def refine_minimum(
 MIN_REFINEMENT_TRIES = 3
 """Least number of tries at a minimum, chosen because each makes the location's derivatives accurate
 to more digits."""
-MINIMUM_LOCATION_TOLERANCE = 1e-6
-"""Accuracy of a minimum's location, in lengths of the step that holds it, chosen because the error
-of the value is the square of it."""

@@ -25,14 +25,19 @@ from vrw_jax.hybrid.minima import (
     MonitoredFunctions,
     StateVector,
     empty_minimum,
-    evaluate_cubic,
-    find_cubic_minimum,
     is_at_roundoff,
     refine_minimum,
     select_row,
     update_minimum,
 )
-from vrw_jax.numerics import Scalar, StepOptions, opaque_condition, tree_where
+from vrw_jax.numerics import (
+    Scalar,
+    StepOptions,
+    evaluate_cubic,
+    find_cubic_minimum,
+    opaque_condition,
+    tree_where,
+)
 from vrw_jax.runtime import lazy_import
 
 if TYPE_CHECKING:

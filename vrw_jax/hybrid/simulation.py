@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
 from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition
+from vrw_jax.printing import describe_ending
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -87,6 +88,11 @@ class HybridSolution(NamedTuple):
     solver_steps: Int[Array, ""]
     termination: Int[Array, ""]  # a Termination
 
+    @property
+    def ending(self) -> str:
+        """Return why the simulation ended, as a sentence; for a batch, each with its count."""
+        return describe_ending(self.termination, Termination)
+
 
 def simulate_hybrid(
     modes: Sequence[Mode],
@@ -112,7 +118,7 @@ def simulate_hybrid(
 
 
 ERROR_CHECK_TIGHTENINGS = (0.1, 0.01)
-"""Factors by which the tolerances are divided in the simulations that `estimate_event_time_errors`
+"""Factors by which the tolerances are divided in the simulations that `time_errors`
 compares with."""
 
 
@@ -175,7 +181,7 @@ def _check_arguments(modes: Sequence[Mode], start: Array, events: int, mode: int
         check_type("a mode", candidate_mode, Mode, "give Mode(field, guards)")
         check_type("guards", candidate_mode.guards, (list, tuple), "give Guards in a tuple")
         for guard in candidate_mode.guards:
-            check_type("a guard", guard, Guard, "give Guard(value, reset, to)")
+            check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
     if not 0 <= mode < len(modes):
         raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
     for i, (field, guards) in enumerate(modes):

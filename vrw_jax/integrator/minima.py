@@ -15,10 +15,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.hybrid import MINIMUM_LOCATION_TOLERANCE, find_cubic_minimum
 from vrw_jax.integrator.tableaus import AccelerationFn, ButcherTableau, StageState, StepFn
 from vrw_jax.integrator.tangents import PhaseTangents
-from vrw_jax.numerics import StepOptions, Vector, tree_where
+from vrw_jax.numerics import (
+    MINIMUM_LOCATION_TOLERANCE,
+    StepOptions,
+    Vector,
+    find_cubic_minimum,
+    tree_where,
+)
 
 
 class MarginFunctions(NamedTuple):

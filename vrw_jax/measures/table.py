@@ -32,7 +32,7 @@ class Measure:
     description: str
     equation: str = ""
     dimension: str = (
-        ""  # "leg": one value for each of the locked legs 3..n, of `CONTACTS` for each leg
+        ""  # "leg": one value for each of the locked legs 3..n, of `CONTACT_MEASURES` for each leg
     )
     violation: str = ""
 

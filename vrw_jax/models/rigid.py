@@ -45,7 +45,7 @@ class RigidWheel(AbstractWheel):
 
     - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
     - `stop_at_lift_off`: end a step where the normal force of the ground would become negative;
-    - `holds_rear_foot`: False is the classic landing, whose rear foot leaves without an impulse
+    - `held_landing`: False is the classic landing, whose rear foot leaves without an impulse
       (angular momentum about the new foot is kept). True is the stiff limit of the paper's own
       landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel`, as
       docs/physics.md derives it.
@@ -66,7 +66,7 @@ class RigidWheel(AbstractWheel):
     stop_at_lift_off: bool = eqx.field(
         static=True, converter=partial(check_bool, "stop_at_lift_off"), default=True
     )
-    holds_rear_foot: bool = eqx.field(
+    held_landing: bool = eqx.field(
         static=True, converter=partial(check_bool, "held_landing"), default=False
     )
 
@@ -89,7 +89,7 @@ class RigidWheel(AbstractWheel):
     def _rate_ratio(self, s: Symbols) -> Elementwise:
         """Return the ratio of the rate after to the rate before the landing."""
         foot_inertia = _foot_inertia(s)
-        if not self.holds_rear_foot:
+        if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
         half_angle = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
         motion = transitions.land(
@@ -184,7 +184,7 @@ class RigidWheel(AbstractWheel):
         hub_jump = transitions.hub_velocity_jump(
             transitions.motion_before_landing(s, *x), motion_after
         )
-        is_held = self.holds_rear_foot
+        is_held = self.held_landing
         rear_impulse = (
             transitions.land(s, *x).rear_impulse if is_held else dynamics.FootForce(zero, zero)
         )

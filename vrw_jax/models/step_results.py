@@ -11,7 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.section_states import AnySectionState
-from vrw_jax.printing import AbstractPrintable, TextRow, format_outcome_counts, format_quantity
+from vrw_jax.printing import (
+    AbstractPrintable,
+    TextRow,
+    describe_ending,
+    format_outcome_counts,
+    format_quantity,
+)
 from vrw_jax.wheel import Outcome
 
 MeasureValue = Float[Array, "..."]
@@ -19,13 +25,13 @@ MeasureValue = Float[Array, "..."]
 
 
 class AbstractMeasures(AbstractPrintable):
-    """Several measures; each field is one of `results.ALL_MEASURES`."""
+    """Several measures; each field is one of `measures.MEASURES`."""
 
     measure_names: eqx.AbstractClassVar[Mapping[str, str]]
-    """Names in `results.ALL_MEASURES` of the fields whose own names differ."""
+    """Names in `measures.MEASURES` of the fields whose own names differ."""
 
     def measures(self) -> dict[str, Array]:
-        """Return the fields by their names in `results.ALL_MEASURES`."""
+        """Return the fields by their names in `measures.MEASURES`."""
         return {self.measure_names.get(name, name): value for name, value in vars(self).items()}
 
     def summary_rows(self) -> list[TextRow]:
@@ -141,6 +147,11 @@ class AbstractStep(AbstractPrintable):
     solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # attempted solver steps
 
     @property
+    def ending(self) -> str:
+        """Return how the step ended, as a sentence; for a batch, each sentence with its count."""
+        return describe_ending(self.outcome, Outcome)
+
+    @property
     def period(self) -> Array:
         """Duration of the step, s."""
         return jnp.sum(self.durations, axis=-1)
@@ -158,7 +169,7 @@ class AbstractStep(AbstractPrintable):
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
     def measures(self) -> dict[str, Array]:
-        """Return all measures of the step by their names in `results.ALL_MEASURES`.
+        """Return all measures of the step by their names in `measures.MEASURES`.
 
         Batch axes lead; legs come last.
         """
@@ -191,7 +202,7 @@ class AbstractStep(AbstractPrintable):
             verdict = ", holds" if lowest >= 0.0 else ", broken"
             text = measure.format_with_unit(lowest)
             if name in MARGIN_MEASURES:
-                rows.append((f"premise: {measure.label}", text + verdict))
+                rows.append((f"margin: {measure.label}", text + verdict))
             else:
                 rows.append((measure.label, text))
         return rows

@@ -1,5 +1,7 @@
 """Types, options, trigonometry, helpers for automatic differentiation and for batches."""
 
+from typing import Any
+
 from vrw_jax.numerics.autodiff import (
     ExecutionWrapper,
     ForwardFunction,
@@ -36,7 +38,20 @@ from vrw_jax.numerics.batching import (
     unbatch,
     zeros_like_output,
 )
+from vrw_jax.numerics.cubic_minima import (
+    MINIMUM_LOCATION_TOLERANCE,
+    evaluate_cubic,
+    find_cubic_minimum,
+)
 from vrw_jax.numerics.options import EngineName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
+from vrw_jax.validation import RENAMED_IN_NUMERICS, describe_renamed
+
+
+def __getattr__(name: str) -> Any:
+    raise AttributeError(
+        describe_renamed("vrw_jax.numerics", name, RENAMED_IN_NUMERICS)
+        or f"vrw_jax.numerics has no {name!r}."
+    )

@@ -11,7 +11,13 @@ import numpy as np
 
 from vrw_jax.numerics.types import RealInput, Scalar
 from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
-from vrw_jax.validation import check_choice, check_int, check_positive, check_reals
+from vrw_jax.validation import (
+    check_choice,
+    check_int,
+    check_positive,
+    check_reals,
+    refuse_renamed_arguments,
+)
 
 SolverName = Literal[
     "Dopri8", "Tsit5", "Dopri5", "Bosh3", "Heun", "Midpoint", "Ralston",
@@ -40,6 +46,11 @@ def _positive_field(name: str, default: float) -> Any:
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
+@refuse_renamed_arguments(
+    first_step="dt0",
+    event_steps="max_event_iterations",
+    monitor_steps="max_margin_search_iterations",
+)
 class StepOptions(AbstractPrintable):
     """Numerical options of an event-driven step; the tolerances may change without recompiling.
 

@@ -68,6 +68,19 @@ def format_outcome_counts(outcomes: Any, status_class: type[enum.IntEnum]) -> st
     return f"{n:,} in shape {shape}: {', '.join(count_texts)}"
 
 
+def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> str:
+    """Return the sentence of a status code; for a batch, each sentence with its count."""
+    values = np.asarray(codes)
+    if not values.ndim:
+        return status_class(int(values)).meaning  # type: ignore[attr-defined]
+    present_codes, counts = np.unique(values, return_counts=True)
+    sentences = (
+        f"{count:,} of {values.size:,}: {status_class(int(code)).meaning}"  # type: ignore[attr-defined]
+        for code, count in zip(present_codes, counts, strict=True)
+    )
+    return " ".join(sentences) or "There are no batch elements."
+
+
 def format_text(title: str, rows: Iterable[TextRow]) -> str:
     """Return a title and indented rows."""
     return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])

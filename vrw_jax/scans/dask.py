@@ -100,7 +100,8 @@ def _compute_chunks(
             environment_difference = describe_difference(local_environment, worker_environment)
             if environment_difference:
                 raise ValueError(
-                    f"a worker computes by other means than this process: {environment_difference}. "
+                    "a worker computes by other means than this process: "
+                    f"{environment_difference}. "
                     "Start the workers from the same installation on machines of one kind."
                 )
             yield chunk_of_future.pop(future), results

@@ -137,11 +137,33 @@ class Samples(AbstractDesign):
         return index | {name: ("sample", column) for name, column in self.values.items()}
 
 
-def grid(**values: Sequence[float] | np.ndarray) -> Grid:
+def _require_one_form(name: str, mapping: Mapping | None, keywords: Mapping) -> Mapping:
+    """Return the parameters of a design, given either as one mapping or as keywords."""
+    if mapping is not None and keywords:
+        raise TypeError(
+            f"{name} has a mapping and the keywords {', '.join(keywords)}: give either one mapping "
+            "or keywords."
+        )
+    return keywords if mapping is None else mapping
+
+
+def _require_count(name: str, n: int | None) -> int:
+    """Return the number of samples, which has no default."""
+    if n is None:
+        raise TypeError(f"{name} has no number of samples: give n=1024, say.")
+    return n
+
+
+def grid(
+    values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    /,
+    **parameters: Sequence[float] | np.ndarray,
+) -> Grid:
     """Return the design of every combination of the values, e.g. `grid(damping=..., slope=...)`.
 
     Args:
-        **values: the values of each parameter, as any sequence of numbers.
+        values: the values of each parameter, as any sequence of numbers.
+        **parameters: the same as keywords, if no mapping is given.
 
     Returns:
         A design whose axes are the parameters.
@@ -153,6 +175,7 @@ def grid(**values: Sequence[float] | np.ndarray) -> Grid:
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
         (2, 5)
     """
+    values = _require_one_form("grid", values, parameters)
     columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
     for name, column in columns.items():
         if len(np.unique(column)) != len(column):
@@ -163,13 +186,18 @@ def grid(**values: Sequence[float] | np.ndarray) -> Grid:
     return Grid(columns)
 
 
-def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
+def samples(
+    values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    /,
+    **parameters: Sequence[float] | np.ndarray,
+) -> Samples:
     """Return the design of given samples, e.g. `samples({"damping": [100], "slope": [0.29]})`.
 
     A sample outside a parameter's domain, or not finite, gets the outcome BAD_INPUT.
 
     Args:
         values: the values of each parameter, all of one length.
+        **parameters: the same as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -181,6 +209,7 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
         (2,)
     """
+    values = _require_one_form("samples", values, parameters)
     columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -191,7 +220,12 @@ def samples(values: Mapping[str, Sequence[float] | np.ndarray]) -> Samples:
     return Samples(columns)
 
 
-def sobol(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
+def sobol(
+    ranges: Mapping[str, ParameterRange] | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> Samples:
     """Return `n` samples of a scrambled Sobol' sequence.
 
     The samples are spread most evenly if n is a power of 2.
@@ -200,6 +234,7 @@ def sobol(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Sample
         ranges: lower and upper bound of each parameter.
         n: number of samples.
         seed: seed of the scrambling.
+        **parameters: the ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -213,19 +248,26 @@ def sobol(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Sample
     """
     from scipy.stats import qmc  # imported here because the import is slow
 
+    n, ranges = _require_count("sobol", n), _require_one_form("sobol", ranges, parameters)
     names, lower, upper = _parse_box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
     points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
     return _scale_to_box(names, lower, upper, points, "sobol")
 
 
-def uniform(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
+def uniform(
+    ranges: Mapping[str, ParameterRange] | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> Samples:
     """Return `n` independent samples, uniformly distributed over the box.
 
     Args:
         ranges: lower and upper bound of each parameter.
         n: number of samples.
         seed: seed of the random numbers.
+        **parameters: the ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -237,12 +279,18 @@ def uniform(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samp
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
+    n, ranges = _require_count("uniform", n), _require_one_form("uniform", ranges, parameters)
     names, lower, upper = _parse_box(ranges, n)
     points = _make_generator(seed).random((n, len(names)))
     return _scale_to_box(names, lower, upper, points, "uniform")
 
 
-def saltelli(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Samples:
+def saltelli(
+    ranges: Mapping[str, ParameterRange] | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> Samples:
     """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
 
     A row holds two independent points of the box, A and B, and copies of A in which one coordinate
@@ -252,6 +300,7 @@ def saltelli(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Sam
         ranges: lower and upper bound of each parameter.
         n: number of rows, a power of two.
         seed: seed of the sequence.
+        **parameters: the ranges as keywords, if no mapping is given.
 
     Returns:
         A design over the axis `sample`.
@@ -265,6 +314,7 @@ def saltelli(ranges: Mapping[str, ParameterRange], n: int, seed: int = 0) -> Sam
     """
     from scipy.stats import qmc  # imported here because the import is slow
 
+    n, ranges = _require_count("saltelli", n), _require_one_form("saltelli", ranges, parameters)
     names, lower, upper = _parse_box(ranges, n)
     if n & (n - 1):
         raise ValueError(
@@ -303,7 +353,8 @@ def _parse_box(
     """Return the names, lower bounds and upper bounds of a box; check the number of samples."""
     if check_int("n", n) > MAX_LISTED_SAMPLES:
         raise ValueError(
-            f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or a grid."
+            f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
+            "a grid."
         )
     pairs = [
         check_range(f"the range of {name}", pair)

@@ -38,6 +38,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
+from vrw_jax.validation import refuse_renamed_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -54,6 +55,7 @@ class ScanProgress:
     n_reused: int  # samples that an earlier run computed
 
 
+@refuse_renamed_arguments(report="on_progress")
 def scan(
     design: AbstractDesign,
     measures: Iterable[str] | None = None,
@@ -64,7 +66,7 @@ def scan(
     cycle_options: CycleOptions | None = None,
     store: str | Path | None = None,
     chunk: int | None = None,
-    report: ProgressCallback | None = None,
+    on_progress: ProgressCallback | None = None,
     dask: str | None = None,
     tol: float | None = None,
 ) -> xr.Dataset:
@@ -121,7 +123,7 @@ def scan(
         tol=tol,
     )
     with resolve_executor(dask) as executor:
-        return run_scan(scan_plan, store, on_progress=report, executor=executor)
+        return run_scan(scan_plan, store, on_progress=on_progress, executor=executor)
 
 
 def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
@@ -209,7 +211,8 @@ def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
         )
         raise ValueError(
             f"{path} lacks {missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
-            f"was begun by other means, so that its last digits might not fit: {setting_difference}. "
+            "was begun by other means, so that its last digits might not fit: "
+            f"{setting_difference}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
     return storage
@@ -240,6 +243,6 @@ def _explain_full_disk(storage: AbstractStore, n_chunks: int) -> Iterator[None]:
         n_done = n_chunks - len(storage.find_missing_chunks())
         raise OSError(
             error.errno,
-            f"no space is left for {storage.location}, where {n_done} chunks are complete: make room and "
-            "run the same again, it goes on from there",
+            f"no space is left for {storage.location}, where {n_done} chunks are complete: make "
+            "room and run the same again, it goes on from there",
         ) from error

@@ -56,7 +56,8 @@ def forecast_scan(plan: ScanPlan, store: str | Path | None = None) -> dict[str, 
     return lines | {
         "memory": f"about {_format_bytes(memory)}, "
         + ("whatever the number of samples" if store is not None else "plus the result"),
-        "time": f"about {format_seconds(n_samples_left / rate + STARTUP_SECONDS)}: {n_samples_left:,} samples at {rate:,.0f} per "
+        "time": f"about {format_seconds(n_samples_left / rate + STARTUP_SECONDS)}: "
+        f"{n_samples_left:,} samples at {rate:,.0f} per "
         f"second on {count_cores()} cores, {STARTUP_SECONDS:.0f} s to start",
         "measured": f"just now, on {n:,} samples spread over the design; the code for it took "
         f"{compiled_time - start_time:.0f} s and is kept",

@@ -176,14 +176,15 @@ def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, 
         if requested_derivative.measure not in catalog.differentiable:
             raise ValueError(
                 f"{name!r} asks for a derivative of {requested_derivative.measure!r}"
-                f"{suggest_name(requested_derivative.measure, catalog.differentiable)}, but a scan differentiates only "
-                f"{', '.join(catalog.differentiable)}: choose one of these."
+                f"{suggest_name(requested_derivative.measure, catalog.differentiable)}, but a scan "
+                f"differentiates only {', '.join(catalog.differentiable)}: choose one of these."
             )
-        if requested_derivative.parameter not in catalog.differentiation_parameters:
+        parameters = catalog.differentiation_parameters
+        if requested_derivative.parameter not in parameters:
             raise ValueError(
                 f"{name!r} asks for a derivative by {requested_derivative.parameter!r}"
-                f"{suggest_name(requested_derivative.parameter, catalog.differentiation_parameters)}, but it must be by a parameter: "
-                f"choose from {', '.join(catalog.differentiation_parameters)}."
+                f"{suggest_name(requested_derivative.parameter, parameters)}, but it must be by a "
+                f"parameter: choose from {', '.join(parameters)}."
             )
         checked_names[requested_derivative.name] = None
     return tuple(checked_names)

@@ -69,7 +69,6 @@ STORED_FIELD_NAMES = {
         "batch_size": "block",
     },
     "UnilateralWheel": {"infinite_friction_rule": "infinite"},
-    "RigidWheel": {"holds_rear_foot": "held_landing"},
 }
 """Names of fields in stores, where they differ from the names in Python, by class."""
 
@@ -154,8 +153,8 @@ def plan_scan(
     chunk = DEFAULT_CHUNK_SIZE if chunk is None else check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
-            f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at most: "
-            "give its axes fewer values, or draw samples with vrw.sobol."
+            f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
+            "most: give its axes fewer values, or draw samples with vrw.sobol."
         )
     if not model.is_compliant:
         raise TypeError(
@@ -190,7 +189,7 @@ def _check_tolerance(model: AbstractWheel, tol: float) -> float:
     fields: dict[str, Any] = type(model).__dataclass_fields__
     default_only_fields = TOLERANCE_REFERENCE_SETTINGS.get(model.model_name)
     if default_only_fields is None or any(
-        getattr(model, name) != fields[name].default_measures for name in default_only_fields
+        getattr(model, name) != fields[name].default for name in default_only_fields
     ):
         raise ValueError(
             f"tol is given and model is {model!r}, but a tolerance refers to unilateral contact "

@@ -74,8 +74,8 @@ def sobol_indices(
     n = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
     if n < MIN_SOBOL_ROWS:
         raise ValueError(
-            f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices need {MIN_SOBOL_ROWS}: "
-            "narrow the ranges to where there are gaits, or take more rows."
+            f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices "
+            f"need {MIN_SOBOL_ROWS}: narrow the ranges to where there are gaits, or take more rows."
         )
     rows = rows_with_gaits[:n]
     measure_values = np.stack(

@@ -269,8 +269,8 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         )
         if damage_description:
             raise ValueError(
-                f"{damage_description}: run the scan again, which computes these anew, or read the rest with "
-                "open_scan(path, verify=False)."
+                f"{damage_description}: run the scan again, which computes these anew, or read the "
+                "rest with open_scan(path, verify=False)."
             )
     dataset = xr.open_zarr(
         path,

@@ -65,14 +65,14 @@ REASON_START_NOT_EMBEDDABLE = 1 + len(SELECTION_MARGINS)
 
 SELECTION_ATTRS: dict[str, dict[str, object]] = {
     "rung": {
-        "long_name": "rung that served",
+        "long_name": "model that was used",
         "flag_values": [RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL],
         "flag_meanings": "RigidWheel ViscoelasticWheel UnilateralWheel",
     },
     "reason": {
-        "long_name": "why that rung served",
+        "long_name": "why that model was used",
         "units": "1",
-        "description": "0: all premises of the paper's wheel hold; above: the first that breaks, "
+        "description": "0: all margins of the paper's wheel hold; above: the first that breaks, "
         f"of {', '.join(SELECTION_MARGINS)}; below: minus that wheel's outcome.",
     },
 }
@@ -118,7 +118,7 @@ class ModelChoice(AbstractPrintable):
             (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(value))
             for n, value in named_margins
         ]
-        return [("rung", type(self.model).__name__), ("why", self.why), *margins]
+        return [("model", type(self.model).__name__), ("reason", self.why), *margins]
 
     def model_selection(self) -> dict[str, Array]:
         """Return model and reason codes, see `AbstractStep.model_selection`."""
@@ -140,12 +140,12 @@ class ModelChoice(AbstractPrintable):
 def describe_reason(reason: int) -> str:
     """Return a reason code of `ModelChoice` as a sentence."""
     if reason == 0:
-        return "The paper's wheel serves: all its premises hold over this step."
+        return "The paper's wheel serves: all its margins hold over this step."
     if reason < 0:
         return f"The paper's wheel can't step: {Outcome(-reason).meaning}"
     if reason == REASON_START_NOT_EMBEDDABLE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    return f"The paper's premises break: {list(SELECTION_MARGINS.values())[reason - 1]}."
+    return f"The paper's margins break: {list(SELECTION_MARGINS.values())[reason - 1]}."
 
 
 def find_selection_reason(
@@ -216,8 +216,8 @@ class LadderWheel(AbstractWheel):
         >>> wheel = vrw.LadderWheel(friction=50.0)
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
         >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
-        >>> step.choice.explanation
-        "The paper's wheel serves: all its premises hold over this step."
+        >>> step.choice.why
+        "The paper's wheel serves: all its margins hold over this step."
     """
 
     model_name: ClassVar[str] = "ladder"
@@ -375,6 +375,6 @@ def refuse_ladder(model: object, role: str) -> None:
     """Raise `TypeError` for a ladder where a model with smoothly varying gaits is required."""
     if isinstance(model, LadderWheel | str):
         raise TypeError(
-            f"the ladder can't be {role}, since its gaits jump where the rung changes: give "
+            f"the ladder can't be {role}, since its gaits jump where the model changes: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )

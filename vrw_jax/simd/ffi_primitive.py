@@ -31,8 +31,8 @@ def register_code(code: MachineCode) -> None:
 
 
 MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
-"""A call of machine code by programs of JAX, which need it only when they are compiled themselves:
-until then LLVM may be at work on it."""
+"""A call of machine code by JAX programs, which require the code only when they are compiled: LLVM
+can compile it in the meantime."""
 MACHINE_CODE_PRIMITIVE.multiple_results = True
 
 
@@ -66,5 +66,3 @@ mlir.register_lowering(MACHINE_CODE_PRIMITIVE, _lower_call, platform="cpu")
 batching.primitive_batchers[MACHINE_CODE_PRIMITIVE] = ad.primitive_jvps[MACHINE_CODE_PRIMITIVE] = (
     _refuse_transform
 )
-"""A call of machine code by JAX programs, which require the code only when they are compiled: LLVM
-can compile it in the meantime."""

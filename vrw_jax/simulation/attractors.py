@@ -66,7 +66,7 @@ def _walk_round_batched(
     model: Any, options: StepOptions, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the same for unilateral contact and any number of wheels, by the batch kernel."""
-    n, columns = params.n_legs, np.asarray(jax.vmap(model.values)(params)).T
+    n, columns = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
     x = embed_section_states(columns, np.asarray(x), n)
     states, codes = list[np.ndarray](), list[np.ndarray]()
     for _ in range(STEPS_PER_ROUND):

@@ -15,7 +15,13 @@ from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation.attractors import find_distinct_orbits, measure_orbits, walk_until_periodic
 from vrw_jax.simulation.stepping import ModelLike, check_model, check_options, check_single_wheel
-from vrw_jax.validation import check_int, check_not_traced, check_reals, check_type
+from vrw_jax.validation import (
+    check_int,
+    check_not_traced,
+    check_reals,
+    check_type,
+    refuse_renamed_arguments,
+)
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 
 PRE_TOUCHDOWN_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
@@ -31,6 +37,7 @@ NO_ATTRACTOR = -1
 """Index of a start that reaches no attractor."""
 
 
+@refuse_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,
     grid: StartGrid,
@@ -81,8 +88,8 @@ def basin(
     """
     model, options = _validate_arguments(params, model, options)
     options = options.with_engine(engine)
-    max_steps = check_int("most_steps", max_steps)
-    max_period = check_int("longest_period", max_period)
+    max_steps = check_int("max_steps", max_steps)
+    max_period = check_int("max_period", max_period)
     values = _parse_grid_values(grid)
     names = tuple(values)
     axes = [name for name in names if np.ndim(grid[name]) > 0]

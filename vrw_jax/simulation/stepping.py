@@ -29,6 +29,7 @@ from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.printing import (
     AbstractPrintable,
     TextRow,
+    describe_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
@@ -67,7 +68,7 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
         return LadderWheel()
     if not isinstance(model, AbstractWheel):
         raise TypeError(
-            f"model is {model!r}, but a rung of the ladder is needed: give "
+            f"model is {model!r}, but a model of the ladder is needed: give "
             'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
         )
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
@@ -133,7 +134,7 @@ def validate_arguments(
     if state.shape != (size,):
         raise ValueError(
             f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
-            f"(3,){'' if size == 3 else f', or this rung’s own of shape ({size},)'}: "
+            f"(3,){'' if size == 3 else f', or this model’s own of shape ({size},)'}: "
             "for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
@@ -281,6 +282,11 @@ class Walk(AbstractPrintable):
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
         )[..., 0]
+
+    @property
+    def ending(self) -> str:
+        """Return how the walk ended, as a sentence; for a batch, each sentence with its count."""
+        return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:
         """Return names and texts of outcome, steps, start, last state and time."""

@@ -202,7 +202,7 @@ def _compile_trace(
 
 
 def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return a step by the names of `TRAJECTORY`, shape (phase, sample), from Leg 1's foot.
+    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample), from Leg 1's foot.
 
     The column `ahead` is the position along the slope of the leg that lands next, in m.
     """

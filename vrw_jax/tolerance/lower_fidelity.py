@@ -41,9 +41,14 @@ class LowerFidelityGait(NamedTuple):
 def empty_gaits(n_elements: int) -> LowerFidelityGait:
     """Return empty gaits for a batch."""
     return LowerFidelityGait(
-        np.full(n_elements, NO_MODEL), np.zeros((n_elements, 3)), np.zeros((n_elements, N_STEP_QUANTITIES)), np.zeros((n_elements, 3, 3)),
-        np.zeros((n_elements, N_STEP_QUANTITIES, 3)), np.zeros((n_elements, 3)), np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
-    )  # fmt: skip
+        np.full(n_elements, NO_MODEL),
+        np.zeros((n_elements, 3)),
+        np.zeros((n_elements, N_STEP_QUANTITIES)),
+        np.zeros((n_elements, 3, 3)),
+        np.zeros((n_elements, N_STEP_QUANTITIES, 3)),
+        np.zeros((n_elements, 3)),
+        np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
+    )
 
 
 def replace_gaits(
@@ -141,9 +146,13 @@ def _foot_distance_factor(params: WheelParams) -> np.ndarray:
 
 
 def _make_gaits(
-    model_index: int, section_states: np.ndarray, end_states: np.ndarray, quantities: np.ndarray, jacobian: np.ndarray,
+    model_index: int,
+    section_states: np.ndarray,
+    end_states: np.ndarray,
+    quantities: np.ndarray,
+    jacobian: np.ndarray,
     quantity_jacobian: np.ndarray,
-) -> LowerFidelityGait:  # fmt: skip
+) -> LowerFidelityGait:
     with np.errstate(all="ignore"):
         newton_matrix = np.linalg.inv(np.eye(3) - jacobian)
     defect = np.einsum("ijk,ik->ij", newton_matrix, end_states - section_states)

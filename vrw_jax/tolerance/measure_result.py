@@ -8,7 +8,12 @@ import numpy as np
 
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StatusCode
-from vrw_jax.printing import AbstractPrintable, TextRow, format_outcome_counts
+from vrw_jax.printing import (
+    AbstractPrintable,
+    TextRow,
+    describe_ending,
+    format_outcome_counts,
+)
 from vrw_jax.tolerance.lower_fidelity import MODEL_NAMES
 from vrw_jax.wheel import Outcome
 
@@ -113,6 +118,11 @@ class MeasureResult(AbstractPrintable):
         return (self.outcomes == Outcome.STEPPED)[()]
 
     @property
+    def ending(self) -> str:
+        """Return how the search for the gait ended, as a sentence; for a batch, each sentence with its count."""
+        return describe_ending(self.outcomes, Outcome)
+
+    @property
     def why(self) -> Any:
         """Return why that model is selected, as a sentence. A batch has an array of them."""
         explain = np.vectorize(_explain, otypes=[object])
@@ -121,7 +131,8 @@ class MeasureResult(AbstractPrintable):
     @property
     def title(self) -> str:
         if self.models.ndim:
-            return f"Answer, {self.models.size} lanes, {_format_short(1e3 * self.seconds)} ms"
+            milliseconds = _format_short(1e3 * self.seconds)
+            return f"MeasureResult, {self.models.size} wheels, {milliseconds} ms"
         measures_text = "; ".join(self._format_measure(i) for i in range(len(self.names)))
         return f"{measures_text}: {self.why}. {_format_short(1e3 * self.seconds)} ms"
 
@@ -137,7 +148,7 @@ class MeasureResult(AbstractPrintable):
             (f"largest error of {n}", _format_short(max_error(i))) for i, n in enumerate(self.names)
         ]
         return [
-            ("answered by", counts_text),
+            ("models", counts_text),
             ("outcomes", format_outcome_counts(self.outcomes, Outcome)),
             *error_rows,
         ]

@@ -81,6 +81,14 @@ class MultifidelityMean(AbstractPrintable):
     measure: str = eqx.field(static=True)
     control: str = eqx.field(static=True)
 
+    @property
+    def ending(self) -> str:
+        """Return how many wheels were computed with unilateral contact, as a sentence."""
+        return (
+            f"{self.n_high_fidelity:.0f} wheels were computed with unilateral contact; "
+            f"{self.n_gaits:.0f} of them have a gait."
+        )
+
     def summary_rows(self) -> list[TextRow]:
         unit = MEASURES[self.measure].display_unit
         return [
@@ -154,8 +162,8 @@ def multifidelity_mean(
     n_wheels = len(mu)
     if not shape or n_wheels <= pilot:
         raise ValueError(
-            f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels than its "
-            "pilot: give lanes, params.damping of shape (1000,), say."
+            f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
+            "than its pilot: give a batch, params.damping of shape (1000,), say."
         )
     wheels = _WheelSample(measure, params, mu, stoppers)
     permutation = np.random.default_rng(seed).permutation(n_wheels)
@@ -164,8 +172,8 @@ def multifidelity_mean(
     is_found = pilot_results.found
     if np.sum(is_found) < MIN_PILOT_GAITS:
         raise ValueError(
-            f"{np.sum(is_found)} of the pilot's {pilot} wheels have a gait with contact, but a mean "
-            f"needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
+            f"{np.sum(is_found)} of the pilot's {pilot} wheels have a gait with contact, but a "
+            f"mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
     pilot_sample = _SampledMeasures.from_results(pilot_results)
     control_columns = [

@@ -533,9 +533,14 @@ def refine(
     """
     n_elements, n_measures = len(iteration.indices), len(names)
     result = RefinementResult(
-        np.zeros(n_elements, bool), np.full((n_elements, n_measures), np.nan), np.full((n_elements, n_measures), np.inf), np.zeros((n_elements, n_measures)),
-        np.zeros(n_elements, int), iteration.section_states, np.full(n_elements, np.nan),
-    )  # fmt: skip
+        np.zeros(n_elements, bool),
+        np.full((n_elements, n_measures), np.nan),
+        np.full((n_elements, n_measures), np.inf),
+        np.zeros((n_elements, n_measures)),
+        np.zeros(n_elements, int),
+        iteration.section_states,
+        np.full(n_elements, np.nan),
+    )
     error_bound = _ErrorBound(n_elements, n_measures, float(iteration.ground.options.rtol))
     n_failures, n_steps_since_refresh, active = (
         np.zeros(n_elements, int),

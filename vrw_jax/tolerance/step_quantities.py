@@ -30,7 +30,7 @@ MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dtheta_touchdown": _read_quantity(5),
     "dL1_touchdown": _read_quantity(6),
 }
-"""Measures that every model has, by their names in `results.ALL_MEASURES`."""
+"""Measures that every model has, by their names in `measures.MEASURES`."""
 
 COMPLEX_STEP = 1e-30
 

@@ -86,7 +86,7 @@ def measure_to_tolerance(
 
     The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the one that
     continues the paper's gait, or else the one that a walk from the paper's gait reaches;
-    `MeasureResult.explanation` names which. Fields of `params` and `friction` may have one batch
+    `MeasureResult.why` names which. Fields of `params` and `friction` may have one batch
     axis; each element is computed independently.
 
     This function cannot be used inside `jax.jit`, because it depends on values.
@@ -116,7 +116,7 @@ def measure_to_tolerance(
     """
     start_seconds = time.perf_counter()
     check_not_traced(
-        "vrw.measure_to_tolerance", "it on numbers, and give lanes as arrays", params, friction
+        "vrw.measure_to_tolerance", "it on numbers, and give a batch as arrays", params, friction
     )
     names = check_names("measures", measures)
     for name in names:
@@ -159,8 +159,8 @@ def check_batch(
     if len(shape) > 1 or shapes - {(), shape}:
         shapes_text = ", ".join(map(str, sorted(shapes - {()})))
         raise ValueError(
-            f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but lanes have one axis, the same for "
-            "all: give one value for all, or one for each lane."
+            f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but a batch has one "
+            "axis, the same for all: give one value for all, or one for each element."
         )
     n_elements = shape[0] if shape else 1
     broadcast = lambda x: np.broadcast_to(np.asarray(x, float), (n_elements,))
@@ -183,12 +183,18 @@ class _MeasureRequest:
         self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
         full = lambda fill: np.full((n_elements, n_measures), fill)
         self.results = {
-            "values": full(np.nan), "errors": full(np.inf), "model_errors": full(np.nan),
-            "numerical_errors": full(np.inf), "models": np.full(n_elements, NO_MODEL),
-            "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)), "n_steps": np.zeros(n_elements, int),
-            "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)), "n_gaits": np.zeros(n_elements, int),
-            "speeds": np.full(n_elements, np.nan), "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
-        }  # fmt: skip
+            "values": full(np.nan),
+            "errors": full(np.inf),
+            "model_errors": full(np.nan),
+            "numerical_errors": full(np.inf),
+            "models": np.full(n_elements, NO_MODEL),
+            "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)),
+            "n_steps": np.zeros(n_elements, int),
+            "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
+            "n_gaits": np.zeros(n_elements, int),
+            "speeds": np.full(n_elements, np.nan),
+            "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
+        }
 
     def error_goal(self, values: np.ndarray) -> np.ndarray:
         """Return the absolute tolerance of measures with about these values."""
@@ -304,10 +310,18 @@ class _MeasureRequest:
             bound = np.abs(error) + (ERROR_SAFETY_FACTOR - 1.0) * correction_effect + numerical
             is_accepted = estimate.same_codes & np.all(bound <= self.error_goal(values), axis=1)
         self.results["n_steps"][indices] += 1
-        self._record(indices[is_accepted], lower_gaits.model_index[is_accepted], MeasureStatus.CHECKED_BY_ONE_STEP, {
-            "values": values[is_accepted], "errors": bound[is_accepted], "model_errors": error[is_accepted],
-            "numerical_errors": numerical[is_accepted], "states": section_states[is_accepted],
-        })  # fmt: skip
+        self._record(
+            indices[is_accepted],
+            lower_gaits.model_index[is_accepted],
+            MeasureStatus.CHECKED_BY_ONE_STEP,
+            {
+                "values": values[is_accepted],
+                "errors": bound[is_accepted],
+                "model_errors": error[is_accepted],
+                "numerical_errors": numerical[is_accepted],
+                "states": section_states[is_accepted],
+            },
+        )
         rejected = np.flatnonzero(~is_accepted & estimate.same_codes)
         if not continues or not len(rejected):
             return
@@ -382,12 +396,19 @@ class _MeasureRequest:
         values = evaluate_measures(
             self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)
         )
-        self._record(indices, np.full(len(indices), UNILATERAL_MODEL_INDEX), status, {
-            "values": refinement.values, "errors": refinement.remaining_error + refinement.numerical_error,
-            "model_errors": values - refinement.values,
-            "numerical_errors": refinement.remaining_error + refinement.numerical_error, "speeds": refinement.speed,
-            "states": refinement.section_states,
-        })  # fmt: skip
+        self._record(
+            indices,
+            np.full(len(indices), UNILATERAL_MODEL_INDEX),
+            status,
+            {
+                "values": refinement.values,
+                "errors": refinement.remaining_error + refinement.numerical_error,
+                "model_errors": values - refinement.values,
+                "numerical_errors": refinement.remaining_error + refinement.numerical_error,
+                "speeds": refinement.speed,
+                "states": refinement.section_states,
+            },
+        )
 
     def _record(
         self,

@@ -58,8 +58,8 @@ class ObjectiveAndConstraints:
         objective_value = self.objective(cycle, step)
         if jnp.shape(check_reals("objective", objective_value, "return one number")):
             raise ValueError(
-                f"objective returns an array of shape {jnp.shape(objective_value)}, but what is maximised is "
-                "one number: reduce it, as by jnp.min or jnp.sum."
+                f"objective returns an array of shape {jnp.shape(objective_value)}, but what is "
+                "maximised is one number: reduce it, as by jnp.min or jnp.sum."
             )
         constraint_values = [
             self._evaluate_constraint(name, cycle, step) for name in self.constraints

@@ -273,9 +273,15 @@ class TuneProblem:
         if outcome != Outcome.STEPPED:
             values, jacobian = np.full_like(values, np.nan), np.full_like(jacobian, np.nan)
         return EvaluatedTrial(
-            normalized_parameters, outcome, is_on_branch, float(values[0]), jacobian[0], values[1:] - self.min_constraint_values,
-            jacobian[1:], evaluation,
-        )  # fmt: skip
+            normalized_parameters,
+            outcome,
+            is_on_branch,
+            float(values[0]),
+            jacobian[0],
+            values[1:] - self.min_constraint_values,
+            jacobian[1:],
+            evaluation,
+        )
 
     def explore_starts(self, n_starts: int, seed: int) -> Exploration:
         """Take first-order steps from many starts side by side: this wheel, and random ones."""
@@ -521,7 +527,8 @@ def _parse_objective(
 ) -> tuple[MeasureFunction, str]:
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
-            f"objective is {format_value(objective)}, but it is a measure's name, weights of several or a "
+            f"objective is {format_value(objective)}, but it is a measure's name, weights of "
+            "several or a "
             'function of the cycle: give "dls_fraction", say.'
         )
     if callable(objective):
@@ -577,7 +584,8 @@ def _check_bounds(
         for end in (low, high):
             if not PARAMETER_DOMAINS[name].contains(end):
                 raise ValueError(
-                    f"the bounds of {name} reach {end:g}, but {PARAMETER_DOMAINS[name].description} must lie "
+                    f"the bounds of {name} reach {end:g}, but "
+                    f"{PARAMETER_DOMAINS[name].description} must lie "
                     f"in {PARAMETER_DOMAINS[name]}: keep them inside."
                 )
         value = float(getattr(params, name))

@@ -91,6 +91,11 @@ class TuneResult:
         """Return whether the maximization ended at an optimum."""
         return self.status == TuneStatus.CONVERGED
 
+    @property
+    def ending(self) -> str:
+        """Return why the maximization ended, as a sentence."""
+        return self.status.meaning
+
     def describe(self) -> dict[str, str]:
         """Return the printed lines of the result by label."""
         free_names = self.path.attrs["free"].split()
@@ -122,4 +127,4 @@ class TuneResult:
         return format_text("TuneResult", self.describe().items())
 
     def _repr_html_(self) -> str:
-        return format_html_table("TuneResult gait", self.describe().items())
+        return format_html_table("Tuned gait", self.describe().items())

@@ -18,3 +18,9 @@ from vrw_jax.validation.checks import (
     is_traced,
     suggest_name,
 )
+from vrw_jax.validation.renamed import (
+    RENAMED_IN_NUMERICS,
+    RENAMED_IN_PACKAGE,
+    describe_renamed,
+    refuse_renamed_arguments,
+)

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
-from vrw_jax.validation import check_choice, check_int, check_not_traced, check_type
+from vrw_jax.validation import (
+    check_choice,
+    check_int,
+    check_not_traced,
+    check_type,
+    refuse_renamed_arguments,
+)
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
 
 if TYPE_CHECKING:
@@ -40,7 +46,7 @@ function render({ model, el }) {
     } else if (data.vrw === "values" && ready) {
       told = JSON.stringify(data.values);
       model.set("values", data.values);
-      model.set("told", data.told);
+      model.set("measures", data.told);
       model.save_changes();
     }
   };
@@ -66,13 +72,16 @@ def find_page() -> Path:
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
     """Return the address of the page, opened at this wheel."""
     default_values = _page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
-    values_of_wheel = _page_values(params, 1.0, check_choice("rung", model_name, PAGE_MODEL_NAMES))
+    values_of_wheel = _page_values(
+        params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
+    )
     values = {
         name: value for name, value in values_of_wheel.items() if value != default_values[name]
     }
     return find_page().as_uri() + (f"#{urlencode(values)}" if values else "")
 
 
+@refuse_renamed_arguments(rung="model_name")
 def explore(
     params: WheelParams | None = None,
     *,
@@ -119,7 +128,7 @@ def explore(
         values=_page_values(
             params,
             require_known_friction(friction),
-            check_choice("rung", model_name, PAGE_MODEL_NAMES),
+            check_choice("model_name", model_name, PAGE_MODEL_NAMES),
         ),
         map=map_data,
         height=check_int("height", height),
@@ -174,7 +183,10 @@ def _make_widget_class() -> type:
 
         @model_name.setter
         def model_name(self, value: str) -> None:
-            self.values = {**self.values, "rung": check_choice("rung", value, PAGE_MODEL_NAMES)}
+            self.values = {
+                **self.values,
+                "rung": check_choice("model_name", value, PAGE_MODEL_NAMES),
+            }
 
     return Explorer
 

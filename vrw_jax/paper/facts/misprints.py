@@ -56,10 +56,11 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
 
 
 # fmt: off
-MISPRINT_CLAIMS = ClaimGroup("Misprints of the paper, with the evidence", _compute_misprint_numbers, (
+MISPRINT_CLAIMS = ClaimGroup(
+    "Misprints of the paper, with the evidence", _compute_misprint_numbers, (
     Claim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)", "−L1 sin θ − L2 sin(θ+α)",
           "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} mended (must be 0)",
-          lambda n: n.violation > 0.1 and n.right < 1e-12,
+          lambda n: n.wrong > 0.1 and n.right < 1e-12,
           "1e-12 m/s: rounding; as printed far from it"),
     Claim("eq. (35): the impulse is −X⁻¹ J q̇†", "eq. (35)", "the projector of eq. (20)",
           "as printed five numbers, eq. (20)'s velocities; mended M Δq̇ = Jᵀ λ_I to "

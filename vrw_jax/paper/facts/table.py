@@ -66,7 +66,7 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
         "",
         "Figure 10 is drawn at slope 0.30 rad: Section 5.2 prints 0.10, where the gaits do not fit "
         "its numbers (last group). With Coulomb friction the rear foot would slip in the landing; "
-        "this rung of the model holds it, as the paper does.",
+        "this model holds it, as the paper does.",
     ]
     for title, group in itertools.groupby(facts, lambda fact: fact.group):
         rows = []

@@ -1,8 +1,8 @@
-"""The package as its imports show it: modules, rooms, arrows. It is read, never run.
+"""The import graph of a Python package: modules, packages and edges, read from source, never run.
 
 Every import counts: inside functions, for type checkers only, by name (`import_module("a.b")`, a
-string that is a module's dotted name), by attribute (`room.module.name`). A name fetched through
-a face, or through `runtime.lazy`, is an arrow to where it is defined as well.
+string that is a module's dotted name), by attribute (`package.module.name`). A name imported
+through an `__init__` file, or by `lazy_import`, also gives an edge to the module that defines it.
 """
 
 import ast
@@ -20,21 +20,21 @@ PACKAGE_LAYERS = (
     ("selection",), ("simulation",), ("batches",), ("continuation",), ("cycles",), ("tolerance",),
     ("branches", "tuning", "scans"), ("figures", "web"), ("paper",), ("cli",),
 )  # fmt: skip
-"""Rooms in the order in which they may know each other; those of one row do not."""
+"""Packages in import order: a package may import those of earlier rows only."""
 
 
 class ImportEdge(NamedTuple):
-    """What one import leads to."""
+    """One import of one name."""
 
     source: str  # module that imports, dotted
     target: str  # module of the package, or name in a library
-    imported_name: str  # what is fetched, `module:name`
-    stated_module: str  # module that an import statement names, dotted; "" for an attribute
+    imported_name: str  # `module:name`
+    stated_module: str  # module named in the import statement, dotted; "" for an attribute
     line: int
 
 
 class ImportGraph:
-    """A package: its modules, what they import, and from where."""
+    """The modules of a package and their imports."""
 
     def __init__(self, folder: Path) -> None:
         self.name = folder.name
@@ -48,35 +48,38 @@ class ImportGraph:
         }
 
     def is_init_module(self, module: str) -> bool:
-        """Whether a module is a package's `__init__`."""
+        """Return whether a module is a package's `__init__`."""
         return module in self.paths and self.paths[module].name == "__init__.py"
 
     def package_of(self, module: str) -> str:
-        """First folder below the package, or file; "" for the package's face and its `__main__`."""
+        """Return a module's first folder or file below the top package.
+
+        It is "" for the top package's `__init__` and `__main__`.
+        """
         package = module.split(".")[1] if "." in module else ""
         return "" if package == "__main__" else package
 
     @cached_property
     def packages(self) -> tuple[str, ...]:
-        """Every room, in the order of the flow; those that it does not know last."""
-        known_packages = [room for row in PACKAGE_LAYERS for room in row]
+        """All packages in import order; those outside `PACKAGE_LAYERS` come last."""
+        known_packages = [package for row in PACKAGE_LAYERS for package in row]
         existing_packages = {self.package_of(module) for module in self.paths} - {""}
         return (
-            *(room for room in known_packages if room in existing_packages),
+            *(package for package in known_packages if package in existing_packages),
             *sorted(existing_packages - set(known_packages)),
         )
 
     def modules_of(self, package: str) -> list[str]:
-        """Modules of a room, its face among them."""
+        """Return the modules of a package, including its `__init__`."""
         return [module for module in self.paths if self.package_of(module) == package]
 
     def count_lines(self, module: str) -> int:
-        """Lines of a module's file."""
+        """Return the number of lines of a module's file."""
         return len(self.paths[module].read_text().splitlines())
 
     @cached_property
     def edges(self) -> list[ImportEdge]:
-        """Every import of every module, once for each module it leads through, and libraries."""
+        """All imports of all modules: one edge per module on the path, and per library."""
         edges_by_key = {}
         for module in self.paths:
             for imported, stated_module, line in self._iterate_imports(self.trees[module], module):
@@ -91,11 +94,11 @@ class ImportGraph:
 
     @cached_property
     def package_links(self) -> Counter[tuple[str, str]]:
-        """How many names the modules of a room fetch from what another room defines."""
+        """Numbers of names that the modules of one package import from another, by pair."""
         imported_names = {
-            (arrow.source, arrow.imported_name, self.package_of(arrow.target))
-            for arrow in self.edges
-            if arrow.target in self.paths and not self.is_init_module(arrow.target)
+            (edge.source, edge.imported_name, self.package_of(edge.target))
+            for edge in self.edges
+            if edge.target in self.paths and not self.is_init_module(edge.target)
         }
         package_pairs = ((self.package_of(source), target) for source, _, target in imported_names)
         return Counter(
@@ -105,9 +108,9 @@ class ImportGraph:
         )
 
     def resolve_path(self, imported_name: str) -> list[str]:
-        """Modules that `module:name` leads through, then the name where it is defined, dotted.
+        """Return the modules on the path of `module:name`, then its dotted definition.
 
-        Faces and re-exports are followed; a library's name is its own end.
+        `__init__` files and re-exports are followed; a name of a library ends the path.
         """
         module, _, name = imported_name.partition(":")
         if module not in self.paths:
@@ -120,17 +123,17 @@ class ImportGraph:
                 return [*modules_on_path, *self.resolve_path(_join_names(origin, remaining_parts))]
             if submodule not in self.paths:
                 return [*modules_on_path, ".".join([submodule, *remaining_parts])]
-            modules_on_path[-1] = module = submodule  # a module is found without its face
+            modules_on_path[-1] = module = submodule  # a module is imported without its `__init__`
         return [*modules_on_path, module]
 
     def find_definition(self, module: str, node: ast.AST) -> str:
-        """Where what a name or attribute in a module stands for is defined, dotted; or ""."""
+        """Return the dotted definition of a name or attribute in a module, or ""."""
         first_name, *attribute_names = _attribute_chain(node) or [""]
         origin = self.names[module].get(first_name, f"{module}:{first_name}")
         return self.resolve_path(_join_names(origin, attribute_names))[-1] if first_name else ""
 
     def find_imports_in(self, text: str) -> set[str]:
-        """What source outside of the package fetches, `module:name`; code in strings counts."""
+        """Return the imports, `module:name`, of outside source and of the code in its strings."""
         tree = ast.parse(text)
         imports = {
             self.normalize_import(imported_name)
@@ -148,7 +151,7 @@ class ImportGraph:
         return imports
 
     def normalize_import(self, imported_name: str) -> str:
-        """`package:module.name` as `package.module:name`, unless the face hands the module out."""
+        """Return `package:module.name` as `package.module:name`, unless the module is exported."""
         module, _, name = imported_name.partition(":")
         first, _, rest = name.partition(".")
         inner = f"{module}.{first}"
@@ -157,7 +160,7 @@ class ImportGraph:
         return self.normalize_import(f"{inner}:{rest}" if rest else inner)
 
     def _collect_names(self, module: str, tree: ast.AST) -> dict[str, str]:
-        """Names that a module imports, wherever in it, and what each stands for."""
+        """Return the origin of each name that a module imports at any depth."""
         names: dict[str, str] = {}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
@@ -171,13 +174,13 @@ class ImportGraph:
         return {name: origin for name, origin in names.items() if name not in own_values}
 
     def _origin(self, module: str, node: ast.ImportFrom) -> str:
-        """What stands between `from` and `import`, without leading dots."""
+        """Return the absolute name of the module between `from` and `import`."""
         parts = module.split(".")
         base = parts[: len(parts) - node.level + self.is_init_module(module)] if node.level else []
         return ".".join([*base, node.module] if node.module else base)
 
     def _iterate_imports(self, tree: ast.AST, module: str) -> Iterator[tuple[str, str, int]]:
-        """Dotted names that a module fetches, what each import states, and the line."""
+        """Yield the imported name, the stated module and the line of each import."""
         names = self.names[module] if module else self._collect_names(module, tree)
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
@@ -197,24 +200,24 @@ class ImportGraph:
 
 
 def _join_names(origin: str, names: list[str]) -> str:
-    """`module:a` and further names as `module:a.b.c`."""
+    """Return `module:a` with further attribute names as `module:a.b.c`."""
     return f"{origin}{'.' if ':' in origin else ':'}{'.'.join(names)}" if names else origin
 
 
 def find_loaded_module(node: ast.AST, names: dict[str, str]) -> str | None:
-    """What a call imports by name; "" where the name is not written out, None for other nodes."""
+    """Return the module that a call imports; "" for a computed name, None for other nodes."""
     if not isinstance(node, ast.Call) or not node.args:
         return None
     first, *rest = _attribute_chain(node.func) or [""]
     called = _join_names(names.get(first, first), rest).replace(":", ".").split(".")[-1]
-    if called not in {"import_module", "__import__", "library"}:
+    if called not in {"import_module", "__import__", "lazy_import"}:
         return None
     name = node.args[0]
     return name.value if isinstance(name, ast.Constant) else ""
 
 
 def _attribute_chain(node: ast.AST) -> list[str] | None:
-    """`a.b.c` as ["a", "b", "c"]; None for anything but attributes of a name."""
+    """Return `a.b.c` as ["a", "b", "c"]; None for anything but attributes of a name."""
     if isinstance(node, ast.Name):
         return [node.id]
     inner = _attribute_chain(node.value) if isinstance(node, ast.Attribute) else None
