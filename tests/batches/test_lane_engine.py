@@ -441,7 +441,10 @@ def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy()
     ]
     evaluations = lambda result: (
         np.asarray(result.solver_steps)
-        * [len(load_explicit_tableau(result.solver_names[i]).nodes) - 1 for i in result.solver_index]
+        * [
+            len(load_explicit_tableau(result.solver_names[i]).nodes) - 1
+            for i in result.solver_index
+        ]
     )
     # The limits of stability over evaluations promise 0.68; accuracy takes some of it back.
     saved = evaluations(batch_result) / evaluations(named)

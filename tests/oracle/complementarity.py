@@ -309,7 +309,9 @@ def _process_event(w, place, struck_foot, struck_leg):
         retained = {*problem.locked, *itertools.compress(problem.legs, is_active)}
         legs = [j for j in legs if j in retained or v[3 + j] > -REST_SPEED]
     is_unfinished = [j for j in feet if abs(speeds[j, 0]) < REST_SPEED]
-    drag = [0.0 if j in is_unfinished else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet]
+    drag = [
+        0.0 if j in is_unfinished else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet
+    ]
     pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
     others = [rows[is_unfinished, 0], _locked_rows(legs)]
     v = _bring_to_rest(

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.hybrid import ReturnMap, Termination
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
 from vrw_jax.printing import format_numbers, format_quantity, format_text
 from vrw_jax.validation import (
@@ -27,7 +28,8 @@ class FixedPointResult(NamedTuple):
     - `x`: the point, shape (n,);
     - `jacobian`: of the map, or of its period_n-th iterate;
     - `residual`: largest entry of map(x) - x;
-    - `converged`, `n_iterations`: of Newton's method.
+    - `converged`, `iterations`: of Newton's method;
+    - `termination`: of the simulation of a `ReturnMap` from `x`; None for any other map.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -40,6 +42,7 @@ class FixedPointResult(NamedTuple):
     residual: Scalar
     converged: Bool[Array, ""]
     n_iterations: Int[Array, ""]
+    termination: Int[Array, ""] | None = None
 
     @property
     def ending(self) -> str:
@@ -52,12 +55,16 @@ class FixedPointResult(NamedTuple):
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
             return f"FixedPointResult{tuple(self)}"
-        rows = (
+        known = bool(np.all(np.isfinite(self.jacobian)))
+        multipliers = np.linalg.eigvals(self.jacobian) if known else np.full(len(self.x), np.nan)
+        rows = [
             ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
             ("x", format_numbers(self.x)),
             ("residual", format_quantity(self.residual, "")),
-            ("multipliers", format_numbers(np.linalg.eigvals(self.jacobian))),
-        )
+            ("multipliers", format_numbers(multipliers)),
+        ]
+        if self.termination is not None:
+            rows.append(("simulation", Termination(int(self.termination)).meaning))
         return format_text("FixedPointResult", rows)
 
 
@@ -82,9 +89,10 @@ def solve_fixed_point(
     converge is returned unchanged, without derivative.
 
     Args:
-        function: a map of a vector to a vector of the same shape, differentiable in forward mode.
-        start: shape (n,), near the fixed point.
-        period_n: number of times the map is applied.
+        function: a map of a vector onto its like, differentiable forwards; of a walk through
+            modes a `ReturnMap`, which has no point where the walk ends early.
+        start: shape (n,), near the point that is looked for.
+        period_n: how often the map is applied.
         tolerance: of Newton's last correction, in units of `start`.
         max_iterations: limit of Newton's iterations.
 
@@ -100,7 +108,10 @@ def solve_fixed_point(
         0.739085 True
     """
 
-    return _solve_checked(_run_newton, function, start, period_n, tolerance, max_iterations)
+    cycle = _solve_checked(_run_newton, function, start, period_n, tolerance, max_iterations)
+    if isinstance(function, ReturnMap):
+        cycle = cycle._replace(termination=function.find_termination(cycle.x, period_n))
+    return cycle
 
 
 def solve_fixed_point_implicit(

@@ -22,18 +22,20 @@ class MonitoredFunctions(NamedTuple):
     """Functions monitored along a phase: guards that end it, then margins whose minimum is
     searched.
 
-    `values` returns the `n_guards` guards followed by the margins. A margin's minimum is searched
-    at every interior local minimum and at the phase's end. The phase's start counts too
-    (`includes_start`), unless the margin is zero there by construction, like the height of a foot
-    that leaves the ground. `guard_scales`: magnitudes of the terms whose difference is the guard. A
-    guard within some round-off of its scale is at zero, because in a dip of microseconds no other
-    time brings it closer.
+    `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
+    at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
+    the quantity is zero there by construction, like the height of a foot that leaves the ground.
+    `sizes`: what guards are differences of. One within some roundings of it is at zero: in a dip
+    of microseconds no time brings it closer.
+    `on_start`: guards that the caller takes for zero at the start, whatever rounding makes of them;
+    without it those that read exactly zero there, or rounding of their `sizes`.
     """
 
     values: MonitorFn
     n_guards: int
     includes_start: tuple[bool, ...] = ()
     guard_scales: Array | None = None
+    on_start: Bool[Array, " n_guards"] | None = None
 
 
 GUARD_ROUNDOFF_EPS = 32.0
@@ -55,6 +57,28 @@ def is_at_roundoff(
     is_near_zero = jnp.abs(jnp.min(lowest)) <= GUARD_ROUNDOFF_EPS * jnp.finfo(lowest.dtype).eps
     has_scales = monitored_functions.guard_scales is not None
     return is_near_zero & has_scales, jnp.argmin(lowest).astype(jnp.int32)
+
+
+def guards_met_at_start(
+    monitored_functions: MonitoredFunctions,
+    guards: Float[Array, " n_guards"],
+    rates: Float[Array, " n_guards"],
+) -> tuple[Bool[Array, " n_guards"], Bool[Array, " n_guards"]]:
+    """Return which guards end the phase at its start, and which of them fall through zero there.
+
+    The others are past zero or at rest on it: when they were met does not follow from the start.
+    """
+    met = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
+    on = guards == 0.0
+    if monitored_functions.guard_scales is not None:
+        on = on | (
+            guards
+            >= -GUARD_ROUNDOFF_EPS * jnp.finfo(guards.dtype).eps * monitored_functions.guard_scales
+        )
+    if monitored_functions.on_start is not None:
+        on = monitored_functions.on_start
+        met = jnp.where(on, rates <= 0.0, met)
+    return met, met & on & (rates < 0.0)
 
 
 class AcceptedPhaseStep(NamedTuple):

@@ -25,6 +25,7 @@ from vrw_jax.hybrid.minima import (
     MonitoredFunctions,
     StateVector,
     empty_minimum,
+    guards_met_at_start,
     is_at_roundoff,
     refine_minimum,
     select_row,
@@ -74,7 +75,8 @@ class _EventSearch(NamedTuple):
     upper_bound: Scalar
     time_tolerance: Scalar  # of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirmed: Int[Array, ""]  # consecutive tries that left the event unchanged
+    n_confirmed: Int[Array, ""]  # tries that no longer moved the event
+    change: Scalar  # of the event's time by the last try, s
 
 
 class _PhaseState(NamedTuple):
@@ -201,12 +203,13 @@ def integrate_phase(
 ) -> PhaseEnd:
     """Integrate `field` from `start` until the earliest guard reaches zero from above.
 
-    A guard that is negative at the start, or zero and not rising, ends the phase immediately with
-    duration 0; a guard that is zero and rising does not fire. A guard that dips below zero and
-    returns within one step is detected: where the step's cubic through values and rates dips, the
-    step is repeated up to the dip. With `active` False nothing is integrated. If two guards vanish
-    together, the first in the list counts. Errors are those of the solver at the tolerances in
-    `options`.
+    A guard that is negative at the start, or zero and not rising, ends the phase at once with
+    duration 0; one that is zero and rising does not fire. The event time of one that falls through
+    zero there has its derivative, minus the guard's by the start over its rate. A guard that dips
+    below zero and comes back within one step is found: where the step's cubic through values and
+    rates dips, the step is retried up to the dip. With `active` False nothing is integrated. Two
+    guards at once: the first in the list wins. Errors are those of the solver at `options`'
+    tolerances.
     """
     context = _PhaseContext(_make_stepper(field, options), monitored_functions, options)
     loop = lax.while_loop(
@@ -258,7 +261,13 @@ def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, 
         next_length=zero_time,  # the first step has length zero: it evaluates the start
         controller_state=jax.tree.map(lambda x: x + constant_zero, controller_state),
         search=_EventSearch(
-            is_crossing, constant_zero, constant_zero, constant_zero, zero_count, zero_count
+            is_crossing,
+            constant_zero,
+            constant_zero,
+            constant_zero,
+            zero_count,
+            zero_count,
+            constant_zero,
         ),
         minimum=empty_minimum(monitored_functions, start),
         refinement=MinimumRefinement(
@@ -287,11 +296,14 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
     is_starting, is_searching = loop.mode == STARTING_MODE, loop.mode == EVENT_SEARCH_MODE
     step, error = _try_step(context, loop)
     guards, rates = step.values[:n], step.rates[:n]
-    is_past = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
-    has_immediate_event = is_starting & jnp.any(is_past)
+    met, falls = guards_met_at_start(monitored_functions, guards, rates)
+    first_met = jnp.argmax(met).astype(jnp.int32)
+    # An event at time zero is searched for like any other: its time moves with the start.
+    searched_at_start = is_starting & falls[first_met]
+    has_immediate_event = is_starting & jnp.any(met) & ~falls[first_met]
     assessment = _assess_step(context, loop, step, error)
     proposal = _propose_event(search, guards, rates, length)
-    is_close = jnp.abs(proposal.length - length) <= search.time_tolerance
+    is_close, change = _close(search, proposal.length, previous_step.time, length)
     is_at_zero, lowest_guard = is_at_roundoff(monitored_functions, search.is_crossing, guards)
     proposal = proposal._replace(guard=jnp.where(is_at_zero, lowest_guard, proposal.guard))
     n_confirmed = search.n_confirmed + (is_searching & (is_close | is_at_zero))
@@ -303,13 +315,17 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
         is_searching & ~has_arrived & (search.n_iterations >= options.max_event_iterations)
     )
     is_phase_end = has_immediate_event | has_arrived | timed_out | is_stuck
+    begins_search = assessment.has_crossed | searched_at_start
     mode = jnp.where(is_starting, INTEGRATING_MODE, loop.mode)
     mode = jnp.where(
-        is_phase_end, DONE_MODE, jnp.where(assessment.has_crossed, EVENT_SEARCH_MODE, mode)
+        is_phase_end, DONE_MODE, jnp.where(begins_search, EVENT_SEARCH_MODE, mode)
     ).astype(jnp.int32)
     following_length = jnp.where(
-        is_searching, proposal.length, lax.stop_gradient(assessment.following_length)
+        searched_at_start, 0.0, lax.stop_gradient(assessment.following_length)
     )
+    following_length = jnp.where(is_searching, proposal.length, following_length)
+    crossing = jnp.where(assessment.has_crossed, assessment.is_crossing, search.is_crossing)
+    at_start = searched_at_start & (jnp.arange(n) == first_met)
     is_counted = (assessment.is_accepted & ~is_starting) | has_arrived
     minimum = update_minimum(
         monitored_functions, loop.minimum, previous_step, step, length, is_counted
@@ -336,24 +352,21 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
         next_length=following_length,
         controller_state=assessment.controller_state,
         search=_EventSearch(
-            is_crossing=jnp.where(
-                assessment.has_crossed, assessment.is_crossing, search.is_crossing
-            ),
-            lower_bound=jnp.where(assessment.has_crossed, 0.0, proposal.lower_bound),
-            upper_bound=jnp.where(
-                assessment.has_crossed, lax.stop_gradient(length), proposal.upper_bound
-            ),
+            is_crossing=jnp.where(searched_at_start, at_start, crossing),
+            lower_bound=jnp.where(begins_search, 0.0, proposal.lower_bound),
+            upper_bound=jnp.where(begins_search, lax.stop_gradient(length), proposal.upper_bound),
             time_tolerance=jnp.where(
                 assessment.has_crossed, assessment.time_tolerance, search.time_tolerance
             ),
             n_iterations=search.n_iterations + is_searching,
             n_confirmed=n_confirmed,
+            change=jnp.where(begins_search, jnp.inf, change),
         ),
         minimum=minimum,
         refinement=refinement,
         guard=jnp.where(
             has_immediate_event,
-            jnp.argmax(is_past).astype(jnp.int32),
+            first_met,
             jnp.where(has_arrived & ~timed_out, proposal.guard, loop.guard),
         ),
         timed_out=timed_out | loop.timed_out,
@@ -377,9 +390,10 @@ def _try_step(context: _PhaseContext, loop: _PhaseState) -> tuple[AcceptedPhaseS
     end, error, solver_state = stepper.advance_state(*start, loop.next_length)
     values, rates = jax.jvp(monitored_functions.values, (end,), (stepper.field(end),))
     error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
-    return AcceptedPhaseStep(
-        loop.accepted_step.time + loop.next_length, end, solver_state, values, rates
-    ), error
+    limit = lax.stop_gradient(options.max_phase_time)
+    last = (loop.mode == INTEGRATING_MODE) & (loop.next_length >= limit - loop.accepted_step.time)
+    time = jnp.where(last, limit, loop.accepted_step.time + loop.next_length)
+    return AcceptedPhaseStep(time, end, solver_state, values, rates), error
 
 
 class _StepAssessment(NamedTuple):
@@ -418,10 +432,16 @@ def _assess_step(
     )
     following_length = jnp.where(is_starting, options.dt0, next_length)
     following_length = jnp.where(must_retry, length_to_dip, following_length)
+    accepted = is_starting | (is_kept & ~has_crossed & ~must_retry)
+    reached = jnp.where(accepted, step.time, previous_step.time)
+    # The last step ends at the time limit.
+    following_length = jnp.minimum(
+        following_length, lax.stop_gradient(options.max_phase_time - reached)
+    )
     guess = _guess_event_length(previous_step, step.values, step.rates, length, n, is_crossing)
     resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
     return _StepAssessment(
-        is_accepted=is_starting | (is_kept & ~has_crossed & ~must_retry),
+        is_accepted=accepted,
         has_crossed=has_crossed,
         is_crossing=is_crossing,
         is_stuck=is_integrating & ~has_crossed & cannot_continue,
@@ -506,6 +526,29 @@ def _guess_event_length(
             is_crossing & is_falling, jnp.clip(fraction - change, 0.0, 1.0), fraction
         )
     return lax.stop_gradient(length) * jnp.min(jnp.where(is_crossing, fraction, 1.0))
+
+
+MAX_SETTLED_CHANGE = 1e-4
+"""Most that a try that counts may change the event's time, over the duration of the phase. Chosen
+because Newton's method squares it in each of the next two tries: 1e-16 at the last."""
+MIN_STALLED_RATIO = 0.9
+"""A change of the event's time that is not less than this times the one before is rounding. Chosen
+because Newton's method at least halves changes, and takes two thirds at a triple root."""
+
+
+def _close(
+    search: _EventSearch, following: Scalar, time: Scalar, length: Scalar
+) -> tuple[Bool[Array, ""], Scalar]:
+    """Return whether the next try changes the event's time by little, and by how much, s.
+
+    Little compared with the step and, for an event much earlier than the step's end, with the time
+    since the phase began, unless rounding of the guard leaves no more to gain.
+    """
+    fixed, fixed_length, begin = lax.stop_gradient((following, length, time))
+    change = jnp.abs(fixed - fixed_length)
+    small = change <= MAX_SETTLED_CHANGE * (begin + fixed)
+    stalled = change >= MIN_STALLED_RATIO * search.change
+    return (change <= search.time_tolerance) & (small | stalled), change
 
 
 class _EventProposal(NamedTuple):

@@ -11,13 +11,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vrw_jax.hybrid.phase_integration import sample_phase
-from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode
-from vrw_jax.numerics import Scalar, StepOptions
+from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, collect_modes
+from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
 from vrw_jax.validation import check_reals
 
 
 def flow_jacobian_determinant(
-    modes: Sequence[Mode],
+    modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,
     solution: HybridSolution,
     options: StepOptions | None = None,
@@ -32,10 +32,10 @@ def flow_jacobian_determinant(
     return map's Jacobian loses that product's digits where a guard is grazed, because its entries
     grow as one over the guard's rate.
 
-    The result is NaN if the solver steps are spent. Transforms apply.
+    Not a number where steps are spent. Transforms apply, reverse mode does not.
     """
     options = StepOptions() if options is None else options
-    start = check_reals("start", start)
+    modes, start = collect_modes(modes), check_reals("start", start)
     event_factors = [_event_factor(mode, guard, options) for mode in modes for guard in mode.guards]
     first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
     phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
@@ -55,7 +55,8 @@ def flow_jacobian_determinant(
         count, phase_starts, solution.states_before, solution.states_after, durations, first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
-    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
+    product = lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
+    return refuse_reverse_mode("volume_change", product)
 
 
 def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
-from vrw_jax.numerics import Scalar, StepOptions
+from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
 
 
 class FlowSegments(NamedTuple):
@@ -89,7 +89,8 @@ def segment_maps(
         return end_state[:dim], (end_state[:dim], jacobian, end_state[-2])
 
     _, (states, maps, divergences) = lax.scan(integrate_segment, start, None, length=n_segments)
-    return FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
+    segments = FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
+    return refuse_reverse_mode("segment_maps", segments)
 
 
 class ProductMultipliers(NamedTuple):

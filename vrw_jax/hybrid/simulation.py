@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition
+from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition, refuse_reverse_mode
 from vrw_jax.printing import describe_ending
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
@@ -40,8 +40,9 @@ class Guard(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """An autonomous vector field, shape (dim,) to (dim,), and its guards; time is a coordinate if
-    needed.
+    """An autonomous field, shape (dim,) to (dim,), and its guards, or the only one of them.
+
+    Time is a coordinate if any.
     """
 
     field: VectorField
@@ -95,7 +96,7 @@ class HybridSolution(NamedTuple):
 
 
 def simulate_hybrid(
-    modes: Sequence[Mode],
+    modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,
     *,
     events: int,
@@ -104,17 +105,19 @@ def simulate_hybrid(
 ) -> HybridSolution:
     """Simulate `modes` from `start` through at most `events` events.
 
-    Guards are treated as in `integrate_phase`: the earliest first, at the integrator's accuracy,
-    with derivatives of event times and states. A guard within the clock's round-off of zero at the
-    start of its mode counts as zero. A guard that is zero at rest there fires only if it will not
-    rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`) apply.
+    Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
+    accuracy, with derivatives of event times and states. A guard within the clock's rounding of
+    zero where its mode begins counts as zero; one that is zero at rest there fires only if it
+    will not rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
+    apply, reverse mode does not. One mode, or a mode's one guard, may be given without a tuple.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     start, events = check_reals("start", start), check_int("events", events)
+    modes = collect_modes(modes)
     _check_arguments(modes, start, events, mode)
     options.check_tolerances(start.dtype)
-    return _simulate(tuple(modes), events, options, start, mode)
+    return refuse_reverse_mode("simulate_hybrid", _simulate(modes, events, options, start, mode))
 
 
 ERROR_CHECK_TIGHTENINGS = (0.1, 0.01)
@@ -123,32 +126,29 @@ compares with."""
 
 
 def time_errors(
-    modes: Sequence[Mode],
+    modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,
     solution: HybridSolution,
     options: StepOptions | None = None,
 ) -> Float[Array, " events"]:
     """Return estimated errors of the event times, s, from simulations at two looser tolerances.
 
-    The same events are computed again with tolerances ten and a hundred times as large. Each error
-    is twice the largest change of any event so far, in units of its `time_tolerance`, and at least
-    twice its `time_tolerance`. It includes what `time_tolerance` alone omits: accumulated errors of
-    steps and errors that earlier events transfer to later ones. It also includes the part that an
-    implicit solver's own estimate omits in a stiff field. It is infinite from the first event that
-    the simulation at ten times the tolerance does not reach. The estimate is measured, not proved;
-    `options` are those of the simulation.
+    The same events are walked to again with tolerances ten and a hundred times as large. Each time
+    is stated to twice the most that any event so far moved by, in units of its `resolution`, and to
+    twice its `resolution` at least; not below the roundings of all states so far, and of the clock.
+    That holds what `resolution` alone does not know: errors of
+    steps that add up, what earlier events hand on to later ones, and what an implicit solver's own
+    estimate leaves out where the field is stiff. Infinite from the first event that the walk at ten
+    times the tolerance does not meet. Measured, not proved; `options` are those of the walk.
     """
     options = StepOptions() if options is None else options
+    modes = collect_modes(modes)
     start, solution = lax.stop_gradient((check_reals("start", start), solution))
     count = jnp.arange(len(solution.times))
 
     def time_change(factor: Array) -> Array:
         looser_solution = _simulate(
-            tuple(modes),
-            len(count),
-            options.with_tightened_tolerances(factor),
-            start,
-            solution.modes[0],
+            modes, len(count), options.with_tightened_tolerances(factor), start, solution.modes[0]
         )
         is_same_event = (looser_solution.guards == solution.guards) & (
             looser_solution.modes == solution.modes
@@ -156,6 +156,11 @@ def time_errors(
         is_same_event = jnp.cumprod(is_same_event & (count < looser_solution.n_events)) > 0
         return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
 
+    # Each event adds a rounding of its state, and the clock its own.
+    rounding = jnp.cumsum(
+        jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
+    )
+    rounding = rounding + jnp.finfo(start.dtype).eps * jnp.abs(solution.times)
     changes_at_ten, changes_at_hundred = lax.stop_gradient(
         lax.map(time_change, jnp.asarray(ERROR_CHECK_TIGHTENINGS, start.dtype))
     )
@@ -166,22 +171,33 @@ def time_errors(
         / solution.time_tolerance
     )
     max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
-    return jnp.where(count < solution.n_events, 2.0 * max_change * solution.time_tolerance, 0.0)
+    stated = jnp.maximum(2.0 * max_change * solution.time_tolerance, rounding)
+    return jnp.where(count < solution.n_events, stated, 0.0)
 
 
-def _check_arguments(modes: Sequence[Mode], start: Array, events: int, mode: int) -> None:
+def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
+    """Return modes, and the guards of each, as tuples; one alone may be given as it is."""
+    if isinstance(modes, Mode | Guard):  # tuples themselves
+        modes = (modes,)  # type: ignore[assignment]
+    check_type("modes", modes, (list, tuple), "give Modes in a list")
+    listed = []
+    for mode in modes:
+        check_type("a mode", mode, Mode, "give Mode(field, guards)")
+        guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
+        check_type("guards", guards, (list, tuple), "give Guards in a tuple")
+        for guard in guards:
+            check_type("a guard", guard, Guard, "give Guard(value, reset, to)")
+        listed.append(mode._replace(guards=tuple(guards)))
+    return tuple(listed)
+
+
+def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: int) -> None:
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
         raise ValueError("start holds a number that is not finite.")
     if events * start.size > MAX_STORED_NUMBERS:
         raise ValueError(f"events is {events}, but so many states don't fit: ask for fewer.")
-    check_type("modes", modes, (list, tuple), "give Modes in a list")
-    for candidate_mode in modes:
-        check_type("a mode", candidate_mode, Mode, "give Mode(field, guards)")
-        check_type("guards", candidate_mode.guards, (list, tuple), "give Guards in a tuple")
-        for guard in candidate_mode.guards:
-            check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
     if not 0 <= mode < len(modes):
         raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
     for i, (field, guards) in enumerate(modes):
@@ -232,8 +248,9 @@ def _integrate_mode(
     # For a guard at rest the second derivative decides: it does not fire if it will rise.
     is_rising = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
     guard_offset = jnp.where(is_rising, jnp.finfo(state.dtype).tiny, guard_offset)
+    on = (values <= 0.0) & is_near_zero & ~is_rising
     monitored_functions = MonitoredFunctions(
-        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards)
+        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), on_start=on
     )
     return integrate_phase(
         mode.field, monitored_functions, state, ~is_violated, options
@@ -264,6 +281,13 @@ def _apply_reset(mode: Mode, guard: Array, state: Array, mode_index: int) -> tup
     )[index]
 
 
+def _added(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
+    """Return the rounded sum and what rounding took from it (D. E. Knuth's two-sum)."""
+    later = time + duration
+    taken = later - time
+    return later, (time - (later - taken)) + (duration - taken)
+
+
 def _simulate(
     modes: tuple[Mode, ...], events: int, options: StepOptions, start: Array, mode: int | Array
 ) -> HybridSolution:
@@ -281,20 +305,22 @@ def _simulate(
         return run_mode
 
     mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
+    # The n - 1 guards between n bodies that meet in one point fire up to n (n - 1) / 2 times there.
+    most_at_once = sum(len(mode.guards) ** 2 for mode in modes)
 
     def advance_event(carry: tuple) -> tuple:
-        solution, n_stationary = carry
+        solution, n_stationary, remainder = carry
         end, is_violated, time_scales, next_state, next_mode = lax.switch(
             solution.mode, mode_branches, solution.state, solution.time
         )
         has_event = ~is_violated & (end.guard >= 0)
-        time = solution.time + end.duration
+        time, remainder = _added(solution.time, end.duration + remainder)
         n_stationary = jnp.where(time > solution.time, 0, n_stationary + 1)
         has_spent_steps = end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
             solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), _STILL_RUNNING
         )
-        termination = jnp.where(n_stationary > len(modes), int(Termination.ZENO), termination)
+        termination = jnp.where(n_stationary > most_at_once, int(Termination.ZENO), termination)
         failure = jnp.where(
             end.timed_out, int(Termination.MAX_TIME_REACHED), int(Termination.STEP_SIZE_UNDERFLOW)
         )
@@ -325,6 +351,7 @@ def _simulate(
                 termination=termination.astype(jnp.int32),
             ),
             n_stationary,
+            remainder,
         )
 
     zero_count, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
@@ -339,7 +366,7 @@ def _simulate(
     is_running = lambda carry: opaque_condition(
         carry[0].termination == _STILL_RUNNING, carry[0].n_events
     )
-    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count))[0]
+    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, zero))[0]
 
 
 _STILL_RUNNING = -1

@@ -43,6 +43,7 @@ from vrw_jax.numerics.cubic_minima import (
     evaluate_cubic,
     find_cubic_minimum,
 )
+from vrw_jax.numerics.forward_only import refuse_reverse_mode
 from vrw_jax.numerics.options import EngineName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine

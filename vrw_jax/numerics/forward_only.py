@@ -1,0 +1,41 @@
+"""A sentence instead of JAX's own error where reverse mode meets a loop of unknown length."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, PyTree
+
+_FORWARD_ONLY = Primitive("forward_only")
+"""The identity, of which the transpose raises."""
+
+
+def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
+    raise ValueError(
+        f"numerics.{name} has no derivative in reverse mode, since the number of its solver steps "
+        "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "
+        "jax.jacrev or jax.vjp."
+    )
+
+
+_FORWARD_ONLY.def_impl(lambda x, *, name: x)
+_FORWARD_ONLY.def_abstract_eval(lambda x, *, name: x)
+ad.deflinear2(_FORWARD_ONLY, _refuse)
+batching.defvectorized(_FORWARD_ONLY)
+mlir.register_lowering(_FORWARD_ONLY, lambda _context, x, *, name: [x])
+
+
+def refuse_reverse_mode(name: str, tree: PyTree) -> PyTree:
+    """Return the results of `numerics.<name>`, with a sentence in place of reverse mode."""
+
+    def mark(leaf: Any) -> Any:
+        marks = isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf)
+        return _mark(leaf, name) if marks else leaf
+
+    return jax.tree.map(mark, tree)
+
+
+def _mark(leaf: Array, name: str) -> Array:
+    return _FORWARD_ONLY.bind(leaf, name=name)
