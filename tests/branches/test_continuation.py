@@ -1,5 +1,7 @@
 """Branches pass folds, and every bifurcation and border on them is located to 1e-9."""
 
+import pickle
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -157,6 +159,91 @@ def test_real_reciprocal_multipliers_are_no_neimark_sacker_bifurcation():
     saddle = lambda _, x, p: jnp.stack([2.0 * p * x[0], 0.5 * x[1]])
     branch = vrw.continue_map(saddle, [0.0, 0.0], 0.8, (0.6, 1.4))
     assert "neimark_sacker" not in special_points_by_kind(branch)
+
+
+def pitchfork(offset, x, p):
+    """x -> x + (p x - x^3 + offset)/10: side branch p = x^2, broken where the offset is not 0."""
+    return x + 0.1 * (p * x - x**3 + offset)
+
+
+def along_the_side_branch(offset):
+    return vrw.continue_map(pitchfork, [1.0], 1.0, (-1.0, 1.2), constants=offset)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_equal_logistic_maps_double_their_period_all_at_once_at_3(n):
+    branch = vrw.continue_map(evaluate_logistic, [0.6] * n, 2.5, (2.0, 3.5))
+    (border,) = branch.special_points
+    assert (border.kind, border.n_multipliers) == ("period_doubling", n)
+    assert abs(border.value - 3.0) < LOCATION_TOLERANCE
+    assert f"of {n} multipliers at once" in str(border)
+
+
+def test_three_equal_maps_seen_from_other_coordinates_are_no_neimark_sacker_bifurcation():
+    """Round-off makes a threefold multiplier complex, by 1e-5."""
+    into = jnp.array([[1.0, 2.0, 0.3], [0.0, 1.0, -1.0], [0.5, 0.0, 1.0]])
+    turned = lambda _, x, r: into @ evaluate_logistic(None, jnp.linalg.solve(into, x), r)
+    branch = vrw.continue_map(turned, into @ jnp.full(3, 0.6), 2.5, (2.0, 3.5))
+    (border,) = branch.special_points
+    assert (border.kind, border.n_multipliers) == ("period_doubling", 3)
+    assert abs(border.value - 3.0) < LOCATION_TOLERANCE
+
+
+def test_two_pairs_of_multipliers_leave_the_circle_at_once():
+    twice = lambda _, x, r: jnp.concatenate(
+        [evaluate_delayed_logistic(_, x[:2], r), evaluate_delayed_logistic(_, x[2:], r)]
+    )
+    (border,) = vrw.continue_map(twice, [0.4] * 4, 1.7, (1.4, 2.2)).special_points
+    assert (border.kind, border.n_multipliers) == ("neimark_sacker", 4)
+    assert abs(border.value - 2.0) < LOCATION_TOLERANCE
+
+
+def test_two_period_doublings_within_one_step_are_told_apart():
+    beside = lambda _, x, r: jnp.stack(
+        [evaluate_logistic(_, x[0], r), evaluate_logistic(_, x[1], r + 1e-4)]
+    )
+    first, second = vrw.continue_map(beside, [0.6, 0.6], 2.5, (2.0, 3.5)).special_points
+    assert {first.kind, second.kind} == {"period_doubling"}
+    assert abs(first.value - 2.9999) < LOCATION_TOLERANCE
+    assert abs(second.value - 3.0) < LOCATION_TOLERANCE
+
+
+def test_different_bifurcations_at_one_place_are_each_found():
+    """A pair at 2, and a period doubling of the logistic map there."""
+    both = lambda _, x, r: jnp.concatenate(
+        [evaluate_delayed_logistic(_, x[:2], r), evaluate_logistic(_, x[2:], r + 1.0)]
+    )
+    branch = vrw.continue_map(both, [0.4, 0.4, 0.63], 1.7, (1.4, 2.2))
+    assert sorted(border.kind for border in branch.special_points) == [
+        "neimark_sacker",
+        "period_doubling",
+    ]
+    assert all(abs(border.value - 2.0) < LOCATION_TOLERANCE for border in branch.special_points)
+
+
+def test_a_pitchfork_is_met_along_its_side_branch():
+    branch = along_the_side_branch(0.0)
+    (border,) = branch.special_points
+    assert border.kind == "branch_point"
+    assert abs(border.value) < LOCATION_TOLERANCE
+    assert abs(border.point.section_state[0]) < 1e-5  # p = x^2
+    np.testing.assert_allclose(branch.dataset.x[:, 0] ** 2, branch.values, atol=1e-9)
+
+
+@pytest.mark.parametrize("offset", [1e-3, 1e-6, 1e-9])
+def test_beside_a_pitchfork_that_nearly_is_one_the_branch_is_not_left(offset):
+    """Above, the branch is x > 0 and stable; below, it turns back at 3 (offset/2)^(2/3)."""
+    above = along_the_side_branch(offset)
+    assert not above.special_points
+    assert above.values[0] == -1.0
+    assert (above.dataset.x > 0.0).all()
+    assert above.stable.all()
+    below = along_the_side_branch(-offset)
+    (fold,) = below.special_points
+    assert fold.kind == "fold"
+    assert abs(fold.value - 3.0 * (0.5 * offset) ** (2 / 3)) < LOCATION_TOLERANCE
+    assert below.values[[0, -1]].tolist() == [1.2, 1.2]
+    assert (below.dataset.x > 0.0).all()
 
 
 def test_a_fold_of_a_map_of_three_numbers_is_found():
@@ -379,6 +466,15 @@ def test_the_cycle_at_a_special_point_is_a_limit_cycle_of_the_wheel(branch):
     np.testing.assert_allclose(
         border.cycle.multipliers, border.point.multipliers, atol=1e-9, rtol=0.0
     )
+
+
+def test_a_branch_with_borders_survives_pickling(branch):
+    """Its borders find the same gaits then."""
+    again = pickle.loads(pickle.dumps(branch))
+    assert str(again) == str(branch)
+    assert again.dataset.identical(branch.dataset)
+    one, other = branch.special_points[-1].cycle, again.special_points[-1].cycle
+    np.testing.assert_array_equal(other.section_state, one.section_state)
 
 
 def test_the_map_before_touchdown_and_after_impact_have_the_same_multipliers(find_gait_at_damping):

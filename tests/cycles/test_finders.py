@@ -1,5 +1,6 @@
 """One face for gaits: two independent finders tell the same gait, one table names what it tells."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,9 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 MODELS = (vrw.RigidWheel(), vrw.ViscoelasticWheel(), vrw.UnilateralWheel(), vrw.LadderWheel())
 TABLE_1 = vrw.WheelParams()
+WHEEL_AXES = eqx.tree_at(
+    lambda w: w.slope, jax.tree.map(lambda _: None, TABLE_1), 0, is_leaf=lambda x: x is None
+)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +84,35 @@ def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: Abst
     if feels:
         ground, _ = model.with_parameter(TABLE_1, FRICTION_NAME, jnp.asarray(1.25))
         assert float(ground.friction) == 1.25
+
+
+def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
+    """A rigid wheel's steps all contract towards one: it has gaits of one step alone."""
+    model, wheel, start = (
+        vrw.RigidWheel(holds_rear_foot=True),
+        vrw.WheelParams(slope=0.1),
+        (0.39, 1.5),
+    )
+    for n in (1, 2, 4):
+        gait = vrw.limit_cycle(wheel, model=model, guess=[*start, 0.0], period_n=n)
+        assert bool(gait.found)
+        assert int(gait.minimal_period) == 1
+        assert ("its minimal period is 1" in str(gait)) == (n > 1)
+    lost = vrw.limit_cycle(vrw.WheelParams(slope=0.0), model=model, guess=[*start, 0.0], period_n=2)
+    assert (bool(lost.found), int(lost.minimal_period)) == (False, 0)
+    slopes = vrw.WheelParams(slope=jnp.array([0.0, 0.1]))
+    search = lambda params: vrw.limit_cycle(params, model=model, guess=[*start, 0.0], period_n=2)
+    every = jax.vmap(search, in_axes=(WHEEL_AXES,))(slopes)
+    np.testing.assert_array_equal(every.minimal_period, [0, 1])
+
+
+def test_a_cycle_of_two_steps_has_two_as_its_minimal_period():
+    """The ends of its steps differ; made up from a gait of one step."""
+    model, wheel = vrw.RigidWheel(holds_rear_foot=True), vrw.WheelParams(slope=0.1)
+    gait = vrw.limit_cycle(wheel, model=model, guess=[0.39, 1.5, 0.0], period_n=2)
+    place = lambda cycle: cycle.steps.section_state
+    shift = 1e-5 * jnp.array([[1.0], [-1.0]])
+    assert int(eqx.tree_at(place, gait, place(gait) + shift).minimal_period) == 2
 
 
 def test_a_cycle_is_confirmed_only_if_the_step_from_it_returns_to_it():

@@ -370,6 +370,8 @@ def test_a_cycle_walked_twice_has_the_multipliers_squared():
     np.testing.assert_allclose(twice.multipliers, once.multipliers**2, rtol=1e-10)
     np.testing.assert_allclose(twice.durations, np.tile(once.durations, (2, 1)), rtol=1e-9)
     np.testing.assert_allclose(twice.dls_fraction, once.dls_fraction, rtol=1e-9)
+    assert (int(once.minimal_period), int(twice.minimal_period)) == (1, 1)
+    assert "repeats after 2 steps; its minimal period is 1" in str(twice)
 
 
 @pytest.mark.slow
@@ -380,6 +382,7 @@ def test_beyond_the_discontinuity_a_cycle_of_five_steps_is_found_from_a_walk():
     end = walk.steps.section_state[-1]
     five = vrw.limit_cycle(params, guess=end, period_n=5)
     assert int(five.outcome) == Outcome.STEPPED
+    assert int(five.minimal_period) == 5
     np.testing.assert_allclose(five.section_state, end, atol=1e-8)
     assert np.sum(np.asarray(five.durations)[:, 0] == 0.0) == 1
     x = five.section_state

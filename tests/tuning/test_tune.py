@@ -15,6 +15,7 @@ from vrw_jax.tuning.maximization import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneS
 from vrw_jax.tuning.objective import max_breach, parse_margins, scale_slacks, signed_bound
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
 from vrw_jax.tuning.tune_result import TuneResult
+from vrw_jax.wheel import PARAMETER_NAMES
 
 PARAMETER_BOX = {
     "damping": (20.0, 215.0),
@@ -143,6 +144,58 @@ def test_a_lost_gait_shortens_the_step_and_is_reported():
     assert 0.0 < float(tuned.cycle.indicators.lambda_4) < 1e-3
 
 
+def test_no_branch_that_ends_is_called_a_maximum_inside_all_bounds():
+    bounds = {"damping": (150.0, 400.0)}
+    tuned = tune(vrw.WheelParams(), {"lambda_4_plus": -1.0}, ["damping"], bounds, {})
+    assert tuned.status == TuneStatus.BRANCH_ENDED
+    assert not tuned.active
+    assert tuned.describe()["held by"] == "the end of the branch, no constraint and no bound"
+
+
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
+def test_trials_without_a_finite_objective_are_shortened(bad):
+    """(c - 150)^2 has its least value at 150, beyond which trials meet no number."""
+
+    def objective(cycle):
+        damping = cycle.parameters[PARAMETER_NAMES.index("damping")]
+        return jnp.where(damping > 160.0, bad, -((damping - 150.0) ** 2))
+
+    bounds = {"damping": (100.0, 215.0)}
+    tuned = tune(vrw.WheelParams(damping=110.0), objective, ["damping"], bounds, {})
+    assert tuned.status == TuneStatus.CONVERGED
+    assert float(tuned.params.damping) == pytest.approx(150.0, abs=1e-3)
+    beyond = tuned.path.damping.values > 160.0
+    np.testing.assert_array_equal(beyond, tuned.path.kind.values == TrialKind.NOT_FINITE)
+    assert tuned.n_backtracks == beyond.sum() > 0
+
+
+def test_a_climb_ends_where_the_objective_ceases_to_be_finite():
+    def objective(cycle):
+        damping = cycle.parameters[PARAMETER_NAMES.index("damping")]
+        return jnp.where(damping > 160.0, jnp.nan, damping)
+
+    bounds = {"damping": (100.0, 215.0)}
+    tuned = tune(vrw.WheelParams(damping=110.0), objective, ["damping"], bounds, {}, n_starts=3)
+    assert tuned.status == TuneStatus.BRANCH_ENDED
+    assert np.isfinite(tuned.value)
+    assert 159.99 < float(tuned.params.damping) <= 160.0
+
+
+@pytest.mark.parametrize(
+    ("objective", "sentence"),
+    [
+        (lambda cycle: cycle.speed * jnp.nan, "is nan at the start"),
+        (lambda cycle: cycle.speed + jnp.inf, "is inf at the start"),
+        (lambda cycle: jnp.sqrt(0.0 * cycle.speed), "has a derivative that is not finite"),
+    ],
+)
+def test_a_start_that_is_not_finite_is_refused_in_one_sentence(objective, sentence):
+    bounds = {"damping": (100.0, 215.0)}
+    with pytest.raises(ValueError, match=sentence) as caught:
+        tune(vrw.WheelParams(damping=110.0), objective, ["damping"], bounds, {})
+    assert "\n" not in str(caught.value)
+
+
 def test_functions_of_cycle_and_step_are_objectives_like_names():
     u = np.array([0.7, 0.45, 0.4, 0.55])
 
@@ -235,6 +288,34 @@ def test_constraints_of_a_unilateral_gait_are_lower_bounds_or_ranges():
         parse_margins(vrw.WheelParams(), ["clearance_sls1"], ground)
     with pytest.raises(ValueError, match="holds nothing"):
         parse_margins(vrw.WheelParams(), {"slip": (0.05, 0.0)}, ground)
+
+
+@pytest.mark.parametrize(
+    ("pair", "margins"),
+    [
+        ((None, 0.6), {"-dls_fraction": -0.6}),
+        ((0.2, None), {"dls_fraction": 0.2}),
+        ((0.2, 0.6), {"-dls_fraction": -0.6, "dls_fraction": 0.2}),
+    ],
+)
+def test_none_at_an_end_of_a_constraint_s_range_is_no_bound(pair, margins):
+    finder = make_finder(vrw.ViscoelasticWheel(), 8)
+    assert parse_margins(vrw.WheelParams(), {"dls_fraction": pair}, finder) == margins
+
+
+def test_a_range_without_any_bound_is_refused():
+    finder = make_finder(vrw.ViscoelasticWheel(), 8)
+    with pytest.raises(ValueError, match="bounds nothing"):
+        parse_margins(vrw.WheelParams(), {"dls_fraction": (None, None)}, finder)
+
+
+def test_an_upper_bound_alone_is_kept():
+    bounds = {"damping": (100.0, 215.0)}
+    given = {"dls_fraction": (None, 0.545)}
+    tuned = tune(vrw.WheelParams(damping=120.0), "dls_fraction", ["damping"], bounds, given)
+    assert tuned.value == pytest.approx(0.545, abs=1e-6)
+    (active,) = tuned.active
+    assert (active.name, active.limit) == ("dls_fraction", 0.545)
 
 
 @pytest.mark.slow

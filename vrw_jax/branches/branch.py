@@ -47,13 +47,15 @@ class FixedPoint(NamedTuple):
 class SpecialPoint:
     """Bifurcation, border collision or end of a branch.
 
-    `kind` is "fold", "period_doubling", "neimark_sacker", "border_collision" (the indicator or
-    margin `name` is zero) or "lost" (the order of events changes: `name` is the reason).
+    `kind` is "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision" (the
+    indicator or monitor `name` is zero), "order_of_contacts_changes" (the branch goes on with a
+    kink or a jump) or "lost" (the order of events changes: `name` says which).
 
     - `value`: of the parameter;
-    - `point`: a fixed point next to it, on the valid side of the branch;
-    - `ends_branch`: whether the branch ends here;
-    - `find_cycle`: function that finds the gait there, used by the property `cycle`.
+    - `point`: beside it, on the side that belongs to the branch;
+    - `ends_branch`: whether the branch goes no further;
+    - `find_cycle`: finds the gait there, as the property `cycle`;
+    - `n_multipliers`: multipliers that pass the unit circle there; 0 at other borders.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -68,6 +70,7 @@ class SpecialPoint:
     point: FixedPoint
     ends_branch: bool
     find_cycle: Callable[[], Any] | None = field(default=None, repr=False, compare=False)
+    n_multipliers: int = 0
 
     @functools.cached_property
     def cycle(self) -> Any:
@@ -77,6 +80,9 @@ class SpecialPoint:
     def __str__(self) -> str:
         name = "" if self.name == self.kind else f" {self.name}"
         ends = ", ends the branch" if self.ends_branch else ""
+        usual = 2 if self.kind == "neimark_sacker" else 1
+        if self.n_multipliers > usual:
+            name += f" of {self.n_multipliers} multipliers at once"
         return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
 
     def __repr__(self) -> str:

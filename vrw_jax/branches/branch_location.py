@@ -18,6 +18,23 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import FixedPoint, SpecialPoint
+from vrw_jax.branches.jumps import find_jumps, follow_beyond_jumps
+from vrw_jax.branches.multiplicity import (
+    BRANCH_POINT_KIND,
+    CONTACT_ORDER,
+    MODULI,
+    ORDER_CHANGES,
+    WEIGHTS,
+    ZERO_MARGIN,
+    Found,
+    drop_twins,
+    is_off_circle,
+    is_zero,
+    moduli_of,
+    name_order,
+    quantity_of,
+    with_ranks,
+)
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
     AbstractContinuationProblem,
@@ -57,11 +74,6 @@ READ_BATCH_SIZE = 32
 
 ADMISSIBLE_COLUMN = "sequence"
 """Name of the column that is 1 where a point is admissible, else -1."""
-
-BRANCH_POINT_KIND = "branch_point"
-"""Kind of a point where a multiplier crosses 1 but the branch does not turn back: another branch
-crosses it. The equations are singular there, so the location is only as accurate as the
-continuation steps are short."""
 
 QuantityTable = dict[str, np.ndarray]
 """Named quantities over a batch of points, first axis."""
@@ -104,6 +116,14 @@ class AbstractContinuation(abc.ABC):
         """Return a name for the end of a branch from the first point beyond it."""
         return ADMISSIBLE_COLUMN
 
+    def is_alike(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+        """Return which points beyond a jump are still the branch's, row by row."""
+        return after[ADMISSIBLE_COLUMN] > 0.0
+
+    def describe_end(self, name: str, value: float) -> str:
+        """Return the sentence for an end of a branch, by its border's name."""
+        return f"{name.replace('_', ' ')} at {value:.9g} ends it."
+
     def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
         """Return whether the mesh limits the extent or the accuracy of a branch; `ends` are names
         of ends."""
@@ -124,6 +144,9 @@ class AbstractContinuation(abc.ABC):
         )
         table |= {name: test_functions[:, i] for i, name in enumerate(BIFURCATION_NAMES)}
         table = self.mask_undefined(table, wheel_indices)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            table[BRANCH_POINT_KIND] = table["fold"] / points.fraction_rate
+        table[MODULI] = moduli_of(np.asarray(points.jacobian))
         for name, substitute in self.linear_substitutes.items():
             if substitute in table and name in table:
                 table[_combined_name(name)] = combined_margin(table[name], table[substitute])
@@ -164,8 +187,11 @@ def _continue_both_ways(
     continue_all = (
         arclength.continue_from if continuation.problem.is_traceable else continue_many_from
     )
-    results = continue_all(continuation.problem, continuation.options, *arguments)
-    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, 2, *x.shape[1:]), results)
+    continue_all = functools.partial(continue_all, continuation.problem, continuation.options)
+    results: arclength.ContinuationResult = jax.tree.map(np.asarray, continue_all(*arguments))
+    if continuation.problem.has_kinks:
+        results = follow_beyond_jumps(continuation, continue_all, arguments[0], results)
+    return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), results)
 
 
 @eqx.filter_jit
@@ -282,10 +308,10 @@ def _locate_zeros(
 
     def quantity_at(fractions: np.ndarray, bracket_indices: np.ndarray) -> np.ndarray:
         table = solve_at_fractions(fractions, bracket_indices)[1]
-        return np.array([table[names[k]][i] for i, k in enumerate(bracket_indices)])
+        return np.array([quantity_of(table, names[k])[i] for i, k in enumerate(bracket_indices)])
 
     values_at = lambda row_indices: np.array(
-        [point_table.table[n][i] for n, i in zip(names, row_indices, strict=True)]
+        [quantity_of(point_table.table, n)[i] for n, i in zip(names, row_indices, strict=True)]
     )
     parameter_distance = np.maximum(np.abs(right.p - left.p), LOCATION_ACCURACY)
     tolerances = np.minimum(LOCATION_ACCURACY / parameter_distance, FOLD_BRACKET_FRACTION)
@@ -456,7 +482,15 @@ def _join_ends(
     for valid_range in ranges:
         lower_end, upper_end = (located_ends.get((valid_range.wheel_index, end)) for end in (0, 1))
         if lower_end is not None and lower_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
-            append_points(lower_end.point_beside, valid_range.wheel_index, lower_end.table)
+            # Located the way back: its tangent leads against the branch.
+            back = lower_end.point_beside._replace(
+                fraction_rate=-lower_end.point_beside.fraction_rate
+            )
+            append_points(
+                back,
+                valid_range.wheel_index,
+                lower_end.table | {BRANCH_POINT_KIND: -lower_end.table[BRANCH_POINT_KIND]},
+            )
         append_points(
             take_rows(point_table.points, valid_range.point_indices),
             valid_range.wheel_index,
@@ -469,9 +503,16 @@ def _join_ends(
 
 def _locate_inner_zeros(
     continuation: AbstractContinuation, point_table: _PointTable
-) -> list[tuple[str, _LocatedZero]]:
-    """Locate every change of sign between neighbors on the same branch; return names and zeros."""
-    skipped_names = (ADMISSIBLE_COLUMN, *continuation.linear_substitutes.values())
+) -> list[Found]:
+    """Return every border between neighbours on the same branch, with its name.
+
+    The number is that of the multipliers that pass the unit circle there.
+    """
+    skipped_names = (
+        ADMISSIBLE_COLUMN,
+        BRANCH_POINT_KIND,
+        *continuation.linear_substitutes.values(),
+    )
     names = [
         name
         for name, values in point_table.table.items()
@@ -482,29 +523,78 @@ def _locate_inner_zeros(
         _combined_name(name) if _combined_name(name) in point_table.table else name
         for name in names
     ]
+    # At a branch point itself the sign of the fold's margin is round-off.
+    rows = np.flatnonzero(~(np.abs(point_table.table["fold"]) < ZERO_MARGIN))
     requests, request_names = [], []
-    for left, right, column_index in find_sign_changes(
-        np.stack([point_table.table[name] for name in columns], 1)
+    for i, j, column_index in find_sign_changes(
+        np.stack([point_table.table[name] for name in columns], 1)[rows]
     ):
-        if point_table.wheel_indices[left] == point_table.wheel_indices[right]:
-            requests.append((left, right, columns[column_index]))
+        if point_table.wheel_indices[rows[i]] == point_table.wheel_indices[rows[j]]:
+            requests.append((int(rows[i]), int(rows[j]), columns[column_index]))
             request_names.append(names[column_index])
+    fraction_rates, fold = np.asarray(point_table.points.fraction_rate), point_table.table["fold"]
     for i, (left, right, _) in enumerate(requests):
-        fraction_rates = point_table.points.fraction_rate
         if request_names[i] == "fold" and fraction_rates[left] * fraction_rates[right] > 0.0:
             request_names[i] = BRANCH_POINT_KIND
-    named_zeros = list(
-        zip(request_names, _locate_zeros(continuation, point_table, requests), strict=True)
-    )
-    return [
-        (n, z)
-        for n, z in named_zeros
-        if n != "neimark_sacker" or has_unit_circle_pair(np.asarray(z.point_beside.jacobian[0]))
+    for left, right in _neighbours(point_table, rows):
+        # Along the side branch of a pitchfork the margin touches zero where the parameter turns.
+        if fold[left] * fold[right] > 0.0 and fraction_rates[left] * fraction_rates[right] < 0.0:
+            requests.append((left, right, BRANCH_POINT_KIND))
+            request_names.append(BRANCH_POINT_KIND)
+    jumps: list[tuple[int, int]] = []
+    if continuation.problem.has_kinks:
+        states = np.asarray(jax.vmap(continuation.problem.section_state)(point_table.points.z))
+        shares = point_table.points.p / (continuation.bounds[1] - continuation.bounds[0])
+        jumps = find_jumps(
+            states, shares, fraction_rates, _neighbours(point_table, np.arange(len(fold)))
+        )
+    order = point_table.table.get(CONTACT_ORDER, np.zeros(len(fold)))
+    for left, right in _neighbours(point_table, np.arange(len(fold))):
+        if order[left] != order[right]:
+            # Where the first order ends, and where the last one begins: in between may be others.
+            requests += [(left, right, name_order(order[i])) for i in (left, right)]
+            request_names += [ORDER_CHANGES] * 2
+    across = [any(left <= i and j <= right for i, j in jumps) for left, right, _ in requests]
+    requests = [one for one, leaves in zip(requests, across, strict=True) if not leaves]
+    request_names = [name for name, leaves in zip(request_names, across, strict=True) if not leaves]
+    named_zeros = [
+        (name, zero, WEIGHTS.get(name, 0))
+        for name, zero in zip(
+            request_names, _locate_zeros(continuation, point_table, requests), strict=True
+        )
+        if name not in WEIGHTS or is_zero(point_table.table, zero)
     ]
+    named_zeros = [
+        (name, zero, count)
+        for name, zero, count in named_zeros
+        if name != "neimark_sacker"
+        or has_unit_circle_pair(np.asarray(zero.point_beside.jacobian[0]))
+    ]
+    named_zeros += [(ORDER_CHANGES, _zero_at_jump(point_table, pair), 0) for pair in jumps]
+    pairs = _neighbours(point_table, np.flatnonzero(is_off_circle(point_table.table[MODULI])))
+    pairs = [(a, b) for a, b in pairs if not any(a <= i and j <= b for i, j in jumps)]
+    search = functools.partial(_locate_zeros, continuation, point_table)
+    return with_ranks(point_table.table, fraction_rates, pairs, drop_twins(named_zeros), search)
+
+
+def _neighbours(pieces: _PointTable, rows: np.ndarray) -> list[tuple[int, int]]:
+    """Return pairs of the points `rows` that follow each other on the same branch."""
+    pairs = zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)
+    return [(i, j) for i, j in pairs if pieces.wheel_indices[i] == pieces.wheel_indices[j]]
+
+
+def _zero_at_jump(pieces: _PointTable, pair: tuple[int, int]) -> _LocatedZero:
+    """Return the border at a jump: the point at which the branch stalled, for lack of steps."""
+    i, j = pair
+    p, last = pieces.points.p, len(pieces.points.p) - 1
+    stalled_first = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last)] - p[j])
+    place = 0 if stalled_first else 1
+    point, table = take_rows((pieces.points, pieces.table), slice(pair[place], pair[place] + 1))
+    return _LocatedZero((i, j, ORDER_CHANGES), float(p[pair[place]]), float(place), point, table)
 
 
 def _classify(continuation: AbstractContinuation, name: str) -> str:
-    if name in (*BIFURCATION_NAMES, BRANCH_POINT_KIND):
+    if name in WEIGHTS or name == ORDER_CHANGES:
         return name
     return "border_collision" if continuation.is_margin(name) else "lost"
 
@@ -577,7 +667,7 @@ def continue_and_locate(
     inner_zeros = _locate_inner_zeros(continuation, all_points)
 
     def make_special_point(
-        name: str, zero: _LocatedZero, wheel_index: int, ends_branch: bool
+        name: str, zero: _LocatedZero, wheel_index: int, ends_branch: bool, count: int = 0
     ) -> SpecialPoint:
         point_beside = take_rows(zero.point_beside, 0)
         section = np.asarray(continuation.problem.section_state(jax.device_put(point_beside.z)))
@@ -591,16 +681,17 @@ def continue_and_locate(
             point,
             ends_branch,
             make_cycle(wheel_index, point_beside),
+            count,
         )
 
     for valid_range in ranges:
         point_indices = np.flatnonzero(all_points.wheel_indices == valid_range.wheel_index)
         positioned_points = [
             (
-                located_zero.bracket[0] + located_zero.fraction,
-                make_special_point(name, located_zero, valid_range.wheel_index, False),
+                located_zero.bracket[0] + located_zero.place,
+                make_special_point(name, located_zero, valid_range.wheel_index, False, count),
             )
-            for name, located_zero in inner_zeros
+            for name, located_zero, count in inner_zeros
             if located_zero.bracket[0] in point_indices
         ]
         end_reasons = []
@@ -617,9 +708,7 @@ def continue_and_locate(
             positioned_points.append(
                 (point_indices[0] - 1.0 if end == 0 else point_indices[-1] + 1.0, end_point)
             )
-            end_reasons.append(
-                f"{end_point.name.replace('_', ' ')} at {end_point.value:.9g} ends it."
-            )
+            end_reasons.append(continuation.describe_end(end_point.name, end_point.value))
         special_points = tuple(b for _, b in sorted(positioned_points, key=lambda pair: pair[0]))
         table = take_rows(all_points.table, point_indices)
         end_names = tuple(b.name for b in special_points if b.ends_branch)

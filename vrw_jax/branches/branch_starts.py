@@ -17,10 +17,11 @@ from vrw_jax.branches.continuation_problems import (
     GroundProblem,
     ReturnMapProblem,
 )
+from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import ContinuationPoint
 from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycles, make_finder, transfer_to_mesh
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.simulation import walk_toward_gait
 from vrw_jax.wheel import WheelParams
 
@@ -49,6 +50,34 @@ class BranchStart(NamedTuple):
     finer_options: CycleOptions | None = None  # options with a finer mesh, None without a mesh
 
 
+@dataclasses.dataclass(frozen=True)
+class FindLimitCycle:
+    """Function without arguments that finds the gait at a border; its class lets it be pickled.
+
+    - `finder`, `model`: of the gaits that were followed;
+    - `name`: of the parameter along which they were;
+    - `wheel`, `guess`: the wheel, and its gait where the branch begins;
+    - `z`, `p`: the point beside the border.
+    """
+
+    finder: Any
+    model: AbstractWheel
+    name: str
+    wheel: WheelParams
+    guess: LimitCycle
+    z: CollocationSolution
+    p: Any
+
+    def __call__(self) -> LimitCycle:
+        """Return the gait at the border."""
+        wheel, guess = jax.device_put((self.wheel, self.guess))
+        located = guess.located._replace(solution=jax.tree.map(jnp.asarray, self.z))
+        guess = dataclasses.replace(guess, located=located, system=self.finder.system)
+        _, wheel = self.model.with_parameter(wheel, self.name, jnp.asarray(self.p))
+        found: LimitCycle = self.finder.cycle(wheel, guess)
+        return found
+
+
 def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
     """Return starts from limit cycles by collocation, given or found."""
     params, name, period_n = request.params, request.parameter_name, request.period_n
@@ -67,18 +96,9 @@ def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
     )
     system = finder.system
 
-    def make_cycle(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
-        def find_cycle_at_point() -> LimitCycle:
-            guess = jax.tree.map(lambda x: x[wheel_index], start_cycle)
-            collocation_state = guess.collocation_state._replace(
-                solution=jax.tree.map(jnp.asarray, point.z)
-            )
-            guess = dataclasses.replace(guess, collocation_state=collocation_state, system=system)
-            wheel = jax.tree.map(lambda x: x[wheel_index], params)
-            _, wheel = request.model.with_parameter(wheel, name, jnp.asarray(point.p))
-            return finder.find_cycle(wheel, guess)
-
-        return find_cycle_at_point
+    def make_cycle(wheel_index: int, point: ContinuationPoint) -> FindLimitCycle:
+        guess, wheel = take_rows((start_cycle, params), wheel_index)
+        return FindLimitCycle(finder, request.model, name, wheel, guess, point.z, point.p)
 
     return BranchStart(
         CollocationProblem(system=system, parameter_name=name, additional_quantities=None),

@@ -27,7 +27,7 @@ from vrw_jax.branches.branch_location import (
     continue_and_locate,
 )
 from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest, start_from_walks
-from vrw_jax.branches.continuation_problems import BranchWheel
+from vrw_jax.branches.continuation_problems import SLIDES_AWAY, BranchWheel
 from vrw_jax.continuation import (
     ArclengthOptions,
     ContinuationPoint,
@@ -80,6 +80,10 @@ DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
 COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of an end where the mesh is too coarse: the gaits do not repeat in a walk."""
 
+ALIKE = 0.01
+"""Relative change of period and step length up to which a gait beyond a jump is the branch's;
+chosen because two impacts that change places move both by 1e-4."""
+
 REFINE_ABOVE_BRANCH_MESH_ERROR, MAX_BRANCH_REFINEMENTS = 1e-8, 3
 """Estimate of the mesh's error on a branch above which a finer mesh is used, and largest number of
 refinements."""
@@ -94,7 +98,7 @@ class GaitContinuation(AbstractContinuation):
     step_options: StepOptions
     n_legs: int
 
-    ending_quantities: ClassVar[tuple[str, ...]] = BRANCH_ENDING_QUANTITIES
+    ending_quantities: ClassVar[tuple[str, ...]] = (*BRANCH_ENDING_QUANTITIES, SLIDES_AWAY)
     linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
     """Margins that vanish as a cube, with the quantity that vanishes at the same point linearly. A
     foot that takes off less steeply dips less deeply, until it rises immediately. A solver cannot
@@ -114,6 +118,21 @@ class GaitContinuation(AbstractContinuation):
     def is_admissible(self, table: QuantityTable) -> np.ndarray:
         return (table["outcome"] == Outcome.STEPPED) & (
             table["closure"] <= STATE_AGREEMENT_TOLERANCE
+        )
+
+    def is_alike(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+        """Return which gaits beyond a jump have the period and step length of those before."""
+        alike = super().is_alike(before, after)
+        for name in ("period", "step_length"):
+            alike &= np.abs(after[name] - before[name]) <= ALIKE * np.abs(before[name])
+        return alike
+
+    def describe_end(self, name: str, value: float) -> str:
+        if name != SLIDES_AWAY:
+            return super().describe_end(name, value)
+        return (
+            f"At {value:.9g} the friction coefficient is the tangent of the slope: with less no "
+            "contact carries the weight along the slope, and no gait repeats."
         )
 
     def is_margin(self, name: str) -> bool:
@@ -159,8 +178,8 @@ def continue_branch(
 
     For other models the gaits are fixed points of their return map, as accurate as `step_options`.
     With unilateral contact `name` may be "friction" too. The start is then a `ReturnMapCycle` or,
-    without one, the end of a walk. A branch continues where the order of events changes, with a
-    kink. "auto" uses the model that is selected for the start. A violated margin of the paper's
+    without one, the end of a walk. A branch continues where the order of contacts changes, with a
+    kink or a jump that is marked as a special point, and ends where friction is tan(slope). "auto" uses the model that is selected for the start. A violated margin of the paper's
     model is a special point with the name of the margin, beyond which unilateral contact is
     selected.
 

@@ -7,6 +7,7 @@ it in forward mode.
 """
 
 import abc
+import zlib
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from vrw_jax.branches.multiplicity import CONTACT_ORDER
 from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.continuation import (
@@ -37,7 +39,7 @@ from vrw_jax.cycles import (
     init_search_flags,
     solve_linear_systems,
 )
-from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models import AbstractStep, AbstractWheel, AnySectionState
 from vrw_jax.numerics import Scalar, StepOptions, unbatch
 from vrw_jax.wheel import (
@@ -47,6 +49,13 @@ from vrw_jax.wheel import (
     stack_parameters,
     wheel_from_parameters,
 )
+
+SLIDES_AWAY = "friction_above_slope"
+"""Column that is the friction coefficient above the tangent of the slope: the least with a gait."""
+
+LEAST_SURPLUS = 1e-9
+"""Share of the slope's tangent by which friction must exceed it; chosen because at the tangent
+itself gaits of every speed repeat, to the round-off of friction."""
 
 
 class BranchWheel(NamedTuple):
@@ -267,6 +276,10 @@ class ReturnMapProblem(AbstractGaitProblem):
     def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
         return interpolate_states(left, right, fraction, self.n_coordinates)
 
+    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
+        """Whether the codes of both are the same."""
+        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
+
     def read_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
@@ -285,6 +298,7 @@ class GroundProblem(AbstractGaitProblem):
     n_legs: int = eqx.field(static=True)
 
     is_traceable: ClassVar[bool] = False
+    has_kinks: ClassVar[bool] = True
 
     @property
     def n_steps(self) -> int:
@@ -340,6 +354,10 @@ class GroundProblem(AbstractGaitProblem):
     def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
         return interpolate_states(left, right, fraction, self.n_coordinates)
 
+    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
+        """Whether the codes of both are the same."""
+        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
+
     def read_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
@@ -355,7 +373,43 @@ class GroundProblem(AbstractGaitProblem):
         period = self._period_map(wheels, points.p).evaluate_period(
             options, np.asarray(points.z), False, False
         )
-        return _measure_periods(period.steps, points.z) | {"section_state": jnp.asarray(points.z)}
+        beyond = {
+            "section_state": jnp.asarray(points.z),
+            CONTACT_ORDER: order_of_contacts(period.steps, self.n_legs),
+            SLIDES_AWAY: np.asarray(self._grip(wheels, points.p)),
+        }
+        return _measure_periods(period.steps, points.z) | beyond
+
+    def _grip(self, wheels: BranchWheel, p: Array) -> Array:
+        """Return how much friction exceeds what the weight along the slope needs; one or many.
+
+        Over a period the ground's tangential impulse is the weight's along the slope, and friction
+        bounds it by the normal one: without a surplus no gait repeats.
+        """
+
+        def one(wheel: BranchWheel, p: Array) -> Array:
+            model: Any
+            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+            return model.friction - jnp.tan(params.slope) * (1.0 + LEAST_SURPLUS)
+
+        return one(wheels, p) if jnp.ndim(p) == 0 else jax.vmap(one)(wheels, p)
+
+    def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
+        """Whether friction can carry the weight along the slope."""
+        return jnp.all(jnp.isfinite(z)) & (self._grip(wheel, p) > 0.0)
+
+
+def order_of_contacts(steps: Any, n_legs: int) -> np.ndarray:
+    """Return a number for each order in which the contacts of many periods come.
+
+    It stands for the modes that occur, the counts of events and the feet's modes at the end.
+    """
+    occurring = np.asarray(steps.mode_durations) > 0.0
+    codes = np.asarray(steps.section_state)[..., -n_legs:]
+    counts = np.stack([np.asarray(steps.events), np.asarray(steps.impacts)], -1)
+    rows = [x.reshape(len(x), -1).astype(np.int64) for x in (occurring, codes, counts)]
+    orders = [zlib.crc32(row.tobytes()) for row in np.concatenate(rows, 1)]
+    return np.array(orders, float)
 
 
 @jax.jit
@@ -408,6 +462,8 @@ def combine_step_measures(
             measures[name] = values[0]
         elif name == "outcome":
             measures[name] = values[jnp.argmax(values != Outcome.STEPPED)]
+        elif MEASURES[name].is_ratio:
+            measures[name] = jnp.mean(values, 0)
         else:
             measures[name] = jnp.sum(values, 0)
     period = jnp.where(measures["period"] > 0.0, measures["period"], 1.0)

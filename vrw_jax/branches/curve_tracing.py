@@ -15,7 +15,6 @@ import numpy as np
 
 from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
-    BRANCH_POINT_KIND,
     AbstractContinuation,
     BranchData,
     QuantityTable,
@@ -40,6 +39,7 @@ from vrw_jax.branches.gait_test_functions import (
     quantity_group_of,
     test_quantity_of,
 )
+from vrw_jax.branches.multiplicity import BRANCH_POINT_KIND
 from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,

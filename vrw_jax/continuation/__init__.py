@@ -17,6 +17,7 @@ from vrw_jax.continuation.batched_continuation import (
     solve_many_on_planes,
     solve_on_plane,
 )
+from vrw_jax.continuation.crossings import ON_CIRCLE_TOLERANCE
 from vrw_jax.continuation.fixed_points import (
     FixedPointResult,
     solve_fixed_point,
@@ -25,6 +26,7 @@ from vrw_jax.continuation.fixed_points import (
 from vrw_jax.continuation.floquet import floquet_multipliers
 from vrw_jax.continuation.sign_changes import (
     BIFURCATION_NAMES,
+    SMALLEST_ANGLE,
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,

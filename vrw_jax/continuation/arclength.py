@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.continuation.crossings import Doubt, is_accounted_for
 from vrw_jax.numerics import Scalar, StatusCode, tree_where, value_and_jacobian
 from vrw_jax.validation import (
     check_int,
@@ -75,6 +76,11 @@ class ArclengthOptions:
             )
 
 
+KINK_STEPS = 8.0
+"""Smallest steps below which a branch with kinks may turn at once; chosen because three halvings
+are then left for where Newton's method fails between the pieces."""
+
+
 class NewtonStep(NamedTuple):
     """Correction and tangent of Newton's method at a trial point (z, p)."""
 
@@ -92,6 +98,12 @@ class AbstractContinuationProblem(eqx.Module):
     """Whether `linearize` can be compiled into a loop; otherwise it is called for many points at
     once from outside of compiled code."""
 
+    has_multipliers: ClassVar[bool] = True
+    """Whether the Jacobians are those of the equations that are followed."""
+
+    has_kinks: ClassVar[bool] = False
+    """Whether a branch may have kinks, where its tangent jumps."""
+
     @abc.abstractmethod
     def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
         """Return correction, tangent and Jacobian; they are not finite where the map
@@ -107,6 +119,10 @@ class AbstractContinuationProblem(eqx.Module):
         two points.
         """
         return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
+
+    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
+        """Whether the branch has no kink between two points, as far as these show."""
+        return jnp.asarray(True)
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
         """Return the norm of a correction, its largest entry, which is compared with
@@ -303,6 +319,10 @@ def _predict_point(
     displacement = jnp.append(
         section_state - problem.section_state(previous_point.z), fraction - previous_fraction
     )
+    has_two_points = has_two_points & problem.is_smooth_between(previous_point.z, current_point.z)
+    has_two_points = has_two_points & (
+        displacement @ displacement > (1e-9 * ds) ** 2
+    )  # after a kink both are one, to round-off
     chord = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
 
     def extrapolate(a: Array, da: Array, b: Array, db: Array) -> Array:
@@ -335,6 +355,7 @@ class ContinuationState(NamedTuple):
     first_point: ContinuationPoint  # of the branch, if it exists
     ds: Scalar
     trial: _TrialPoint
+    doubt: Doubt
     iteration: Int[Array, ""]
     n_points: Int[Array, ""]
     status: Int[Array, ""]
@@ -348,7 +369,8 @@ class _TrialAssessment(NamedTuple):
 
     is_accepted: Bool[Array, ""]
     has_failed: Bool[Array, ""]
-    fraction_rate: Scalar  # along the branch, in the direction of the continuation
+    is_kink: Bool[Array, ""]  # accepted, although the branch turns by more than a step may
+    fraction_rate: Scalar  # along the branch, the way it is followed
 
 
 def _assess_trial(
@@ -375,11 +397,34 @@ def _assess_trial(
     alignment = jnp.where(is_first, direction, alignment)
     norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
     is_straight = is_first | (jnp.abs(alignment) >= norm * jnp.cos(options.max_turn_angle))
-    is_accepted = is_converged & is_straight
+    # No step is short enough for a kink: it is passed once the step is all but the shortest.
+    is_kink = is_converged & ~is_straight & (state.ds < KINK_STEPS * options.min_ds)
+    is_kink = is_kink & problem.has_kinks
+    is_accepted = is_converged & (is_straight | is_kink)
     has_failed = ~is_accepted & (
         ~is_valid | is_converged | (state.iteration + 1 >= options.max_newton_iterations)
     )
-    return _TrialAssessment(is_accepted, has_failed, jnp.where(alignment >= 0.0, 1.0, -1.0) / norm)
+    return _TrialAssessment(
+        is_accepted, has_failed, is_kink, jnp.where(alignment >= 0.0, 1.0, -1.0) / norm
+    )
+
+
+def _is_doubtful(
+    problem: AbstractContinuationProblem,
+    options: ArclengthOptions,
+    state: ContinuationState,
+    assessment: _TrialAssessment,
+    reached: ContinuationPoint,
+) -> Bool[Array, ""]:
+    """Whether an accepted trial may lie on another branch, and a shorter step may show it."""
+    if not problem.has_multipliers:
+        return jnp.asarray(False)
+    turns_back = state.current_point.fraction_rate * reached.fraction_rate < 0.0
+    explained = is_accounted_for(state.current_point.jacobian, reached.jacobian, turns_back)
+    open_ = (
+        assessment.is_accepted & (state.n_points > 0) & ~state.doubt.is_over & reached.is_admissible
+    )
+    return open_ & ~explained
 
 
 def _choose_next_ds(
@@ -427,10 +472,8 @@ def _update_status(
     next_length: Scalar,
     is_closed: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Return whether and why the branch ends at this trial; `next_length` is the next step's
-    length.
-    """
-    is_accepted, has_failed, _ = assessment
+    """Whether and why it ends with the trial as judged; `ahead`: length of what follows."""
+    is_accepted, has_failed = assessment.is_accepted, assessment.has_failed
     n_points, status = state.n_points + is_accepted, state.status
     for has_occurred, code in (
         (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
@@ -464,16 +507,9 @@ def _init_branch(
         ConstraintPlane(x, fraction, jnp.zeros_like(x), zero + 1.0), z, fraction, zero, false
     )
     running = zero_count + int(ContinuationStatus.RUNNING)
+    doubt, first_step = Doubt(zero, false), zero + options.initial_ds
     return ContinuationState(
-        point,
-        point,
-        point,
-        zero + options.initial_ds,
-        trial,
-        zero_count,
-        zero_count,
-        running,
-        zero_count,
+        point, point, point, first_step, trial, doubt, zero_count, zero_count, running, zero_count
     )
 
 
@@ -538,15 +574,25 @@ def iterate_branches(
         new_point = ContinuationPoint(
             corrector.z, p, tangent, assessment.fraction_rate, corrector.jacobian, is_admissible
         )
+        doubtful = _is_doubtful(problem, options, state, assessment, new_point)
+        assessment = assessment._replace(
+            is_accepted=assessment.is_accepted & ~doubtful,
+            has_failed=assessment.has_failed | doubtful,
+        )
         current_point = tree_where(assessment.is_accepted, new_point, state.current_point)
         first_point = tree_where(
             assessment.is_accepted & (state.n_points == 0), new_point, state.first_point
         )
         previous_point = tree_where(
-            assessment.is_accepted, state.current_point, state.previous_point
-        )
+            assessment.is_kink, new_point, state.current_point
+        )  # none that a cubic could lead from
+        previous_point = tree_where(assessment.is_accepted, previous_point, state.previous_point)
         n_points = state.n_points + assessment.is_accepted
-        ds = _choose_next_ds(options, state, assessment)
+        ds, doubt = (
+            _choose_next_ds(options, state, assessment),
+            state.doubt.raised(doubtful, state.ds),
+        )
+        doubt, ds = doubt.resolved(assessment.is_accepted, ds, options.min_ds)
         next_trial = _predict_point(
             problem, previous_point, current_point, n_points > 1, ds, bounds
         )
@@ -561,7 +607,7 @@ def iterate_branches(
         iteration = jnp.where(is_finished, 0, state.iteration + 1)
         counters = n_points, status, state.n_linearizations + 1
         next_state = ContinuationState(
-            previous_point, current_point, first_point, ds, next_trial, iteration, *counters
+            previous_point, current_point, first_point, ds, next_trial, doubt, iteration, *counters
         )
         return next_state, new_point, assessment.is_accepted
 

@@ -99,13 +99,22 @@ def iterate_plane_solve(
 
 
 def finish_plane_solve(
-    problem: AbstractContinuationProblem, args: Any, bounds: Array, state: PlaneSolveState
+    problem: AbstractContinuationProblem,
+    args: Any,
+    bounds: Array,
+    plane: ConstraintPlane,
+    state: PlaneSolveState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point of a finished solve, and whether it converged."""
+    """The point with its tangent, which leads the way that the plane's row points."""
     corrector, p = state.corrector, parameter_from_fraction(state.corrector.fraction, bounds)
-    is_admissible = problem.is_admissible(args, corrector.z, p)
+    is_admissible, by_share = (
+        problem.is_admissible(args, corrector.z, p),
+        problem.section_state(corrector.tangent),
+    )
+    ahead = plane.normal_section @ by_share + plane.normal_fraction
+    slope = jnp.where(ahead >= 0.0, 1.0, -1.0) / jnp.sqrt(1.0 + by_share @ by_share)
     return ContinuationPoint(
-        corrector.z, p, (), jnp.ones_like(p), corrector.jacobian, is_admissible
+        corrector.z, p, (), slope, corrector.jacobian, is_admissible
     ), state.n_converged >= 1
 
 
@@ -132,9 +141,8 @@ def solve_on_plane(
         return iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
 
     needs_more = functools.partial(needs_iteration, options)
-    return finish_plane_solve(
-        problem, args, bounds, lax.while_loop(needs_more, iterate_once, init_plane_solve(z, plane))
-    )
+    state = lax.while_loop(needs_more, iterate_once, init_plane_solve(z, plane))
+    return finish_plane_solve(problem, args, bounds, plane, state)
 
 
 def continue_many_from(
@@ -197,7 +205,7 @@ def solve_many_on_planes(
             problem, batch_args, bounds, state.corrector.z, state.corrector.fraction, is_open
         )
         state = _iterate_plane_solves(problem, options, bounds, planes, state, newton_step)
-    return _finish_plane_solves(problem, batch_args, bounds, state)
+    return _finish_plane_solves(problem, batch_args, bounds, planes, state)
 
 
 _is_active_jit: Any = eqx.filter_jit(is_active)
@@ -208,11 +216,10 @@ _needs_iteration_jit: Any = eqx.filter_jit(needs_iteration)
 
 @eqx.filter_jit
 def _finish_plane_solves(
-    problem: AbstractContinuationProblem, batch_args: Any, bounds: Array, state: PlaneSolveState
+    problem: AbstractContinuationProblem, batch_args: Any, bounds: Array, *of: Any
 ) -> Any:
-    return jax.vmap(lambda args, state: finish_plane_solve(problem, args, bounds, state))(
-        batch_args, state
-    )
+    one = lambda args, plane, state: finish_plane_solve(problem, args, bounds, plane, state)
+    return jax.vmap(one)(batch_args, *of)
 
 
 @eqx.filter_jit

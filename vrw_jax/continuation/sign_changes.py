@@ -36,6 +36,11 @@ def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     return values
 
 
+SMALLEST_ANGLE = 1e-3
+"""Imaginary part below which multipliers on the unit circle count as real; chosen because three
+equal real ones are computed with imaginary parts of 1e-5."""
+
+
 def has_unit_circle_pair(jacobian: np.ndarray) -> bool:
     """Return whether a complex pair of multipliers lies on the unit circle.
 
@@ -43,9 +48,8 @@ def has_unit_circle_pair(jacobian: np.ndarray) -> bool:
     bifurcation.
     """
     values = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
-    return bool(
-        np.any((np.abs(np.abs(values) - 1.0) < UNIT_CIRCLE_TOLERANCE) & (values.imag != 0.0))
-    )
+    is_pair = np.abs(values.imag) > SMALLEST_ANGLE
+    return bool(np.any((np.abs(np.abs(values) - 1.0) < UNIT_CIRCLE_TOLERANCE) & is_pair))
 
 
 class SignChange(NamedTuple):

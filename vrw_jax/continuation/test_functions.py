@@ -6,7 +6,7 @@ folds.
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,6 +77,8 @@ class TestFunctionCurve(AbstractContinuationProblem):
 
     test_function: AbstractTestFunction
     bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
+
+    has_multipliers: ClassVar[bool] = False
 
     def second_parameter(self, z: TestFunctionPoint) -> Elementwise:
         """Return the second parameter at a point of the curve."""

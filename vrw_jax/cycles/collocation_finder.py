@@ -30,7 +30,7 @@ from vrw_jax.cycles.limit_cycle_result import (
     transfer_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES, WITH_DERIVATIVES
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
 from vrw_jax.simulation import validate_arguments
@@ -54,10 +54,9 @@ class CollocationFinder(AbstractGaitFinder):
 
     options_type: ClassVar[type] = CycleOptions
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(CYCLE_MEASURE_FUNCTIONS)
-    readable_measures: ClassVar[tuple[str, ...]] = (
-        *cycle_measures, "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
-        *(n for n in MARGIN_MEASURES if n not in CYCLE_MEASURE_FUNCTIONS),
-    )  # fmt: skip
+    readable_measures: ClassVar[tuple[str, ...]] = tuple(
+        dict.fromkeys((*cycle_measures, *WITH_DERIVATIVES, *MARGIN_MEASURES))
+    )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         n for n in readable_measures if not MEASURES[n].dimension
     )

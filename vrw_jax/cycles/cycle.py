@@ -22,6 +22,10 @@ from vrw_jax.printing import (
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
+SAME_STATE_TOLERANCE = 1e-7
+"""Relative distance below which two section states of a cycle are the same one; chosen because it
+is ten times what the two computations of a gait may differ by (`finder.AGREEMENT`)."""
+
 
 class AbstractCycle(AbstractPrintable):
     """Gait that repeats after `period_n` steps. Batched under vmap: every field gains the batch
@@ -52,6 +56,26 @@ class AbstractCycle(AbstractPrintable):
     @abc.abstractmethod
     def warm_start(self) -> Any:
         """Return the start of a search for a neighbor's gait."""
+
+    @property
+    @abc.abstractmethod
+    def step_ends(self) -> Array:
+        """Section state at the end of each step; the last axes are steps and numbers."""
+
+    @property
+    def minimal_period(self) -> Int[Array, "..."]:
+        """Return the fewest steps after which the gait repeats; 0 where there is none.
+
+        It divides `period_n`: a gait of one step also repeats after two.
+        """
+        ends, n = self.step_ends, self.period_n
+        scale = jnp.max(jnp.abs(ends), (-2, -1))
+        tolerance = jnp.maximum(SAME_STATE_TOLERANCE, 100.0 * jnp.finfo(ends.dtype).eps)
+        fewest = jnp.full(self.outcome.shape, n, jnp.int32)
+        for steps in (steps for steps in range(n - 1, 0, -1) if n % steps == 0):
+            distance = jnp.max(jnp.abs(jnp.roll(ends, steps, -2) - ends), (-2, -1))
+            fewest = jnp.where(distance <= tolerance * scale, steps, fewest)
+        return jnp.where(self.found, fewest, 0)
 
     def replace_missing_by_nan(self, params: WheelParams) -> Any:
         """Return the cycle with NaN in place of zeros where there is none, also in derivatives with
@@ -166,6 +190,8 @@ class AbstractCycle(AbstractPrintable):
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
         spectral_radius, multipliers_text = format_multipliers(np.asarray(self.monodromy_value))
         period_text = f"{self.period_n} steps" if self.period_n > 1 else "one step"
+        if (fewest := int(self.minimal_period)) < self.period_n:
+            period_text += f"; its minimal period is {fewest}"
         stability_text = "stable" if spectral_radius < 1.0 else "unstable"
         return [
             ("gait", f"{stability_text}, repeats after {period_text}"),

@@ -93,6 +93,10 @@ class LimitCycle(AbstractCycle):
         return self.system.period_n
 
     @property
+    def step_ends(self) -> Array:
+        return jnp.asarray(self.collocation_state.ends)
+
+    @property
     def warm_start(self) -> CollocationState:
         return self.collocation_state
 

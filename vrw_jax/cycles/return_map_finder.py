@@ -17,11 +17,15 @@ from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     BranchPoint,
     Gait,
+    GaitMeasures,
     Values,
+    measure_from_cycle,
+    measure_from_gait,
     move_derivative_axis_first,
     value_and_tangents,
 )
 from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.measures import SHARED_STEP_MEASURE_NAMES, WITH_DERIVATIVES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
 from vrw_jax.printing import TextRow, format_numbers
@@ -90,6 +94,10 @@ class ReturnMapCycle(AbstractCycle):
     def margins(self) -> Any:
         """Return the margins of each step."""
         return self._squeeze_steps(self.steps.margins)
+
+    @property
+    def step_ends(self) -> Array:
+        return jnp.asarray(self.steps.section_state)
 
     @property
     def warm_start(self) -> Array:
@@ -204,11 +212,21 @@ class ReturnMapFinder(AbstractReturnMapFinder):
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
         n for n in CYCLE_MEASURE_FUNCTIONS if n != "takeoff_acceleration"
     )
-    differentiable_measures: ClassVar[tuple[str, ...]] = cycle_measures
+    differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
+        dict.fromkeys(
+            (*cycle_measures, *(n for n in SHARED_STEP_MEASURE_NAMES if n in WITH_DERIVATIVES))
+        )
+    )
     default_measures: ClassVar[tuple[str, ...]] = tuple(
         n for n in cycle_measures if n != "spectral_margin"
     )
-    readable_measures: ClassVar[tuple[str, ...]] = cycle_measures
+    readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
+
+    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
+        if set(names) <= set(self.cycle_measures):
+            return measure_from_cycle(self, values, guess, names)
+        start = self.initial_guess(values) if guess is None else guess
+        return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
 
     @eqx.filter_jit
     def find_gait(self, values: Values, guess: Array) -> Gait:

@@ -60,7 +60,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
     """Draw the objective over the evaluated gaits."""
     number, value = path.evaluation.values, path.objective.values
-    is_gait_lost = path.kind.values == TrialKind.LOST
+    is_gait_lost = np.isin(path.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
     axes.plot(number[~is_gait_lost], value[~is_gait_lost], color=DARK_GRAY, linewidth=0.7, zorder=1)
     for is_feasible, fill, text in (
         (True, BLUE, "keeps the constraints"),
@@ -72,7 +72,7 @@ def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
         )
     if is_gait_lost.any():
         for i, evaluation in enumerate(number[is_gait_lost]):
-            legend_text = "gait lost, step shortened" if i == 0 else None
+            legend_text = "gait or finite value lost, step shortened" if i == 0 else None
             axes.axvline(evaluation, color=ORANGE, linewidth=0.8, linestyle=":", label=legend_text)
     axes.set_ylabel(format_axis_label(path.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)

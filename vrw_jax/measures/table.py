@@ -22,7 +22,9 @@ class Measure:
     """A named quantity; `unit` is "1" for a pure number, `equation` is the paper's, "" if there is
     none.
 
-    `violation` is a clause with the consequence of a negative value, "" if there is none.
+    `breaks` is a clause: what happens where it is negative, "" where nothing does. `is_shared`: the
+    steps of every model have it. `is_code`: a whole number without derivatives. `is_ratio`: the
+    mean and not the sum of several steps counts.
     """
 
     name: str
@@ -35,6 +37,9 @@ class Measure:
         ""  # "leg": one value for each of the locked legs 3..n, of `CONTACT_MEASURES` for each leg
     )
     violation: str = ""
+    is_shared: bool = False
+    is_code: bool = False
+    is_ratio: bool = False
 
     @property
     def mathtext(self) -> str:
@@ -78,25 +83,30 @@ def _make_table(*measures: Measure) -> dict[str, Measure]:
 # fmt: off
 STEP_MEASURES = _make_table(
     Measure("dls_fraction", "1", "T_DLS/T", "DLS fraction",
-            "Share of the step spent in double-limb support."),
-    Measure("period", "s", "T", "step period", "Duration of the step, touchdown to touchdown."),
-    Measure("speed", "m/s", "v", "walking speed", "Step length over period, along the slope."),
+            "Share of the step spent in double-limb support.", is_shared=True, is_ratio=True),
+    Measure("period", "s", "T", "step period", "Duration of the step, touchdown to touchdown.",
+            is_shared=True),
+    Measure("speed", "m/s", "v", "walking speed", "Step length over period, along the slope.",
+            is_shared=True, is_ratio=True),
     Measure("step_length", "m", "D", "step length",
-            "Distance between both feet at the landing that opens the step."),
+            "Distance between both feet at the landing that opens the step.", is_shared=True),
     Measure("duration_dls", "s", "T_DLS", "duration of DLS",
-            "Time with both feet on the ground.", "Section 3.3.1"),
+            "Time with both feet on the ground.", "Section 3.3.1", is_shared=True),
     Measure("duration_sls1", "s", "T_SLS-I", "duration of SLS-I",
             "Time from take-off of Leg 2 until it is at its stopper.", "Section 3.3.2"),
     Measure("duration_sls2", "s", "T_SLS-II", "duration of SLS-II",
             "Time from the stopper of Leg 2 to the next touchdown.", "Section 3.3.3"),
     Measure("theta_post_impact", "rad", "θ⁺", "angle just after landing",
-            "Angle of Leg 1 from the slope's normal just after the opening landing.", "(15)"),
+            "Angle of Leg 1 from the slope's normal just after the opening landing.", "(15)",
+            is_shared=True),
     Measure("dtheta_post_impact", "rad/s", "θ̇⁺", "angular rate just after landing",
-            "Angular rate just after the opening landing.", "(20)"),
+            "Angular rate just after the opening landing.", "(20)", is_shared=True),
     Measure("theta_touchdown", "rad", "θ⁻", "angle just before touchdown",
-            "Angle of Leg 1 just before the next touchdown: section state, first number."),
+            "Angle of Leg 1 just before the next touchdown: section state, first number.",
+            is_shared=True),
     Measure("dtheta_touchdown", "rad/s", "θ̇⁻", "angular rate just before touchdown",
-            "Angular rate just before the next touchdown: section state, second number."),
+            "Angular rate just before the next touchdown: section state, second number.",
+            is_shared=True),
     Measure("dL1_touchdown", "m/s", "L̇1⁻", "rate of Leg 1 just before touchdown",
             "Rate of the length of Leg 1 then: section state, third number."),
     Measure("lambda_I4", "N s", "λ_I4", "DLS indicator λ_I4",
@@ -113,9 +123,11 @@ STEP_MEASURES = _make_table(
     Measure("energy_lost_stopper", "J", "ΔE_II", "energy lost at the stopper",
             "Mechanical energy lost in collision II, positive when lost.", "(22)"),
     Measure("energy_lost_damping", "J", "ΔE_c", "energy lost in the dampers",
-            "Mechanical energy lost by the viscous legs over the step.", "(29)"),
-    Measure("outcome", "1", "outcome", "outcome", "How the step ended."),
-    Measure("solver_steps", "1", "N", "solver steps", "Steps tried by the integrator."),
+            "Mechanical energy lost by the viscous legs over the step.", "(29)", is_shared=True),
+    Measure("outcome", "1", "outcome", "outcome", "How the step ended.",
+            is_shared=True, is_code=True),
+    Measure("solver_steps", "1", "N", "solver steps", "Steps tried by the integrator.",
+            is_shared=True, is_code=True),
 )
 """Measures of one step."""
 
@@ -191,24 +203,16 @@ STOPPER_MARGIN_MEASURES = _make_table(
 """Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
 violated."""
 
-SHARED_STEP_MEASURE_NAMES = (
-    "dls_fraction",
-    "period",
-    "speed",
-    "step_length",
-    "duration_dls",
-    "theta_post_impact",
-    "dtheta_post_impact",
-    "theta_touchdown",
-    "dtheta_touchdown",
-    "energy_lost_damping",
-    "outcome",
-    "solver_steps",
-)
-"""Measures of `STEP_MEASURES` that every model reports."""
+SHARED_STEP_MEASURE_NAMES = tuple(name for name, measure in STEP_MEASURES.items() if measure.is_shared)
+"""Measures of `STEP` that every rung tells."""
+
+WITH_DERIVATIVES = tuple(name for name, measure in STEP_MEASURES.items() if not measure.is_code)
+"""Measures of `STEP` that have derivatives along a branch of gaits."""
 
 UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
-    name for name in (*SHARED_STEP_MEASURE_NAMES, *UNILATERAL_STEP_MEASURES) if name not in ("outcome", "solver_steps", "friction")
+    name
+    for name, measure in (STEP_MEASURES | UNILATERAL_STEP_MEASURES).items()
+    if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_code and name != "friction"
 )
 """Measures of a step with unilateral contact that have derivatives."""
 

@@ -61,7 +61,7 @@ def explore_starts(
     """
     n_starts = starts.shape[0]
     trial_evaluation = evaluate(starts, None)
-    is_active = has_gait(trial_evaluation)
+    is_active = has_gait(trial_evaluation) & _is_finite(trial_evaluation, free_indices)
     slacks, slack_jacobian = _slack_and_jacobian(
         trial_evaluation, free_indices, widths, min_constraint_values
     )
@@ -98,6 +98,7 @@ def explore_starts(
         trial_evaluation = evaluate(trial_parameters, evaluation)
         is_accepted = (
             has_gait(trial_evaluation)
+            & _is_finite(trial_evaluation, free_indices)
             & is_active
             & _stays_on_branch(
                 evaluation,
@@ -124,6 +125,12 @@ def explore_starts(
 def has_gait(evaluation: GaitEvaluation) -> np.ndarray:
     """Return whether each start has a gait that the event-driven step confirms."""
     return evaluation.gait.outcome == Outcome.STEPPED
+
+
+def _is_finite(gait: GaitEvaluation, free: list[int]) -> np.ndarray:
+    """Return for each lane whether all values and their derivatives by `free` are finite."""
+    slopes = np.asarray(gait.jacobian)[:, free]
+    return np.isfinite(gait.values).all(-1) & np.isfinite(slopes).all((-1, -2))
 
 
 def _select(is_accepted: np.ndarray, new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:

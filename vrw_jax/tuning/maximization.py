@@ -14,7 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from vrw_jax.numerics import StatusCode
-from vrw_jax.tuning.objective import GaitEvaluation, max_breach, scale_slacks
+from vrw_jax.tuning.objective import (
+    UPPER_BOUND_PREFIX,
+    GaitEvaluation,
+    max_breach,
+    scale_slacks,
+    signed_bound,
+)
 from vrw_jax.wheel import Outcome
 
 
@@ -22,7 +28,7 @@ class TuneStatus(StatusCode):
     """Status of a maximization at its end."""
 
     CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
-    BRANCH_ENDED = 1, "The branch ends here: no smaller step finds a gait."
+    BRANCH_ENDED = 1, "The branch ends here: every smaller step on lost the gait or a finite value."
     MAX_EVALUATIONS_REACHED = 2, "The allowed number of gaits was spent before it converged."
     NO_FEASIBLE_GAIT = 3, "No gait that keeps every constraint was found from this start."
 
@@ -34,6 +40,7 @@ class TrialKind(enum.IntEnum):
     TRIAL = 1
     ITERATE = 2
     LOST = 3
+    NOT_FINITE = 4
 
 
 class EvaluatedTrial(NamedTuple):
@@ -52,6 +59,31 @@ class EvaluatedTrial(NamedTuple):
     def is_found(self) -> bool:
         """Return whether there is a gait, on the same branch."""
         return self.outcome == Outcome.STEPPED and self.is_on_branch
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether objective, constraints and their derivatives are finite numbers."""
+        parts = (self.objective, self.gradient, self.slack, self.slack_jacobian)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the climb may go on from here."""
+        return self.is_found and self.is_finite
+
+    def describe_nonfinite(
+        self, label: str, constraints: tuple[str, ...], least: np.ndarray
+    ) -> str:
+        """Return which number is not finite: the objective's, else a constraint's."""
+        values = self.objective, *map(float, self.slack + least)
+        slopes = self.gradient, *self.slack_jacobian
+        for name, value, slope in zip((label, *constraints), values, slopes, strict=True):
+            measure = name.removeprefix(UPPER_BOUND_PREFIX)
+            if not np.isfinite(value):
+                return f"{measure} is {signed_bound(name, value):g}"
+            if not np.isfinite(slope).all():
+                return f"{measure} has a derivative that is not finite"
+        raise ValueError("Every number of this trial is finite: describe another.")
 
 
 class ClimbResult(NamedTuple):
@@ -115,8 +147,8 @@ class _TrialRecord:
             self.kinds.append(TrialKind.TRIAL)
             self._indices[normalized_parameters.tobytes()] = trial_index
         trial = self.trials[trial_index]
-        if not trial.is_found:
-            self.kinds[trial_index] = TrialKind.LOST
+        if not trial.is_usable:
+            self.kinds[trial_index] = TrialKind.NOT_FINITE if trial.is_found else TrialKind.LOST
             raise _LostBranchError(trial)
         return trial
 
@@ -128,7 +160,7 @@ class _TrialRecord:
         return trial
 
     def _nearest_gait(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        gaits = [trial for trial in self.trials if trial.is_found]
+        gaits = [trial for trial in self.trials if trial.is_usable]
         return min(
             gaits,
             key=lambda trial: float(
@@ -222,9 +254,8 @@ def maximize_objective(
 def _best_trial(
     record: _TrialRecord, scales: np.ndarray, last_trial: EvaluatedTrial
 ) -> EvaluatedTrial:
-    """Return the best gait that satisfies all constraints, else the one with the smallest
-    breach."""
-    gaits = [trial for trial in record.trials if trial.is_found]
+    """The best gait that keeps all constraints; else the one that comes nearest to it."""
+    gaits = [trial for trial in record.trials if trial.is_usable]
     feasible = [
         trial for trial in gaits if max_breach(trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE
     ]

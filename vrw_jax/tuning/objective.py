@@ -14,7 +14,7 @@ from vrw_jax.validation import check_known_name, check_names, check_range, check
 from vrw_jax.wheel import WheelParams
 
 MeasureFunction = Callable[[AbstractCycle, AbstractStep], Array]
-MarginSpec = Mapping[str, float | tuple[float, float]] | Sequence[str]
+MarginSpec = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
 ReadMeasure = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
@@ -91,10 +91,7 @@ def parse_margins(
     margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
         for name, lower in constraints.items():
-            if isinstance(lower, tuple):
-                lower, upper = check_range(f"the range of {name}", lower)
-                margins[UPPER_BOUND_PREFIX + name] = -upper
-            margins[name] = check_real(f"the margin of {name}", lower)
+            margins |= _margins_of_one(name, lower)
     else:
         margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
@@ -107,6 +104,26 @@ def parse_margins(
             "measure for a constraint",
         )
     return margins
+
+
+def _margins_of_one(
+    name: str, least: float | tuple[float | None, float | None]
+) -> dict[str, float]:
+    """Return the least values of one measure and of its negative; None in a pair is no bound."""
+    if not isinstance(least, tuple):
+        return {name: check_real(f"the margin of {name}", least)}
+    if len(least) != 2 or None not in least:
+        low, high = check_range(f"the range of {name}", least)
+        return {UPPER_BOUND_PREFIX + name: -high, name: low}
+    if least == (None, None):
+        raise ValueError(
+            f"the range of {name} is (None, None), which bounds nothing: give a lower or an upper "
+            "bound, as in (None, 0.6), or leave the constraint out."
+        )
+    low_end, high_end = least
+    if low_end is None:
+        return {UPPER_BOUND_PREFIX + name: -check_real(f"the upper end of {name}", high_end)}
+    return {name: check_real(f"the lower end of {name}", low_end)}
 
 
 def signed_bound(name: str, lower: float) -> float:

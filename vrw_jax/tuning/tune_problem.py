@@ -114,11 +114,11 @@ def tune(
         params: the start, one wheel.
         objective: maximized quantity: a measure's name, weights of several, or a function of a
             LimitCycle (and, if it takes two arguments, of the StepResult from it).
-        free: names of the free parameters.
-        bounds: lower and upper bound of each free parameter.
-        constraints: least values of measures by name, or pairs of least and most; names alone mean
-            zero.
-        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        free: names of the parameters that may move.
+        bounds: lower and upper, of each free parameter.
+        constraints: least values of measures by name, or pairs of least and most, of which one may
+            be None: (None, 0.6); names alone mean zero.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
         options: of the steps.
         cycle_options: of the gaits.
         tolerance: on the first-order condition, relative to the objective's gradient.
@@ -157,10 +157,10 @@ def tune(
     )
     exploration = problem.explore_starts(n_starts, seed) if n_starts > 1 else None
     problem.finder.precompile(params)
-    start_trial = (
-        problem.evaluate_start()
+    start_trial = problem.evaluate_start(
+        problem.normalized_start
         if exploration is None
-        else problem.evaluate_trial(exploration.normalized_parameters[exploration.best_index], None)
+        else exploration.normalized_parameters[exploration.best_index]
     )
     compiled_seconds = time.perf_counter()
     climb_result = maximize_objective(
@@ -222,16 +222,19 @@ class TuneProblem:
         values = np.array([float(getattr(self.params, name)) for name in self.free])
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
-    def evaluate_start(self) -> EvaluatedTrial:
-        """Return the trial at the start.
-
-        Raises: ValueError: the start has no gait.
-        """
-        trial = self.evaluate_trial(self.normalized_start, None)
+    def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
+        """Return the gait at `u`, where the climb begins; refuse one that can't be climbed from."""
+        trial = self.evaluate_trial(u, None)
         if not trial.is_found:
             raise ValueError(
                 f"the start has no gait to tune ({trial.outcome.name}: {trial.outcome.meaning[:-1]}"
                 "): start from a wheel that walks, such as WheelParams()."
+            )
+        if not trial.is_finite:
+            raise ValueError(
+                f"{trial.describe_nonfinite(self.objective_label, self.constraint_names, self.min_constraint_values)} at "
+                "the start, but a climb needs finite numbers: start from another wheel, or give an "
+                "objective and constraints that are finite there."
             )
         return trial
 
@@ -297,8 +300,8 @@ class TuneProblem:
         )
         if not np.isfinite(exploration.objective).any():
             raise ValueError(
-                f"none of {n_starts} starts within the bounds has a gait: narrow the bounds around "
-                "wheels that walk, such as WheelParams()."
+                f"none of {n_starts} starts within the bounds has a gait with a finite objective: "
+                "narrow the bounds around wheels that walk, such as WheelParams()."
             )
         return exploration
 
@@ -376,7 +379,9 @@ class TuneProblem:
             path=self._make_path(climb_result),
             n_evaluations=len(climb_result.trials)
             + (0 if exploration is None else exploration.n_evaluations),
-            n_backtracks=sum(kind == TrialKind.LOST for kind in climb_result.kinds),
+            n_backtracks=sum(
+                kind in (TrialKind.LOST, TrialKind.NOT_FINITE) for kind in climb_result.kinds
+            ),
             seconds=end_seconds - start_seconds,
             compile_seconds=compiled_seconds - start_seconds,
             exploration=exploration,

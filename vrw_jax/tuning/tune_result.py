@@ -12,6 +12,14 @@ from vrw_jax.tuning.exploration import Exploration
 from vrw_jax.tuning.maximization import TuneStatus
 from vrw_jax.wheel import Outcome, WheelParams
 
+HELD_BY_NOTHING = {
+    TuneStatus.CONVERGED: "nothing: a maximum inside all bounds and constraints",
+    TuneStatus.BRANCH_ENDED: "the end of the branch, no constraint and no bound",
+    TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the climb has not ended",
+    TuneStatus.NO_FEASIBLE_GAIT: "nothing: a constraint is broken here",
+}
+"""What holds a gait without an active constraint or bound, by the ending of its climb."""
+
 
 class ActiveConstraint(NamedTuple):
     """Active constraint or bound at the optimum.
@@ -55,11 +63,11 @@ class TuneResult:
     - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
     - `violated_margins`: violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
-    - `n_evaluations`: number of limit cycles, each with one step;
-    - `n_backtracks`: number of trials that lost the gait or its branch;
-    - `seconds`: total time;
-    - `compile_seconds`: the part for compiling, and for exploring if there are many starts;
-    - `exploration`: results of many starts before the maximization.
+    - `evaluations`: limit cycles, each with one step;
+    - `shortened`: trials that lost the gait or its branch, or whose numbers are not finite;
+    - `seconds`: of which `compile_seconds` went to compiling;
+    - `compile_seconds`: and to exploring, if there were many starts;
+    - `lanes`: where many starts got to before the climb.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
@@ -113,8 +121,7 @@ class TuneResult:
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
             "wheel": ", ".join(parameter_texts),
             "ending": f"{self.status.name}: {self.status.meaning}",
-            "held by": ", ".join(active_texts)
-            or "nothing: a maximum inside all bounds and constraints",
+            "held by": ", ".join(active_texts) or HELD_BY_NOTHING[self.status],
             "not asked for, and broken": ", ".join(self.violated_margins) or "none",
             "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
             f"{self.validation.distance:.1e} from the cycle at last; {feasibility}",

@@ -1,0 +1,113 @@
+"""Branches on unilateral contact go on where contacts change their order, and end at tan(slope)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.branches.branch_location import continue_and_locate
+from vrw_jax.branches.continuation import MapContinuation
+from vrw_jax.continuation import AbstractContinuationProblem, ArclengthOptions, NewtonStep
+
+TAN = float(np.tan(0.3))
+
+
+class Bent(AbstractContinuationProblem):
+    """x = p/2 for p < 0, else x = slope p: a branch with a kink at 0, linearised from outside."""
+
+    slope: float
+
+    is_traceable = False
+    has_kinks = True
+
+    def linearize(self, wheels, z, p):
+        z, p = np.asarray(z), np.asarray(p)[:, None]
+        slope = np.where(p < 0.0, 0.5, self.slope)
+        return jax.device_put(NewtonStep(slope * p - z, slope, np.zeros((len(z), 1, 1))))
+
+    def section_state(self, z):
+        return z
+
+
+@pytest.mark.parametrize("slope", [-0.3, -2.0])
+def test_a_branch_passes_a_kink_at_which_no_step_is_short_enough(slope):
+    """Its tangent turns there by 76 or 121 degrees; an option forbids more than 0.2 rad."""
+    run = MapContinuation(Bent(slope), ArclengthOptions(), jnp.zeros(1), np.array([-1.0, 1.0]))
+    begin = jnp.array([[-0.25]]), jnp.array([-0.5])
+    (strand,) = continue_and_locate(run, *begin, np.array([True]), lambda owner, point: None)
+    p, x = np.asarray(strand.points.p), np.asarray(strand.points.z)[:, 0]
+    assert p[[0, -1]].tolist() == [-1.0, 1.0]
+    np.testing.assert_allclose(x, np.where(p < 0.0, 0.5 * p, slope * p), atol=1e-12)
+
+
+def down_to_the_slope(damping, friction):
+    return vrw.continue_branch(
+        vrw.WheelParams(damping=damping),
+        "friction",
+        (0.30, 0.34),
+        model=vrw.UnilateralWheel(friction=friction),
+    )
+
+
+@pytest.fixture(scope="module")
+def from_above():
+    return down_to_the_slope(250.0, 0.34)
+
+
+def assert_ends_at_the_slope(branch):
+    """Friction below the tangent of the slope can't carry the weight along it over a period."""
+    assert abs(branch.values[0] - TAN) < 1e-6
+    assert "tangent of the slope" in branch.ends[0]
+    assert branch.values[-1] == 0.34
+    end = branch.special_points[0]
+    assert end.ends_branch
+    assert abs(end.value - TAN) < 1e-6
+    assert branch.stable.all()
+    assert branch.dataset.closure.max() < 1e-8
+
+
+def test_a_branch_goes_on_where_contacts_change_their_order(from_above):
+    assert_ends_at_the_slope(from_above)
+    changes = [b for b in from_above.special_points if b.kind == "order_of_contacts_changes"]
+    (kink,) = [b for b in changes if abs(b.value - 0.3293878) < 1e-6]
+    assert not kink.ends_branch
+    assert str(kink) == f"{kink.value:.9g}: order of contacts changes"
+    i = int(np.searchsorted(from_above.values, kink.value))
+    state = from_above.dataset.section_state.values
+    assert state[i - 1, 20] != state[i, 20]  # the foot slides before the landing, or rests
+    np.testing.assert_allclose(state[i - 1, :20], state[i, :20], atol=1e-4)
+
+
+def test_from_either_side_of_the_kink_the_branch_is_the_same(from_above):
+    below = down_to_the_slope(250.0, 0.325)
+    assert_ends_at_the_slope(below)
+    ours, theirs = ([b.value for b in branch.special_points] for branch in (from_above, below))
+    np.testing.assert_allclose(theirs, ours, atol=1e-8)
+    speeds = np.interp([0.315, 0.3293, 0.3295], below.values, below.dataset.speed)
+    again = np.interp([0.315, 0.3293, 0.3295], from_above.values, from_above.dataset.speed)
+    np.testing.assert_allclose(speeds, again, rtol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [230.0, 300.0, 350.0])
+def test_slow_gaits_of_other_dampings_reach_the_slope_too(damping):
+    assert_ends_at_the_slope(down_to_the_slope(damping, 0.34))
+
+
+def test_the_shipped_branch_on_unilateral_contact_reaches_both_ends_of_its_range():
+    """At 0.5201 a leg meets its stopper as its foot lands: the two impacts do not commute."""
+    branch = vrw.continue_branch(
+        vrw.WheelParams(), "friction", (0.5, 1.0), model=vrw.UnilateralWheel(friction=0.7)
+    )
+    assert branch.values[[0, -1]].tolist() == [0.5, 1.0]
+    assert all("range ended" in end for end in branch.ends)
+    first = branch.special_points[0]
+    assert first.kind == "order_of_contacts_changes"
+    assert first.value == pytest.approx(0.5201063, abs=1e-6)
+    assert branch.stable.all()
+    known = vrw.limit_cycle(
+        vrw.WheelParams(), model=vrw.UnilateralWheel(friction=0.51), which="slowest"
+    )
+    period = np.interp(0.51, branch.values, branch.dataset.period)
+    assert period == pytest.approx(float(known.period), rel=1e-3)
