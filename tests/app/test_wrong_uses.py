@@ -1,6 +1,7 @@
 """What can be got wrong at the command line: one sentence, exit code 2, and nothing written."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -199,6 +200,45 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
         '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nmax_ds = 0.0',
         "be positive",
     ),
+}
+
+DIGITS = "9" * 400
+WRONG_CONFIGS |= {
+    f"400 digits for {key.replace(chr(10), ' ')}": (text, "must be")
+    for key, text in {
+        "damping": f"[wheel]\ndamping = {DIGITS}",
+        "slope": f"[wheel]\nslope = -{DIGITS}",
+        "n_legs": f"[wheel]\nn_legs = {DIGITS}",
+        "friction": f'[model]\nrung = "unilateral"\nfriction = {DIGITS}',
+        "max_events": f'[model]\nrung = "unilateral"\nmax_events = {DIGITS}',
+        "rtol": f"[options]\nrtol = {DIGITS}",
+        "max_solver_steps": f"[options]\nmax_solver_steps = {DIGITS}",
+        "solver": f"[options]\nsolver = {DIGITS}",
+        "steps": f"[gait]\nsteps = {DIGITS}",
+        "start": f"[gait]\nstart = [{DIGITS}, 0, 0]",
+        "chunk": f"[scan]\nchunk = {DIGITS}",
+        "tol": f"[scan]\ntol = {DIGITS}",
+        "an axis": f"[grid]\ndamping = [{DIGITS}]",
+        "from": f"[grid]\ndamping = {{ from = {DIGITS}, to = 2.0, count = 3 }}",
+        "count": f"[grid]\ndamping = {{ from = 1.0, to = 2.0, count = {DIGITS} }}",
+        "n": f"[sobol]\nn = {DIGITS}\ndamping = [1.0, 2.0]",
+        "seed": f"[sobol]\nn = 4\nseed = {DIGITS}\ndamping = [1.0, 2.0]",
+        "a range": f"[uniform]\nn = 4\ndamping = [1.0, {DIGITS}]",
+        "objective": f"[tune]\nobjective = {DIGITS}\n[tune.bounds]\nslope = [0.2, 0.4]",
+        "a weight": f"[tune.objective]\nspeed = {DIGITS}\n[tune.bounds]\nslope = [0.2, 0.4]",
+        "evaluations": f"[tune]\nevaluations = {DIGITS}\n[tune.bounds]\nslope = [0.2, 0.4]",
+        "period": f'[branch]\nparameter = "slope"\nbounds = [0.2, 0.3]\nperiod = {DIGITS}',
+        "largest_step": f'[branch]\nparameter = "slope"\nbounds = [0.2, 0.3]\n'
+        f"largest_step = {DIGITS}",
+        "9,000 hexadecimal": f"[wheel]\ndamping = 0x{'f' * 9000}",
+    }.items()
+}
+WRONG_CONFIGS |= {
+    "400 digits for parameter": (f"[branch]\nparameter = {DIGITS}", "is no parameter"),
+    "more digits than Python reads": (f"[wheel]\ndamping = {DIGITS * 20}", "more digits"),
+    "deeply nested": (f"[wheel]\ndamping = {'[' * 3000}{']' * 3000}", "too deeply"),
+    "nested": (f"[wheel]\ndamping = {'[' * 90}{']' * 90}", "must be a finite number"),
+    "as many legs as there are numbers": ("[wheel]\nn_legs = 1000000000", "at most 1,000"),
 }
 
 GRID_TABLE = "[grid]\ndamping = [100.0, 150.0]\n"
@@ -421,6 +461,8 @@ USAGE_ERRORS = {
     "no config": ("scan",),
     "no such option": ("scan", "my.toml", "--chunks", "3"),
     "no samples in a chunk": ("scan", "my.toml", "--chunk", "0"),
+    "steps of 400 digits": ("gait", "--steps", DIGITS),
+    "a chunk of 400 digits": ("scan", "my.toml", "--chunk", DIGITS),
     "a chunk as text": ("scan", "my.toml", "--chunk", "large"),
     "no steps": ("gait", "--steps", "0"),
     "a word too many": ("gait", "my.toml", "again"),
@@ -451,3 +493,53 @@ def test_a_missing_device_is_reported_in_one_sentence(command: str, tmp_path: Pa
     assert run_result.stderr.startswith("vrw: JAX_PLATFORMS is 'cuda', but JAX finds no device")
     assert run_result.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+ADDRESSES = ["tls://127.0.0.1:9", "tcp://127.0.0.1:99999", "tcp://", "", "inproc://x", "silent"]
+
+
+@pytest.mark_chunk.parametrize("address", ADDRESSES)
+def test_a_cluster_that_does_not_answer_gets_one_sentence(address: str, folder: Path) -> None:
+    (folder / "my.toml").write_text(GRID_TABLE)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # takes a call, and says nothing
+        if address == "silent":
+            address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert_refused(
+            ("scan", "my.toml", "--dask", address), "no dask scheduler answers at", folder
+        )
+
+
+PROCESSES = {
+    "uncompiled": (("gait",), {"JAX_DISABLE_JIT": "1"}, "JAX_DISABLE_JIT is set"),
+    "backend": (("scan", "my.toml"), {"MPLBACKEND": "nonsense"}, "MPLBACKEND is 'nonsense'"),
+}
+
+
+def process(folder: Path, arguments: tuple[str, ...], environment: dict, **more: object) -> object:
+    root = str(Path(__file__).parents[2])
+    return subprocess.run(
+        [sys.executable, "-m", "vrw_jax", *arguments],
+        cwd=folder, text=True, env=os.environ | {"PYTHONPATH": root} | environment, **more,
+    )  # fmt: skip
+
+
+@pytest.mark_chunk.parametrize("name", PROCESSES)
+def test_an_environment_that_can_t_be_meant_gets_one_sentence(name: str, folder: Path) -> None:
+    (folder / "my.toml").write_text(GRID_TABLE)
+    arguments, environment, expected = PROCESSES[name]
+    before = list_files(folder)
+    told = process(folder, arguments, environment, capture_output=True)
+    assert told.returncode == 2, told.stderr
+    assert told.stderr.startswith(f"vrw: {expected}")
+    assert len(told.stderr.splitlines()) == 1
+    assert list_files(folder) == before
+
+
+@pytest.mark_chunk.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark_chunk.parametrize("arguments", [("--version",), ("init", "new")])
+def test_a_full_device_gets_one_sentence(arguments: tuple[str, ...], folder: Path) -> None:
+    with open("/dev/full", "w") as full:
+        told = process(folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)
+    assert told.returncode == 2
+    assert len(told.stderr.splitlines()) == 1
+    assert "No space left on device." in told.stderr

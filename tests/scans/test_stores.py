@@ -21,6 +21,7 @@ from support.scanning import (
 
 import vrw_jax as vrw
 from vrw_jax.scans import design as designs
+from vrw_jax.scans import execution as running
 from vrw_jax.scans import integrity as soundness
 from vrw_jax.scans import planning
 from vrw_jax.scans import store as scan_store
@@ -297,3 +298,174 @@ def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.Monke
     monkeypatch.setattr(scan_store.np, "full", full)
     with pytest.raises(ValueError, match="more than this memory holds: give a store"):
         run_plan(make_plan(), evaluate=evaluate_arithmetically)
+
+
+# Position, design, foreign variables, metadata
+
+
+def test_chunks_in_each_others_place_are_seen_though_their_marks_went_along(store: Path) -> None:
+    """Reference: the store as written. Each chunk's files agree with the mark beside them."""
+    whole = list_files(store)
+    for array in store.iterdir():
+        first, second = (array / "c" / number for number in ("1", "3"))
+        if array.name == "bookkeeping":
+            first, second = (array / "digest" / "c" / number for number in ("1", "3"))
+        if array.is_dir() and first.exists():
+            first.rename(array / "aside")
+            second.rename(first)
+            (array / "aside").rename(second)
+    with pytest.raises(ValueError, match=r"2 damaged chunks \(number 1, 3\)"):
+        open_scan(store)
+    with pytest.warns(UserWarning, match="2 damaged chunks"):
+        run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
+    assert list_files(store) == whole
+
+
+def test_a_chunk_of_another_design_is_seen_though_its_mark_came_along(
+    store: Path, tmp_path: Path
+) -> None:
+    other = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.32, 4))
+    run_plan(
+        plan_scan(other, SCANNED_MEASURES, chunk=4),
+        tmp_path / "other.zarr",
+        evaluate=evaluate_arithmetically,
+    )
+    for path in (tmp_path / "other.zarr").rglob("c/1"):
+        if path.is_dir():  # the files of a chunk, not a coordinate
+            place = store / path.relative_to(tmp_path / "other.zarr")
+            shutil.copytree(path, place, dirs_exist_ok=True)
+    with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
+        open_scan(store)
+
+
+@pytest.mark_chunk.parametrize("keeps", [True, False], ids=["attributes kept", "attributes lost"])
+def test_a_variable_that_a_user_adds_is_no_damage(store: Path, keeps: bool) -> None:
+    before = open_scan(store).load()
+    mine = xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs if keeps else {})
+    mine.to_zarr(store, mode="a")
+    after = open_scan(store).load()
+    xr.testing.assert_identical(after.drop_vars("mine")[list(before.data_vars)], before)
+    np.testing.assert_array_equal(after.mine, mine.mine)
+    again = CountingEngine()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run_plan(make_plan(), store, evaluate=again)
+    assert again.n_calls == 0
+
+
+METADATA = {
+    "not JSON": lambda text: text[: len(text) // 2],
+    "empty": lambda text: "",
+    "another kind of number": lambda text: text.replace("float64", "int64").replace(
+        "int8", "int16"
+    ),
+    "other chunks": lambda text: text.replace('"chunk_shape": [', '"chunk_shape": [7'),
+    "not an object": lambda text: "[]",
+    "deleted": lambda text: None,
+}
+
+
+@pytest.mark_chunk.parametrize("what", METADATA)
+@pytest.mark_chunk.parametrize("name", ["speed", "outcome", "damping", "bookkeeping/digest"])
+def test_damaged_metadata_of_an_array_are_said_and_mended(
+    store: Path, name: str, what: str
+) -> None:
+    whole, place = list_files(store), store / name / "zarr.json"
+    text = METADATA[what](place.read_text())
+    if text == place.read_text():
+        text += "]"
+    place.write_text(text) if text is not None else place.unlink()
+    with pytest.raises(ValueError, match=rf"damaged metadata \({name}\)|can't be opened \({name}"):
+        open_scan(store)
+    assert f"damaged metadata ({name})" in running.find_store(make_plan(), store).damage_description
+    again = CountingEngine()
+    with pytest.warns(UserWarning, match="damaged metadata"):
+        run_plan(make_plan(), store, evaluate=again)
+    assert again.n_calls == 0
+    assert list_files(store) == whole
+
+
+def edited_root(store: Path, edit: object) -> None:
+    root = json.loads((store / "zarr.json").read_text())
+    edit(root)
+    (store / "zarr.json").write_text(json.dumps(root, indent=2))
+
+
+ROOT = {
+    "kind of number": lambda r: inline(r, "speed").update(data_type="int8"),
+    "an array's gone": lambda r: r["consolidated_metadata"]["metadata"].pop("speed"),
+    "nonsense": lambda r: r["consolidated_metadata"]["metadata"].update(speed=3),
+    "the settings": lambda r: r["attributes"].update(scan="{}"),
+    "no settings": lambda r: r["attributes"].pop("scan"),
+    "the list of variables": lambda r: inline(r, "bookkeeping")["attributes"].update(variables=[]),
+}
+
+
+def inline(root: dict, name: str) -> dict:
+    return root["consolidated_metadata"]["metadata"][name]
+
+
+@pytest.mark_chunk.parametrize("what", ROOT)
+def test_damage_of_the_metadata_of_all_is_said_and_mended_or_harmless(
+    store: Path, what: str
+) -> None:
+    whole, before = list_files(store), open_scan(store).load()
+    edited_root(store, ROOT[what])
+    if what == "no settings":
+        xr.testing.assert_identical(open_scan(store).load(), before)
+        return
+    with pytest.raises(ValueError, match=r"damaged metadata|can't be opened"):
+        open_scan(store)
+    again = CountingEngine()
+    with pytest.warns(UserWarning, match="damaged metadata"):
+        run_plan(make_plan(), store, evaluate=again)
+    assert again.n_calls == 0
+    assert list_files(store) == whole
+
+
+def test_a_damaged_coordinate_that_is_not_swept_is_written_again(store: Path) -> None:
+    whole = list_files(store)
+    (store / "leg" / "c" / "0").unlink()
+    with pytest.raises(ValueError, match=r"damaged coordinates \(leg\)"):
+        open_scan(store)
+    with pytest.warns(UserWarning, match="damaged coordinates"):
+        run_plan(make_plan(), store, evaluate=CountingEngine(1))
+    assert list_files(store) == whole
+
+
+def as_before_marks_covered_settings(store: Path) -> None:
+    """Makes a store what 0.1's successor wrote: no attributes of marks, marks of files alone."""
+    edited_root(store, lambda root: inline(root, "bookkeeping").update(attributes={}))
+    book = store / "bookkeeping" / "zarr.json"
+    book.write_text(json.dumps(json.loads(book.read_text()) | {"attributes": {}}, indent=2))
+    group, metadata = zarr.open_group(store, mode="r+"), soundness.StoredMetadata(store)
+    books = soundness.ChunkChecksums(store, group, metadata)
+    for index in range(make_plan().layout.n_chunks):
+        books.mark_chunk(index)
+
+
+@pytest.mark_chunk.parametrize("what", [None, *DAMAGE_CASES])
+def test_a_store_whose_marks_cover_files_alone_opens_and_its_damage_is_seen(
+    store: Path, what: str | None
+) -> None:
+    before = open_scan(store).load()
+    as_before_marks_covered_settings(store)
+    whole = list_files(store)
+    xr.testing.assert_identical(open_scan(store).load(), before)
+    run_plan(make_plan(), store, evaluate=CountingEngine(1))
+    (xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs)).to_zarr(store, mode="a")
+    assert "mine" in open_scan(store)
+    if what is not None:
+        DAMAGE_CASES[what](store / "speed" / CHUNK_FILE)
+        with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
+            open_scan(store)
+        with pytest.warns(UserWarning, match="1 damaged chunk"):
+            run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
+    (store / "speed" / "zarr.json").unlink()
+    with pytest.warns(UserWarning, match=r"damaged metadata \(speed"):
+        run_plan(make_plan(), store, evaluate=CountingEngine(1))
+    shutil.rmtree(store / "mine")
+    kept = list_files(store)
+    assert {n: x for n, x in kept.items() if "/c/" in n} == {
+        n: x for n, x in whole.items() if "/c/" in n
+    }

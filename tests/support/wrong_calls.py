@@ -5,6 +5,7 @@ As a program it runs them all in a process without the annotation checks of the 
 """
 
 import json
+import math
 import sys
 import traceback
 from collections.abc import Callable
@@ -151,7 +152,38 @@ def register_wrong_calls() -> None:
         "order",
     )
 
-    # Models
+    for name in ("rtol", "max_phase_time"):
+        add_wrong_call(
+            f"Options of several {name}, one not a number",
+            lambda n=name: vrw.StepOptions(**{n: [1.0, float("nan")]}),
+            "ValueError",
+            name,
+        )
+        add_wrong_call(
+            f"a step by several {name}",
+            lambda n=name: vrw.step(table_1, start, options=vrw.StepOptions(**{n: [1e-6, 1e-7]})),
+            "ValueError", f"{name} has shape (2,)",
+        )  # fmt: skip
+    add_wrong_call(
+        "uneven as a number", lambda: vrw.UnilateralWheel(uneven=math.inf), "TypeError", "uneven"
+    )
+    for label, value in {
+        "a number": 3, "a dtype": np.dtype(float), "a truth": True, "an array": np.eye(2)
+    }.items():  # fmt: skip
+        add_wrong_call(
+            f"derivatives as {label}",
+            lambda v=value: vrw.step_batch(table_1, np.asarray(start)[None], derivatives=v),
+            "TypeError",
+            "derivatives",
+        )
+    add_wrong_call(
+        "a rung that is an array",
+        lambda: vrw.step(table_1, start, model=np.eye(2)), "TypeError", "an array of shape (2, 2)",
+    )  # fmt: skip
+    add_wrong_call("a store that is a number", lambda: vrw.scan(vrw.grid(damping=[1.0]), store=3),
+        "TypeError", "store")  # fmt: skip
+
+    # Rungs
     frictions = not_numbers | {
         "negative": (-1.0, "ValueError"), "nan": (float("nan"), "ValueError")
     }  # fmt: skip
@@ -404,6 +436,9 @@ def register_wrong_calls() -> None:
         ("stoppers misspelt", {"stoppers": "onesided"}, "ValueError", "stoppers"),
         ("which misspelt", {"which": "quickest"}, "ValueError", "which is 'quickest'"),
         ("which between places", {"which": 0.5}, "ValueError", "which is 0.5"),
+        ("which a set", {"which": {0, 1}}, "TypeError", "which is {0, 1}"),
+        ("which an array", {"which": np.array([0, 1])}, "TypeError", "which is an array"),
+        ("which a truth", {"which": True}, "TypeError", "which is True"),
     )  # fmt: skip
     for label, given, kind, words in wrong:
         add_wrong_call(

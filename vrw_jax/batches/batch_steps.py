@@ -46,6 +46,7 @@ from vrw_jax.simulation import check_model, check_options, check_section_state
 from vrw_jax.validation import (
     check_choice,
     check_int,
+    check_names,
     check_not_traced,
     check_numpy_reals,
     check_type,
@@ -135,6 +136,7 @@ def step_batch(
     checked_model, options = check_model(model, allows_arrays=True), check_options(options)
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps = check_int("n_steps", n_steps)
+    derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
     checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
     columns = _check_columns(params, checked_states, checked_model, options, n_steps)
     checked_states = checked_states.astype(columns[0].dtype, copy=False)
@@ -157,11 +159,8 @@ def step_batch(
 def _check_derivatives(
     derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
 ) -> list[str]:
-    """Return the names of the inputs to differentiate by.
-
-    Raises: ValueError: a name is unknown, or the engine has no derivatives.
-    """
-    names = [derivatives] if isinstance(derivatives, str) else list(derivatives)
+    """What the end is to be told to move with; one clear sentence for what it can't be."""
+    names = list(derivatives)
     for name in names:
         if name not in known_names:
             raise ValueError(

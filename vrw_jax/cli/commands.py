@@ -5,6 +5,7 @@ one sentence on stderr, with exit code 2.
 """
 
 import gc
+import importlib
 import importlib.metadata
 import os
 import signal
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 FACT_FAILED_EXIT_CODE, NOT_CONVERGED_EXIT_CODE = 1, 1
 """Exit codes of a failed fact and of a run that did not converge."""
 
+MAX_GIVEN = 10**9
+"""Largest whole number on a command line, chosen because a scan takes no more samples."""
+
 FolderOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
@@ -54,7 +58,8 @@ def main() -> None:
     # collector takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _stop)
-    app()
+    with printing.whole_output():
+        app()
 
 
 def _stop(_signal: int, _frame: object) -> None:
@@ -125,7 +130,7 @@ def gait(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter; may be repeated."),
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps to walk.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, max=MAX_GIVEN, help="Steps to walk.")] = None,
 ) -> None:
     """Walk a wheel and print its gait: durations, speed, indicators and margins.
 
@@ -253,7 +258,9 @@ def reproduce(
 
     with report_errors():
         start_jax()
+        _require_compiler()
         _require_writable(folder)
+        _require_pictures(True)
     from vrw_jax.paper import reproduce as run
 
     with (
@@ -265,7 +272,8 @@ def reproduce(
             folder,
             on_progress=lambda share, what: bar.update(task, completed=share, description=what),
         )
-    printing.print_facts(facts, folder)
+    with report_errors():
+        printing.print_facts(facts, folder)
     if not all(fact.holds for fact in facts):
         raise typer.Exit(FACT_FAILED_EXIT_CODE)
 
@@ -284,7 +292,8 @@ def scan(
         bool, typer.Option("--verify", help="Only print whether the store is complete and intact.")
     ] = False,
     chunk: Annotated[
-        int | None, typer.Option(min=1, help="Largest number of samples written at a time.")
+        int | None,
+        typer.Option(min=1, max=MAX_GIVEN, help="Most samples that are written at a time."),
     ] = None,
     dask: Annotated[
         str | None,
@@ -325,13 +334,15 @@ def scan(
             scanning.verify_store(plan, store)
             return
         _require_writable(folder)
+        _require_pictures(picture)
     dataset = scanning.compute_scan(plan, store, dask)
-    printing.print_outcomes(dataset)
-    stdout_console.print(f"data: {store}", highlight=False, soft_wrap=True)
-    if picture:
-        from vrw_jax.cli.reports import write_scan
+    with report_errors(f"stopped; the data are in {store}."):
+        printing.print_outcomes(dataset)
+        stdout_console.print(f"data: {store}", highlight=False, soft_wrap=True)
+        if picture:
+            from vrw_jax.cli.reports import write_scan
 
-        printing.print_written_paths(write_scan(dataset, folder))
+            printing.print_written_paths(write_scan(dataset, folder))
 
 
 @app.command("map")
@@ -348,6 +359,7 @@ def map_special_points(
         plan = scanning.plan_config_scan(settings, None, SPECIAL_POINT_MEASURES)
         require_map(plan.design)
         _require_writable(folder)
+        _require_pictures(True)
     dataset = scanning.compute_scan(plan, folder / "scan.zarr", None)
 
     with (
@@ -383,6 +395,7 @@ def tune(
         tune_config = settings.tune
         assert tune_config is not None
         _require_writable(folder)
+        _require_pictures(picture)
         from vrw_jax.cli.reports import write_tuning
         from vrw_jax.tuning import tune as run
 
@@ -427,6 +440,7 @@ def continue_(
         branch_config = settings.branch
         assert branch_config is not None
         _require_writable(folder)
+        _require_pictures(picture)
         from vrw_jax.branches import continue_branch
         from vrw_jax.cli.reports import write_branch
         from vrw_jax.continuation import ArclengthOptions
@@ -459,9 +473,33 @@ def _load_config(path: Path | None) -> "Config":
     from vrw_jax.runtime import start_jax
 
     start_jax()
+    _require_compiler()
     from vrw_jax.cli.config import Config, load_config
 
     return Config() if path is None else load_config(path)
+
+
+def _require_compiler() -> None:
+    """Refuse to compute uncompiled, which takes hours."""
+    import jax
+
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        raise ValueError(
+            "JAX_DISABLE_JIT is set, but commands compute with compiled code: unset it."
+        )
+
+
+def _require_pictures(picture: bool) -> None:
+    """Refuse, before anything is computed, a backend that matplotlib doesn't know."""
+    if not picture:
+        return
+    try:
+        importlib.import_module("vrw_jax.figures")
+    except ValueError as error:
+        raise ValueError(
+            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
+            "it, or set it to agg."
+        ) from error
 
 
 MISSING_TABLE_MESSAGES = {

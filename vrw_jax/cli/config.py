@@ -3,6 +3,7 @@
 An error in a file is reported in one sentence: what was given, what is allowed and what to do.
 """
 
+import contextlib
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -19,7 +20,7 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import CATALOGS, MAX_LISTED_SAMPLES, TOLERANCE_CATALOG, check_measures
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import LadderWheel
-from vrw_jax.validation import check_known_name, check_range, suggest_name
+from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, WheelParams
 
 RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
@@ -34,6 +35,10 @@ MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
 """Model classes by the name in a config."""
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
+MAX_COUNT = 2**53
+"""Largest whole number of a config, chosen because floats hold all up to it."""
+MAX_LEGS = 1_000
+"""Most legs of a config, chosen because results hold a number for each leg of each sample."""
 
 RENAMED_KEYS = {
     "[model]": {"rung": "name"},
@@ -169,6 +174,14 @@ def parse_config(text: str, file_name: str = "config") -> Config:
         raise ValueError(
             f"{file_name}: this is not valid TOML ({error}): mend that line."
         ) from error
+    except ValueError as error:
+        raise ValueError(
+            f"{file_name}: a number has more digits than any key takes: give a shorter one."
+        ) from error
+    except RecursionError as error:
+        raise ValueError(
+            f"{file_name}: lists or tables lie in each other too deeply: no key takes more than two."
+        ) from error
     try:
         return _make_config(tables, text, file_name)
     except ValueError as error:
@@ -249,6 +262,8 @@ def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
     for name, value in table.items():
         if name == "n_legs":
             values[name] = _parse_int(value, name, 5)
+            if values[name] > MAX_LEGS:
+                raise _make_error(name, value, f"at most {MAX_LEGS:,}")
         else:
             values[name] = _parse_parameter(name, value)
     return values
@@ -469,18 +484,23 @@ def _parse_parameter(name: str, value: object) -> float:
 
 
 def _parse_number(value: object, name: str, must_be_positive: bool = False) -> float:
-    """Return a value as a finite number; raise if it is not one."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    number = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+            number = float(value)
+    if not math.isfinite(number):
         raise _make_error(name, value, "a finite number")
-    if must_be_positive and not value > 0:
-        raise ValueError(f"{name} is {value:g}, but it must be positive.")
-    return float(value)
+    if must_be_positive and not number > 0:
+        raise ValueError(f"{name} is {number:g}, but it must be positive.")
+    return number
 
 
 def _parse_int(value: object, name: str, minimum: int) -> int:
     """Return a value as a whole number of at least `minimum`; raise if it is not one."""
     if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
         raise _make_error(name, value, f"a whole number of at least {minimum}")
+    if value > MAX_COUNT:
+        raise _make_error(name, value, f"at most {MAX_COUNT:,}")
     return value
 
 
@@ -513,4 +533,4 @@ def _format_value(value: object) -> str:
     """Return a value as it is written in TOML."""
     if isinstance(value, bool):
         return str(value).lower()
-    return repr(value).replace("'", '"') if isinstance(value, str) else repr(value)
+    return format_value(value).replace("'", '"') if isinstance(value, str) else format_value(value)

@@ -1,6 +1,8 @@
 """Output of commands: tables, progress, and one sentence for a user's mistake."""
 
 import contextlib
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +46,31 @@ def report_errors(interruption_message: str = "stopped; nothing was written.") -
     except (ValueError, OSError) as error:
         print_error(str(error) if isinstance(error, ValueError) else _format_system_error(error))
         raise typer.Exit(USER_ERROR_EXIT_CODE) from error
+
+
+@contextlib.contextmanager
+def whole_output() -> Iterator[None]:
+    """Around a command: if standard output can't take its last lines, one sentence, exit code 2."""
+    code: Any = 0
+    try:
+        yield
+    except SystemExit as end:
+        code = end.code
+    except OSError as error:
+        _give_up_output(error)
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _give_up_output(error)
+    raise SystemExit(code)
+
+
+def _give_up_output(error: OSError) -> None:
+    """Say why the output ends; what is left of it would fail again when Python ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if not isinstance(error, BrokenPipeError):  # whoever closed it knows
+        print_error(f"standard output can't be written: {_format_system_error(error)}")
+    raise SystemExit(USER_ERROR_EXIT_CODE)
 
 
 def print_error(sentence: str) -> None:

@@ -76,6 +76,7 @@ from vrw_jax.validation import (
     check_choice,
     check_int,
     check_reals,
+    check_type,
     refuse_renamed_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
@@ -196,6 +197,8 @@ class UnilateralWheel(AbstractWheel):
             self.infinite_friction_rule,
             (FRICTION_LIMIT, FRICTION_PAPER_RULE),
         )
+        if self.uneven is not None:
+            check_type("uneven", self.uneven, UnevenGround, "leave it out, vrw.walk sets it")
 
     @property
     def has_one_sided_stoppers(self) -> bool:

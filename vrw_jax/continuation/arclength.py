@@ -65,9 +65,9 @@ class ArclengthOptions:
 
     def __post_init__(self) -> None:
         for name in ("max_points", "max_newton_iterations"):
-            check_int(name, getattr(self, name))
+            object.__setattr__(self, name, check_int(name, getattr(self, name)))
         for name in ("initial_ds", "max_ds", "min_ds", "tolerance", "max_turn_angle"):
-            check_positive(name, getattr(self, name))
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         if not self.min_ds <= self.initial_ds <= self.max_ds:
             raise ValueError(
                 f"the steps are {self.min_ds:g} (smallest), {self.initial_ds:g} (first) and "

@@ -143,6 +143,10 @@ def _solve_checked(
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     iterations = check_int("iterations", iterations)
+    if start.ndim != 1 or not start.size:
+        raise ValueError(
+            f"start has shape {start.shape}, but it is a vector: give an array of shape (n,)."
+        )
     if not isinstance(tolerance, jax.Array):
         check_positive("tolerance", tolerance)
 

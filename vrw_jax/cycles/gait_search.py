@@ -35,6 +35,8 @@ from vrw_jax.validation import (
     check_choice,
     check_int,
     check_not_traced,
+    check_real,
+    check_type,
     is_traced,
     refuse_renamed_arguments,
 )
@@ -200,6 +202,7 @@ def limit_cycles(
         >>> cycles.found.tolist(), cycles.period.round(3).tolist()
         ([True, True, False], [0.595, 0.6980000000000001, 0.0])
     """
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
     parse_gait_choice(which)
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not shape:
@@ -218,13 +221,10 @@ def limit_cycles(
 
 
 def parse_gait_choice(which: GaitChoice) -> int:
-    """Return the index of a gait in a list sorted by speed, slowest first.
-
-    Raises: ValueError: the choice is neither a name nor an integer.
-    """
-    if which in ("slowest", "fastest"):
-        return 0 if which == "slowest" else -1
-    if isinstance(which, str) or int(which) != which:
+    """Of a list of gaits, slowest first; one clear sentence for what is none."""
+    if isinstance(which, str):
+        return 0 if check_choice("which", which, ("slowest", "fastest")) == "slowest" else -1
+    if not check_real("which", which).is_integer():
         raise ValueError(
             f"which is {which!r}, but it names one of a wheel's gaits: give 'slowest', 'fastest' "
             "or its place in vrw.limit_cycles(params, model=...)."

@@ -55,9 +55,9 @@ class CycleOptions:
             "homotopy_steps",
             "batch_size",
         ):
-            check_int(name, getattr(self, name))
+            object.__setattr__(self, name, check_int(name, getattr(self, name)))
         for name in ("mesh_grading", "tolerance"):
-            check_positive(name, getattr(self, name))
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
             raise ValueError(
                 f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the intervals in "

@@ -42,8 +42,16 @@ It is chosen because a walk of few steps that grazes a guard gains accuracy down
 """
 
 
+REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0")
+"""Options that are real numbers."""
+
+
 def _positive_field(name: str, default: float) -> Any:
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
+
+
+def _int_field(name: str, default: int) -> Any:
+    return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
 
 
 @refuse_renamed_arguments(
@@ -79,10 +87,10 @@ class StepOptions(AbstractPrintable):
     atol: Scalar = _positive_field("atol", 1e-10)
     derivative_tightening: Scalar = _positive_field("derivative_tightening", 20.0)
     max_phase_time: Scalar = _positive_field("max_phase_time", 20.0)
-    max_solver_steps: int = eqx.field(static=True, default=20_000)
+    max_solver_steps: int = _int_field("max_solver_steps", 20_000)
     dt0: Scalar = _positive_field("dt0", 5e-3)
-    max_event_iterations: int = eqx.field(static=True, default=100)
-    max_margin_search_iterations: int = eqx.field(static=True, default=5)
+    max_event_iterations: int = _int_field("max_event_iterations", 100)
+    max_margin_search_iterations: int = _int_field("max_margin_search_iterations", 5)
 
     if TYPE_CHECKING:
 
@@ -103,12 +111,11 @@ class StepOptions(AbstractPrintable):
     def __check_init__(self) -> None:
         check_choice("solver", self.solver, SOLVER_NAMES)
         check_choice("engine", self.engine, get_args(EngineName))
-        for name in ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0"):
+        for name in REAL_OPTION_NAMES:
             value = getattr(self, name)
-            if not isinstance(value, jax.core.Tracer) and jnp.ndim(value) == 0:
-                check_positive(name, value)
-        for name in ("max_solver_steps", "max_event_iterations", "max_margin_search_iterations"):
-            check_int(name, getattr(self, name))
+            if not isinstance(value, jax.core.Tracer):
+                for one in np.ravel(np.asarray(value)):  # several are for jax.vmap
+                    check_positive(name, one)
 
     def summary_rows(self) -> list[TextRow]:
         units = {"max_phase_time": "s", "dt0": "s"}
@@ -139,6 +146,15 @@ class StepOptions(AbstractPrintable):
         return eqx.tree_at(
             lambda o: (o.rtol, o.atol), self, _tighten_tolerances(tolerances, factor)
         )
+
+    def require_scalars(self) -> None:
+        """Refuse several numbers where one is meant."""
+        for name in REAL_OPTION_NAMES:
+            if shape := getattr(getattr(self, name), "shape", ()):
+                raise ValueError(
+                    f"{name} has shape {shape}, but options hold one number each: give a float, or "
+                    "map over the options with jax.vmap."
+                )
 
     def check_tolerances(self, dtype: np.dtype) -> None:
         """Refuse, in one sentence, an `rtol` below what the number format can resolve.

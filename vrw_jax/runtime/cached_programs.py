@@ -66,11 +66,8 @@ def cached_lane_program(
     settings: Any,
     max_unrolled: int = simd.MAX_UNROLLED,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return `simd.compile_lane_program` of this library's functions, saved in the cache folder.
-
-    `settings` are those of `compile_exported`.
-    """
-    key = (settings, store.source_digest())
+    """`simd.lane_program` of this library's functions, kept here; `settings` as for `compiled`."""
+    key = (settings, store.describe_process())
     return simd.compile_lane_program(
         function, scalar_dtypes, n_lanes_in, dtype, key, store, max_unrolled
     )
@@ -82,11 +79,9 @@ def cached_lane_function(
     settings: object,
     max_unrolled: int = simd.MAX_UNROLLED,
 ) -> Callable:
-    """Return `simd.compile_lane_function` of this library's functions, saved in the
-    cache folder.
-    """
+    """`simd.lane_function` of this library's functions, likewise."""
     return simd.compile_lane_function(
-        function, shape_function, (settings, store.source_digest()), store, max_unrolled
+        function, shape_function, (settings, store.describe_process()), store, max_unrolled
     )
 
 
@@ -96,13 +91,16 @@ def _export_trace(function: Callable, arguments: tuple, settings: object) -> exp
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     # A trace calls the machine code of one processor: others may share the folder.
     platform = (jax.default_backend(), simd.describe_processor() if simd.is_available() else None)
-    key_parts = (settings, str(structure), shapes, jax.__version__, platform, store.source_digest())
+    key_parts = (settings, str(structure), shapes, platform, store.describe_process())
     name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
     content = store.load_bytes(name)
     if content is not None:
         names, _, trace = content.partition(b"\n")
-        if simd.ensure_loaded(names.decode().split(), store):
-            return export.deserialize(bytearray(trace))
+        try:
+            if simd.ensure_loaded(names.decode().split(), store):
+                return export.deserialize(bytearray(trace))
+        except Exception:  # whatever a foreign library raises for what is no trace
+            store.warn_unusable(f"{name} is no trace")
     flat_function = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
     token = _is_exporting.set(True)  # cached traces called within are part of this trace
     try:

@@ -5,11 +5,13 @@ compute its chunks. Workers return a description of their environment. A chunk f
 other than that of the calling process is refused, because its last digits might differ.
 """
 
+import asyncio
 import contextlib
 import functools
 import itertools
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,14 +57,31 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
             client = Client(stack.enter_context(cluster), set_as_default=False)
         else:
             try:
+                _require_answer(address)
                 client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-            except (OSError, ValueError) as error:  # no response, or an invalid address
+            except Exception as error:  # no answer, no address, or what libraries make of it
                 raise ValueError(
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
                 ) from error
         stack.enter_context(client)
         yield functools.partial(_compute_chunks, client)
+
+
+def _require_answer(address: str) -> None:
+    """Refuse an address where nobody answers in dask's way; a client would wait there for ever."""
+    from dask.utils import parse_timedelta
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    async def ask() -> None:
+        how = Security().get_connection_args("client")
+        seconds = parse_timedelta(SCHEDULER_TIMEOUT)
+        comm = await asyncio.wait_for(connect(address, timeout=seconds, **how), 2 * seconds)
+        comm.abort()
+
+    with ThreadPoolExecutor(1) as pool:  # a notebook has a loop of its own
+        pool.submit(asyncio.run, ask()).result()
 
 
 def _compute_chunks(

@@ -249,7 +249,7 @@ def sobol(
     from scipy.stats import qmc  # imported here because the import is slow
 
     n, ranges = _require_count("sobol", n), _require_one_form("sobol", ranges, parameters)
-    names, lower, upper = _parse_box(ranges, n)
+    names, lower, upper, n = _parse_box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
     points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
     return _scale_to_box(names, lower, upper, points, "sobol")
@@ -280,7 +280,7 @@ def uniform(
         (8,)
     """
     n, ranges = _require_count("uniform", n), _require_one_form("uniform", ranges, parameters)
-    names, lower, upper = _parse_box(ranges, n)
+    names, lower, upper, n = _parse_box(ranges, n)
     points = _make_generator(seed).random((n, len(names)))
     return _scale_to_box(names, lower, upper, points, "uniform")
 
@@ -315,7 +315,7 @@ def saltelli(
     from scipy.stats import qmc  # imported here because the import is slow
 
     n, ranges = _require_count("saltelli", n), _require_one_form("saltelli", ranges, parameters)
-    names, lower, upper = _parse_box(ranges, n)
+    names, lower, upper, n = _parse_box(ranges, n)
     if n & (n - 1):
         raise ValueError(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
@@ -349,9 +349,9 @@ def _make_generator(seed: int) -> np.random.Generator:
 
 def _parse_box(
     ranges: Mapping[str, ParameterRange], n: int
-) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Return the names, lower bounds and upper bounds of a box; check the number of samples."""
-    if check_int("n", n) > MAX_LISTED_SAMPLES:
+) -> tuple[list[str], np.ndarray, np.ndarray, int]:
+    n = check_int("n", n)
+    if n > MAX_LISTED_SAMPLES:
         raise ValueError(
             f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
             "a grid."
@@ -361,7 +361,7 @@ def _parse_box(
         for name, pair in _require_sweepable(ranges).items()
     ]
     bounds = np.asarray(pairs)
-    return list(ranges), bounds[:, 0], bounds[:, 1]
+    return list(ranges), bounds[:, 0], bounds[:, 1], n
 
 
 def _require_sweepable(values: Mapping[str, object]) -> Mapping:
@@ -380,7 +380,10 @@ def _require_sweepable(values: Mapping[str, object]) -> Mapping:
 def _to_column(name: str, value: object) -> np.ndarray:
     """Return the values of one parameter as an array of one axis; raise if they are not numbers."""
     check_not_traced("a design", "use jax.vmap", value)
-    column = np.atleast_1d(np.asarray(value))
+    try:
+        column = np.atleast_1d(np.asarray(value))
+    except Exception:  # lists of lists of several lengths, or whatever a foreign object raises
+        column = np.array([None])
     if column.dtype.kind not in "fiu" and column.size:
         raise TypeError(
             f"{name} is {format_value(value)}, but it must be a list of numbers: write [100.0]."

@@ -38,7 +38,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import refuse_renamed_arguments
+from vrw_jax.validation import check_callable, check_type, refuse_renamed_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -112,6 +112,10 @@ def scan(
         >>> gaits.speed.round(3).values.tolist(), gaits.outcome.values.tolist()
         ([1.018, nan], [0, 14])
     """
+    if store is not None:
+        check_type("store", store, (str, Path), "give the folder to keep the result in")
+    if on_progress is not None:
+        check_callable("on_progress", on_progress, "that takes the progress")
     scan_plan = plan_scan(
         design,
         measures,
@@ -144,11 +148,14 @@ def run_scan(
 ) -> xr.Dataset:
     """Return the dataset of a plan, computed in this process or by `executor`."""
     storage = store if isinstance(store, AbstractStore) else _open_storage(scan_plan, store)
-    missing = storage.find_missing_chunks()
-    if missing or storage.damage_description:
+    if storage.damage_description or storage.find_missing_chunks():
         with storage.open_for_writing():
             _compute_chunks(
-                scan_plan, storage, missing, on_progress, executor or _compute_in_process
+                scan_plan,
+                storage,
+                storage.find_missing_chunks(),
+                on_progress,
+                executor or _compute_in_process,
             )
     return storage.load_dataset()
 

@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,14 +26,20 @@ from vrw_jax.measures import MEASURES
 from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.integrity import (
+    ATTRIBUTES,
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,
+    COORDINATES,
     DIGEST_SIZE_BYTES,
     LEGACY_MARKS_NAME,
     MANIFEST_ATTRIBUTE,
+    VARIABLES,
     ChunkChecksums,
+    StoredMetadata,
     describe_damage,
+    digest_values,
     read_manifest,
+    seal,
     store_lock,
 )
 from vrw_jax.scans.measure_catalog import canonicalize_name
@@ -194,16 +200,31 @@ class ZarrStore(AbstractStore):
     """Storage of a scan's results in a folder; `verify` finds damaged chunks."""
 
     def __init__(self, path: Path, layout: ResultLayout, verify: bool = True) -> None:
-        self._path, self._layout, self.location = path, layout, str(path)
-        self._group = zarr.open_group(path, mode="r+", zarr_format=3)
-        self._checksums = ChunkChecksums(path, self._group)
-        self.damaged_chunks = self._checksums.find_damaged_chunks() if verify else []
-        self._damaged_coordinates = self._checksums.find_damaged_coordinates() if verify else []
+        self._path, self._layout, self.location, self._verify = path, layout, str(path), verify
+        self._open()
         self.damage_description = describe_damage(
-            path, self.damaged_chunks, self._damaged_coordinates
+            path, self.damaged_chunks, self._damaged_coordinates, self._metadata
         )
 
+    def _open(self) -> None:
+        metadata, self._checksums = StoredMetadata(self._path), None
+        self._metadata = metadata.damaged() if self._verify else []
+        self.damaged_chunks: list[int] = []
+        self._damaged_coordinates: list[str] = []
+        try:
+            self._group = _open_group(self._path, "r+", metadata)
+            self._checksums = ChunkChecksums(self._path, self._group, metadata)
+        except NOT_METADATA:
+            if not self._metadata:
+                raise
+            return  # they are mended before anything is written
+        if self._verify:
+            self.damaged_chunks = self._checksums.find_damaged_chunks()
+            self._damaged_coordinates = self._checksums.find_damaged_coordinates()
+
     def find_missing_chunks(self) -> list[int]:
+        if self._checksums is None:
+            return list(range(self._layout.n_chunks))
         is_done = self._checksums.is_chunk_marked()
         is_done[np.asarray(self.damaged_chunks, int)] = False
         return [int(i) for i in np.flatnonzero(~is_done)]
@@ -212,6 +233,7 @@ class ZarrStore(AbstractStore):
         region = self._layout.chunk_region(index)
         for variable in self._layout.variables:
             _get_array(self._group, variable.name)[region] = block[variable.name]
+        assert self._checksums is not None
         self._checksums.mark_chunk(index)
         self.damaged_chunks = [chunk for chunk in self.damaged_chunks if chunk != index]
 
@@ -223,6 +245,9 @@ class ZarrStore(AbstractStore):
         with store_lock(self._path):
             for path in self._path.rglob("*.partial"):
                 path.unlink(missing_ok=True)
+            if self._metadata:
+                _mend_metadata(self._path, self._layout)
+                self._open()
             for name in self._damaged_coordinates:
                 _get_array(self._group, name)[:] = self._layout.coordinates[name][1]
             self._damaged_coordinates = []
@@ -261,27 +286,61 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
     check_type("path", path, (str, Path), "give the folder that a scan wrote")
-    group = _open_scan_group(Path(path))
-    checksums = ChunkChecksums(Path(path), group)
-    if verify:
-        damage_description = describe_damage(
-            path, checksums.find_damaged_chunks(), checksums.find_damaged_coordinates()
-        )
-        if damage_description:
-            raise ValueError(
-                f"{damage_description}: run the scan again, which computes these anew, or read the "
-                "rest with open_scan(path, verify=False)."
+    metadata = _open_scan_group(Path(path))
+    broken = metadata.damaged() if verify else []
+    try:
+        group = _open_group(Path(path), "r", metadata)
+        checksums = ChunkChecksums(Path(path), group, metadata)
+        if verify:
+            damage_description = describe_damage(
+                path, checksums.find_damaged_chunks(), checksums.find_damaged_coordinates(), broken
             )
-    dataset = xr.open_zarr(
-        path,
-        consolidated=group.metadata.consolidated_metadata is not None,
-        chunks=None,
-        mask_and_scale=False,
-        decode_times=False,
-    )
+            if damage_description:
+                raise ValueError(f"{damage_description}: {ANEW}")
+        dataset = xr.open_zarr(
+            path,
+            consolidated=group.metadata.consolidated_metadata is not None,
+            chunks=None,
+            mask_and_scale=False,
+            decode_times=False,
+        )
+    except NOT_METADATA as error:
+        if isinstance(error, ValueError) and ANEW in str(error):
+            raise
+        what = ", ".join(broken) or " ".join(str(error).split()).rstrip(".")
+        raise ValueError(
+            f"{path} can't be opened ({what}): run the scan again, which mends the arrays that it "
+            "wrote, and delete others without dimension names."
+        ) from error
+    dataset = dataset.assign_attrs({k: v for k, v in metadata.attrs.items() if k != "coordinates"})
     return _arrange_as_requested(
         _split_legacy_stability_margin(dataset.drop_vars(LEGACY_MARKS_NAME, errors="ignore"))
     )
+
+
+ANEW = (
+    "run the scan again, which computes these anew, or read the rest with "
+    "open_scan(path, verify=False)."
+)
+NOT_METADATA = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
+    ValueError,
+)  # fmt: skip
+"""What zarr, its codecs and xarray raise for metadata that they can't make sense of."""
+
+
+def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) -> zarr.Group:
+    """Open a store by whichever copy of its metadata can be read; the one in its file first."""
+    for consolidated in (None, False):
+        try:
+            group = zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=consolidated)
+            for name in (*metadata.coordinates, *metadata.book.get(VARIABLES, ()), "outcome"):
+                _get_array(group, name)
+            return group
+        except NOT_METADATA:
+            if consolidated is False:
+                raise
+    raise AssertionError
 
 
 def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
@@ -335,30 +394,32 @@ def _split_legacy_stability_margin(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.assign(stability_margin=paper_margin)
 
 
-def _open_scan_group(path: Path) -> zarr.Group:
-    """Return the Zarr group of the scan at `path`; raise if there is none."""
-    try:
-        group = zarr.open_group(path, mode="r", zarr_format=3)
-        attrs = dict(group.attrs)
-    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
+def _open_scan_group(path: Path) -> StoredMetadata:
+    metadata = StoredMetadata(path)
+    if metadata.root.get("node_type") != "group" or metadata.root.get("zarr_format") != 3:
         raise ValueError(
             f"{path} is no scan's store: give the folder that `vrw scan` wrote, or a new place."
-        ) from error
-    if MANIFEST_ATTRIBUTE not in attrs:
+        )
+    if MANIFEST_ATTRIBUTE not in metadata.attrs:
         raise ValueError(
             f"{path} is a Zarr store, but not a scan's: give the folder that `vrw scan` wrote."
         )
-    return group
+    return metadata
 
 
 def read_stored_manifest(path: Path) -> dict | None:
     """Return the settings and provenance of the store at `path`, or None if there is no store."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
-    attrs = dict(_open_scan_group(path).attrs)
-    origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
-    origin = json.loads(origin) if isinstance(origin, str) else origin
-    return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: origin}
+    attrs = _open_scan_group(path).attrs
+    try:
+        origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
+        origin = json.loads(origin) if isinstance(origin, str) else origin
+        return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: origin}
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} has damaged attributes ({error}): give another place for this scan."
+        ) from error
 
 
 def find_first_difference(
@@ -427,7 +488,17 @@ def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]
             attributes=dict(variable.attrs),
         )
     chunks = (layout.n_chunks, DIGEST_SIZE_BYTES)
-    group.create_group(CHECKSUM_GROUP_NAME).create_array(
+    book = seal(
+        {
+            VARIABLES: [variable.name for variable in layout.variables],
+            COORDINATES: {
+                name: digest_values(np.asarray(values))
+                for name, (_, values, _) in layout.coordinates.items()
+            },
+            ATTRIBUTES: dict(group_attrs),
+        }
+    )
+    group.create_group(CHECKSUM_GROUP_NAME, attributes=book).create_array(
         "digest", shape=chunks, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
     )
     _consolidate_metadata(
@@ -450,3 +521,15 @@ def _consolidate_metadata(path: Path, names: list[str]) -> None:
     metadata_path.write_text(
         json.dumps(metadata | {"consolidated_metadata": consolidated}, indent=2)
     )
+
+
+def _mend_metadata(path: Path, layout: ResultLayout) -> None:
+    """Write the metadata of the scan's own arrays again, as in a store made anew beside it."""
+    stored = StoredMetadata(path)
+    building = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+    try:
+        building.mkdir()
+        _create_arrays(building, layout, stored.attrs)
+        stored.mend(StoredMetadata(building))
+    finally:
+        shutil.rmtree(building, ignore_errors=True)

@@ -1,15 +1,15 @@
 """Machine code cached by its content: a trace that gives the same text is not compiled again.
 
-Two files represent a function. An index, named by a digest of everything that the trace depends on,
-contains the name of the code; the code is stored under a digest of the text that LLVM compiles. An
-edit of the source that changes no trace therefore costs a trace but no compilation, and the name
-that JAX programs call stays the same.
+A program is one record, under a digest of what LLVM compiles and for which processor. An index, by
+all that the function's trace depends on, holds the name of that record. So an edit of the source
+that changes no trace costs a trace, not a compiler, and the name that programs of JAX call stays.
 """
 
 import contextlib
 import gc
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
@@ -20,8 +20,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from vrw_jax.simd.kernel import write_module
-from vrw_jax.simd.machine import compilation_key, compile_native
+from vrw_jax.simd.kernel import KERNEL_NAME, write_module
+from vrw_jax.simd.machine import compilation_key, compile_native, require_object
 
 
 @runtime_checkable
@@ -29,7 +29,7 @@ class CodeStore(Protocol):
     """Storage of code between processes; a module with these two functions is one."""
 
     def load_bytes(self, name: str) -> bytes | None:
-        """Return the content saved under that name; None if there is none, or it is damaged."""
+        """What was kept under that name; None if nothing, damaged, or kept under another name."""
 
     def save_bytes(self, name: str, content: bytes) -> None:
         """Save `content` under that name."""
@@ -62,7 +62,7 @@ def get_machine_code(
     index = f"lanes_index_{_digest(repr(key_parts).encode())}"
     if index not in _code_by_name:
         name = store.load_bytes(index) if store is not None else None
-        code = load_machine_code(name.decode(), store) if name else None
+        code = load_machine_code(name.decode("ascii", "replace"), store) if name else None
         _code_by_name[index] = code or _trace_and_compile(
             function, shapes, width, index, store, max_unrolled
         )
@@ -116,9 +116,15 @@ def load_machine_code(name: str, store: CodeStore | None) -> MachineCode | None:
         if content is None:
             return None
         result_types, _, code = content.partition(b"\n")
+        try:
+            results = _parse_result_types(result_types)
+            require_object(code, KERNEL_NAME)
+        except (ValueError, TypeError) as error:  # LLVM would end the process over it
+            warnings.warn(f"{name} holds no machine code ({error}): compiled again.", stacklevel=2)
+            return None
         object_code: Future[bytes] = Future()
         object_code.set_result(code)
-        _code_by_name[name] = MachineCode(name, _parse_result_types(result_types), object_code)
+        _code_by_name[name] = MachineCode(name, results, object_code)
     return _code_by_name[name]
 
 

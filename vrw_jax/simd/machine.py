@@ -2,6 +2,8 @@
 
 import ctypes
 import functools
+import struct
+import sys
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -20,6 +22,13 @@ LLVM_PASSES = (
 They are chosen because the emitter writes nothing twice and already uses vectors. LLVM's usual list
 takes as long as all the rest, for code that is at most a twentieth faster.
 """
+
+ELF_64_BIT_LITTLE_ENDIAN = b"\x7fELF\x02\x01"
+"""How the object files begin that LLVM makes on Linux."""
+ELF_HEADER, ELF_SECTION = struct.Struct("<16sHHIQQQIHHHHHH"), struct.Struct("<IIQQQQIIQQ")
+"""The header of such a file, and an entry of its table of sections."""
+ELF_STRINGS, ELF_WITHOUT_DATA = 3, 8
+"""Kinds of sections: names, and memory that the file holds no bytes for."""
 
 
 @functools.cache
@@ -75,6 +84,29 @@ def _emit_object(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
         getattr(passes, f"add_{name}_pass")()
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     return machine.emit_object(module)
+
+
+def require_object(code: bytes, name: str) -> None:
+    """Refuse, with a ValueError, what isn't whole object code with a function of that name.
+
+    LLVM ends the process over a damaged file, so that its tables are looked at here. Only those of
+    ELF; of what other systems take, no more than the name.
+    """
+    if f"\0{name}\0".encode() not in code and f"\0_{name}\0".encode() not in code:
+        raise ValueError(f"it has no function {name}")
+    if llvm.get_object_format() != "ELF" or sys.byteorder != "little":
+        return
+    if len(code) < ELF_HEADER.size or not code.startswith(ELF_64_BIT_LITTLE_ENDIAN):
+        raise ValueError("it is no object file")
+    *_, begin, _, _, _, _, size, count, names = ELF_HEADER.unpack_from(code)
+    if size != ELF_SECTION.size or begin + count * size > len(code) or names >= count:
+        raise ValueError("its table of sections is cut off")
+    sections = [ELF_SECTION.unpack_from(code, begin + i * size) for i in range(count)]
+    for _, kind, _, _, offset, length, *_ in sections:
+        if kind != ELF_WITHOUT_DATA and offset + length > len(code):
+            raise ValueError("a section is cut off")
+    if sections[names][1] != ELF_STRINGS:
+        raise ValueError("it has no table of names")
 
 
 class LoadedCode:

@@ -35,7 +35,7 @@ from vrw_jax.printing import (
     format_quantity,
 )
 from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
-from vrw_jax.validation import check_int, check_reals, check_type
+from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
 SectionLike = Array | np.ndarray | Sequence[float]
@@ -68,7 +68,7 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
         return LadderWheel()
     if not isinstance(model, AbstractWheel):
         raise TypeError(
-            f"model is {model!r}, but a model of the ladder is needed: give "
+            f"model is {format_value(model)}, but a model of the ladder is needed: give "
             'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
         )
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
@@ -95,6 +95,7 @@ def check_options(options: StepOptions | None) -> StepOptions:
         check_type(
             "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
         )
+        StepOptions.require_scalars(options)  # a bound method takes equinox 0.1 ms to make
     return _make_default_options(jnp.result_type(float)) if options is None else options
 
 

@@ -13,7 +13,33 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src import xla_bridge
 from jaxtyping import Array
+
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number, chosen because arrays count by numbers of 64 bits."""
+
+_state = {"is_forked": False}
+"""Whether this process was forked from one in which JAX already computed."""
+
+
+def _note_fork() -> None:
+    """In a child made by fork: remember whether JAX's threads were left behind."""
+    _state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def refuse_fork() -> None:
+    """Refuse to compute in a forked child, which lacks JAX's threads and would wait for them."""
+    if _state["is_forked"]:
+        raise RuntimeError(
+            "this process was forked after JAX had made an array, and JAX's threads are not copied,"
+            " so that it would wait for ever: start processes with "
+            'multiprocessing.get_context("spawn") or "forkserver".'
+        )
 
 
 def suggest_name(name: object, allowed_names: Iterable[str]) -> str:
@@ -23,10 +49,8 @@ def suggest_name(name: object, allowed_names: Iterable[str]) -> str:
 
 
 def check_known_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
-    """Raise a ValueError for a name that is not in `allowed_names`: "'dampng' is no
-    parameter ...".
-    """
-    if name not in allowed_names:
+    """Refuse a name that is none of those `allowed`: "'dampng' is no parameter ..."."""
+    if not isinstance(name, str) or name not in allowed_names:
         allowed_text = ", ".join(allowed_names)
         raise ValueError(
             f"{format_value(name)} is no {description}{suggest_name(name, allowed_names)}: choose from {allowed_text}."
@@ -37,24 +61,37 @@ def format_value(value: object) -> str:
     """Return a value as text for a message: its repr if short, otherwise its type."""
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value):
         return f"an array of shape {np.shape(value)}"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"a {type(value).__name__}"
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # whatever a foreign object raises, or an integer of thousands of digits
+        return f"a {type(value).__name__}"
+    if len(text) <= 60:
+        return text
+    return f"a number of {len(text)} digits" if type(value) is int else f"a {type(value).__name__}"
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a value is one real number; True and False are not."""
+    """Whether it is one real number; True and False are none."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return True  # of any length
     dtype_kind = (
         np.asarray(value).dtype.kind if isinstance(value, float | int | np.generic) else "O"
     )
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value) == 0:
-        dtype_kind = np.dtype(value.dtype).kind
+        dtype_kind = getattr(value.dtype, "kind", "O")  # random keys have a type of JAX's own
     return dtype_kind in "fiu"
 
 
 def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> int:
-    """Return an integer of at least `min_value`; `reason` explains the limit in the message."""
+    """A whole number of at least `least`; `why` says why so many."""
+    refuse_fork()
     is_number = _is_number(value) and not isinstance(value, jax.core.Tracer)
-    if not is_number or np.asarray(value).dtype.kind not in "iu" or value < min_value:
+    is_whole = is_number and (isinstance(value, int) or np.asarray(value).dtype.kind in "iu")
+    if is_whole and int(value) > MAX_WHOLE:
+        raise ValueError(
+            f"{name} is {format_value(value)}, but it must be at most {MAX_WHOLE:,}: give a smaller one."
+        )
+    if not is_whole or int(value) < min_value:
         raise (ValueError if is_number else TypeError)(
             f"{name} is {format_value(value)}, but it must be a whole number of at least {min_value}{reason}: "
             f"give {name} = {min_value}, say."
@@ -63,14 +100,19 @@ def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> in
 
 
 def check_real(name: str, value: Any) -> float:
-    """Return one finite number."""
+    """One finite number."""
+    refuse_fork()
     if not _is_number(value) or isinstance(value, jax.core.Tracer):
         raise TypeError(
             f"{name} is {format_value(value)}, but it is one real number: give it as a float."
         )
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is {float(value):g}, but it must be finite: give a number.")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(f"{name} is {format_value(value)}, but it must be finite: give a number.")
+    return number
 
 
 def check_positive(name: str, value: Any) -> float:
@@ -102,17 +144,15 @@ def check_range(name: str, bounds: Any) -> tuple[float, float]:
 
 
 def check_reals(name: str, value: Any, advice: str = "give a number, or an array of them") -> Array:
-    """Return real numbers of any shape as a strongly typed array.
-
-    Python numbers get JAX's default type.
-    """
+    """Real numbers of any shape as a strongly typed array; Python's take JAX's default type."""
+    refuse_fork()
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
-    except (RuntimeError, AssertionError):
-        _check_device()  # the first array of a process initializes JAX's backend
-        raise
+    except Exception:  # whatever a foreign object raises
+        _check_device()  # the first array of a process finds out what it may run on
+        array = None
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
     ):
@@ -125,7 +165,8 @@ def check_reals(name: str, value: Any, advice: str = "give a number, or an array
 def check_numpy_reals(
     name: str, value: Any, advice: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """Return concrete real numbers as a numpy array, without JAX if they are already valid."""
+    """`reals` where numbers are known, as numpy holds them: JAX need not see what is sound."""
+    refuse_fork()
     if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
         return value
     return np.asarray(check_reals(name, value, advice))
@@ -144,14 +185,16 @@ def _check_device() -> None:
 
 
 def check_bool(name: str, value: Any) -> bool:
-    """Return True or False."""
+    """True or False."""
+    refuse_fork()
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} is {format_value(value)}, but it is a choice: give True or False.")
     return bool(value)
 
 
 def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
-    """Return one of several allowed words."""
+    """One of several words."""
+    refuse_fork()
     if not isinstance(value, str):
         raise TypeError(
             f"{name} is {format_value(value)}, but it is a word: give '{allowed_names[0]}', say."
@@ -164,18 +207,21 @@ def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
     return value
 
 
-def check_names(name: str, value: Any) -> tuple[str, ...]:
-    """Return several names; a single string counts as one name."""
-    values = (value,) if isinstance(value, str) else value
-    if not isinstance(values, Iterable) or not all(isinstance(v, str) for v in (*values,)):
-        raise TypeError(
-            f'{name} is {format_value(value)}, but it holds names: write ["dls_fraction"].'
-        )
-    return tuple(values)
+def check_names(name: str, value: Any, such_as: str = '"dls_fraction"') -> tuple[str, ...]:
+    """Several names; one alone may be given as it is."""
+    refuse_fork()
+    try:
+        values = (value,) if isinstance(value, str) else tuple(value)
+    except Exception:  # no collection, an array without axes, an unknown number
+        values = (None,)
+    if not all(isinstance(name, str) for name in values):
+        raise TypeError(f"{name} is {format_value(value)}, but it holds names: write [{such_as}].")
+    return values
 
 
 def check_type(name: str, value: Any, expected_type: type | tuple[type, ...], advice: str) -> None:
-    """Raise a TypeError unless a value has this type."""
+    """Refuse what is not of this kind."""
+    refuse_fork()
     if not isinstance(value, expected_type):
         type_name = (
             expected_type[0] if isinstance(expected_type, tuple) else expected_type
@@ -200,7 +246,8 @@ def is_traced(*trees: Any) -> bool:
 
 
 def check_not_traced(function: str, alternative: str, *trees: Any) -> None:
-    """Raise a TypeError inside `jit`, `vmap` or `grad`, for functions that run on the host."""
+    """Refuse to run inside `jit`, `vmap` or `grad`, for what runs on the host."""
+    refuse_fork()
     if is_traced(*trees):
         raise TypeError(
             f"{function} is called inside jit, vmap or grad, but it runs on known numbers: call it "

@@ -1,0 +1,250 @@
+"""What is executed from the cache is what was put there, by the user, under that very name."""
+
+import os
+import stat
+import subprocess
+import sys
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from support.machine_code import CodeRegistrySpy
+
+import vrw_jax as vrw
+from vrw_jax.runtime import (
+    cached_lane_function,
+    cached_lane_program,
+    compile_exported,
+)
+from vrw_jax.runtime import (
+    disk_cache as store,
+)
+
+X = np.arange(4.0)
+FACTORS = (2.0, 3.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A cache of the test's own."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    compilation_cache.reset_cache()
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def process(monkeypatch):
+    monkeypatch.setattr(store, "_warned", set())
+    return CodeRegistrySpy(monkeypatch)
+
+
+def multiples():
+    """The numbers of X times each factor, by machine code and by a trace that calls some."""
+    told = []
+    for factor in FACTORS:
+        lanes = lambda _, x, factor=factor: (factor * x[0],)
+        told.append(cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0])
+        within = cached_lane_function(lambda x, f=factor: f * x, lambda x: x, ("within", factor))
+        call = lambda x, g=within: g(x) + 0.0
+        told.append(
+            compile_exported(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(X)
+        )
+    return told
+
+
+def expected():
+    return [factor * X for factor in FACTORS for _ in range(2)]
+
+
+def check_recompiles(process, warns=True):
+    """The right numbers in a later process, with one warning at most, and then without any."""
+    for again in range(2):
+        process.reset_registry()
+        store._warned.clear()
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            np.testing.assert_array_equal(multiples(), expected())
+        told = [str(w.message) for w in seen if "again" in str(w.message)]
+        assert len(told) == (warns and not again), told
+
+
+@pytest.mark_chunk.parametrize("kind", ["lanes_index", "lanes_code", "vrw_trace"])
+def test_records_in_each_others_place_are_not_used(folder, process, kind):
+    """Reference: the product, in closed form; each record is sound but for its place."""
+    multiples()
+    records = sorted(folder.glob(f"{kind}_*"))
+    contents = [place.read_bytes() for place in records]
+    for place, content in zip(records, [*contents[1:], contents[0]], strict=True):
+        place.write_bytes(content)
+    check_recompiles(process)
+
+
+TEXTS = {
+    "nonsense": lambda content: b"[]\n" + bytes(range(256)) * 9,
+    "nothing": lambda content: b"",
+    "half": lambda content: content[: len(content) // 2],
+}
+OBJECTS = TEXTS | {
+    "its first line": lambda content: content.partition(b"\n")[0] + b"\n",
+    "no symbols": lambda content: content.replace(b"lanes", b"sheep"),
+    "a header before noise": lambda content: content[:120] + b"\0lanes\0" + b"\xa5" * 900,
+}
+
+
+GARBAGE = [
+    *(("lanes_code", what) for what in OBJECTS),
+    *((kind, what) for kind in ("lanes_index", "vrw_trace") for what in TEXTS),
+]
+
+
+@pytest.mark_chunk.parametrize(("kind", "what"), GARBAGE)
+def test_garbage_with_a_valid_digest_is_compiled_anew(folder, process, kind, what):
+    multiples()
+    for place in folder.glob(f"{kind}_*"):
+        store.save_bytes(place.stem, OBJECTS[what](store.load_bytes(place.stem)))
+    process.reset_registry()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        np.testing.assert_array_equal(multiples(), expected())
+
+
+def replace_by_folder(place):
+    place.unlink()
+    place.mkdir()
+
+
+def replace_by_pipe(place):
+    place.unlink()
+    os.mkfifo(place)
+
+
+DAMAGE = {
+    "another byte": lambda place: place.write_bytes(place.read_bytes()[:-9] + b"damaged!?"),
+    "truncated": lambda place: place.write_bytes(place.read_bytes()[:-9]),
+    "empty": lambda place: place.write_bytes(b""),
+    "writable by others": lambda place: place.chmod(0o666),
+    "a pipe": replace_by_pipe,
+}
+
+
+@pytest.mark_chunk.parametrize("what", DAMAGE)
+def test_a_damaged_record_is_compiled_anew_with_one_warning(folder, process, what):
+    multiples()
+    for place in [*folder.glob("lanes_*"), *folder.glob("vrw_*")]:
+        DAMAGE[what](place)
+    check_recompiles(process)
+
+
+def test_what_can_t_be_read_is_compiled_anew_with_one_warning(folder, process):
+    multiples()
+    for place in [*folder.glob("lanes_*"), *folder.glob("vrw_*")]:
+        replace_by_folder(place)
+    process.reset_registry()
+    with pytest.warns(UserWarning, match="it is compiled again") as seen:
+        np.testing.assert_array_equal(multiples(), expected())
+    assert len(seen) == 1
+
+
+def test_another_users_records_are_not_used(folder, process, monkeypatch):
+    multiples()
+    owner = os.geteuid() + 1
+    monkeypatch.setattr(os, "geteuid", lambda: owner)
+    with pytest.warns(UserWarning, match="belongs to another user, but"):
+        assert store.cache_folder() is None
+    assert store.load_bytes(next(folder.glob("lanes_code_*")).stem) is None
+    monkeypatch.setenv(store.TRUST_SHARED_VARIABLE, "1")
+    assert store.load_bytes(next(folder.glob("lanes_code_*")).stem)
+
+
+def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
+    traces = []
+
+    def double(x):
+        traces.append(1)
+        return 2.0 * x
+
+    run = lambda: compile_exported(double, (X,), "versions", jax.devices()[0])(X)
+    run(), run()
+    assert len(traces) == 1
+    monkeypatch.setattr(store, "_versions", lambda: ("diffrax 0.0",))
+    run()
+    assert len(traces) == 2
+
+
+def test_a_record_that_can_t_be_written_whole_leaves_nothing(folder, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    store.save_bytes("lanes_code_x", b"content")
+    assert not list(folder.iterdir())
+
+
+# Folders
+
+
+def started(code="", **environment):
+    """A process under an umask of 0, which starts JAX."""
+    lines = f"import os; os.umask(0); import vrw_jax as vrw; {code or 'vrw.start_jax()'}"
+    outside = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    return subprocess.run(
+        [sys.executable, "-c", lines], env=outside | environment, capture_output=True, text=True
+    )
+
+
+def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
+    code = (
+        "vrw.start_jax(); import numpy as np; from vrw_jax.runtime import lane_program; "
+        "lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], [np.ones(4)])"
+    )
+    made = started(code, XDG_CACHE_HOME=str(tmp_path / "a" / "b"))
+    assert made.returncode == 0, made.stderr
+    for place in (tmp_path / "a").rglob("*"):
+        allowed = 0o700 if place.is_dir() else 0o600
+        assert stat.S_IMODE(place.stat().st_mode) & ~allowed == 0, place
+    assert list((tmp_path / "a").rglob("lanes_code_*"))
+
+
+@pytest.mark_chunk.parametrize("mode", [0o777, 0o770, 0o702, 0o1777])
+def test_a_folder_that_others_can_write_is_refused_in_one_sentence(tmp_path, mode):
+    place = tmp_path / "cache"
+    place.mkdir()
+    place.chmod(mode)
+    told = started(JAX_COMPILATION_CACHE_DIR=str(place))
+    line = told.stderr.splitlines()[-1]
+    assert line.startswith(f"PermissionError: the cache {place} can be written by other users")
+    assert line.endswith("VRW_TRUST_SHARED_CACHE=1.")
+    for allowed in (
+        started("vrw.start_jax(trust_shared=True)", JAX_COMPILATION_CACHE_DIR=str(place)),
+        started(JAX_COMPILATION_CACHE_DIR=str(place), VRW_TRUST_SHARED_CACHE="1"),
+    ):
+        assert allowed.returncode == 0, allowed.stderr
+
+
+def test_a_refused_folder_is_not_jaxs_either(tmp_path):
+    before = jax.config.jax_compilation_cache_dir
+    tmp_path.chmod(0o777)
+    try:
+        with pytest.raises(PermissionError, match="what lies there is executed: run `chmod 700`"):
+            vrw.start_jax(tmp_path)
+        assert jax.config.jax_compilation_cache_dir is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_the_command_line_refuses_such_a_folder_in_one_line(tmp_path):
+    tmp_path.chmod(0o777)
+    told = subprocess.run(
+        [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"],
+        env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert told.returncode == 2
+    assert len(told.stderr.splitlines()) == 1
+    assert told.stderr.startswith("vrw: the cache")
