@@ -47,7 +47,7 @@ LITERALS = (
 PLACES = [(table, key) for table, keys in KEYS.items() for key in keys]
 
 
-@pytest.mark_chunk.parametrize("rung", [*config.MODEL_CLASSES])
+@pytest.mark.parametrize("rung", [*config.MODEL_CLASSES])
 @settings(
     max_examples=150, derandomize=True, database=None, deadline=None,
     suppress_health_check=list(HealthCheck),

@@ -498,7 +498,7 @@ def test_a_missing_device_is_reported_in_one_sentence(command: str, tmp_path: Pa
 ADDRESSES = ["tls://127.0.0.1:9", "tcp://127.0.0.1:99999", "tcp://", "", "inproc://x", "silent"]
 
 
-@pytest.mark_chunk.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("address", ADDRESSES)
 def test_a_cluster_that_does_not_answer_gets_one_sentence(address: str, folder: Path) -> None:
     (folder / "my.toml").write_text(GRID_TABLE)
     with socket.create_server(("127.0.0.1", 0)) as server:  # takes a call, and says nothing
@@ -523,7 +523,7 @@ def process(folder: Path, arguments: tuple[str, ...], environment: dict, **more:
     )  # fmt: skip
 
 
-@pytest.mark_chunk.parametrize("name", PROCESSES)
+@pytest.mark.parametrize("name", PROCESSES)
 def test_an_environment_that_can_t_be_meant_gets_one_sentence(name: str, folder: Path) -> None:
     (folder / "my.toml").write_text(GRID_TABLE)
     arguments, environment, expected = PROCESSES[name]
@@ -535,8 +535,8 @@ def test_an_environment_that_can_t_be_meant_gets_one_sentence(name: str, folder:
     assert list_files(folder) == before
 
 
-@pytest.mark_chunk.skipif(not Path("/dev/full").exists(), reason="there is no full device")
-@pytest.mark_chunk.parametrize("arguments", [("--version",), ("init", "new")])
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark.parametrize("arguments", [("--version",), ("init", "new")])
 def test_a_full_device_gets_one_sentence(arguments: tuple[str, ...], folder: Path) -> None:
     with open("/dev/full", "w") as full:
         told = process(folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)

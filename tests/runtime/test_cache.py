@@ -74,7 +74,7 @@ def check_recompiles(process, warns=True):
         assert len(told) == (warns and not again), told
 
 
-@pytest.mark_chunk.parametrize("kind", ["lanes_index", "lanes_code", "vrw_trace"])
+@pytest.mark.parametrize("kind", ["lanes_index", "lanes_code", "vrw_trace"])
 def test_records_in_each_others_place_are_not_used(folder, process, kind):
     """Reference: the product, in closed form; each record is sound but for its place."""
     multiples()
@@ -103,7 +103,7 @@ GARBAGE = [
 ]
 
 
-@pytest.mark_chunk.parametrize(("kind", "what"), GARBAGE)
+@pytest.mark.parametrize(("kind", "what"), GARBAGE)
 def test_garbage_with_a_valid_digest_is_compiled_anew(folder, process, kind, what):
     multiples()
     for place in folder.glob(f"{kind}_*"):
@@ -133,7 +133,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark_chunk.parametrize("what", DAMAGE)
+@pytest.mark.parametrize("what", DAMAGE)
 def test_a_damaged_record_is_compiled_anew_with_one_warning(folder, process, what):
     multiples()
     for place in [*folder.glob("lanes_*"), *folder.glob("vrw_*")]:
@@ -211,7 +211,7 @@ def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     assert list((tmp_path / "a").rglob("lanes_code_*"))
 
 
-@pytest.mark_chunk.parametrize("mode", [0o777, 0o770, 0o702, 0o1777])
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o702, 0o1777])
 def test_a_folder_that_others_can_write_is_refused_in_one_sentence(tmp_path, mode):
     place = tmp_path / "cache"
     place.mkdir()

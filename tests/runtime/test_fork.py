@@ -90,7 +90,7 @@ def children(tmp_path_factory):
     return fork("arrays", CALLS, 20, tmp_path_factory.mktemp("fork"))
 
 
-@pytest.mark_chunk.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", CALLS)
 def test_a_forked_child_is_told_to_be_spawned(children, name):
     kind, sentence = children[name]
     assert kind == "RuntimeError", (kind, sentence)

@@ -338,7 +338,7 @@ def test_a_chunk_of_another_design_is_seen_though_its_mark_came_along(
         open_scan(store)
 
 
-@pytest.mark_chunk.parametrize("keeps", [True, False], ids=["attributes kept", "attributes lost"])
+@pytest.mark.parametrize("keeps", [True, False], ids=["attributes kept", "attributes lost"])
 def test_a_variable_that_a_user_adds_is_no_damage(store: Path, keeps: bool) -> None:
     before = open_scan(store).load()
     mine = xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs if keeps else {})
@@ -365,8 +365,8 @@ METADATA = {
 }
 
 
-@pytest.mark_chunk.parametrize("what", METADATA)
-@pytest.mark_chunk.parametrize("name", ["speed", "outcome", "damping", "bookkeeping/digest"])
+@pytest.mark.parametrize("what", METADATA)
+@pytest.mark.parametrize("name", ["speed", "outcome", "damping", "bookkeeping/digest"])
 def test_damaged_metadata_of_an_array_are_said_and_mended(
     store: Path, name: str, what: str
 ) -> None:
@@ -405,7 +405,7 @@ def inline(root: dict, name: str) -> dict:
     return root["consolidated_metadata"]["metadata"][name]
 
 
-@pytest.mark_chunk.parametrize("what", ROOT)
+@pytest.mark.parametrize("what", ROOT)
 def test_damage_of_the_metadata_of_all_is_said_and_mended_or_harmless(
     store: Path, what: str
 ) -> None:
@@ -444,7 +444,7 @@ def as_before_marks_covered_settings(store: Path) -> None:
         books.mark_chunk(index)
 
 
-@pytest.mark_chunk.parametrize("what", [None, *DAMAGE_CASES])
+@pytest.mark.parametrize("what", [None, *DAMAGE_CASES])
 def test_a_store_whose_marks_cover_files_alone_opens_and_its_damage_is_seen(
     store: Path, what: str | None
 ) -> None:

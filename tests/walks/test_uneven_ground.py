@@ -1,15 +1,219 @@
-"""A floor whose slope and friction differ from step to step: another code, energy, plain calls."""
+"""Uneven ground: independent codes in an absolute frame, energy, derivatives, plain calls."""
 
+import itertools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import complementarity
+from oracle import complementarity, uneven_ground
+from oracle.five_coordinates import TABLE_1
 
 import vrw_jax as vrw
+from vrw_jax.batches.landing_steps import step_batch_after_landing
 from vrw_jax.contact.mechanics import find_slots, slot_friction
 from vrw_jax.contact.section import pack_section_state, unpack_section_state
+from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 START = (0.1, 1.6, -0.1)
+TIGHT = vrw.StepOptions.tight()
+LINES = (0.31225, 0.28467, 0.30251, 0.29659, 0.29728, 0.29896, 0.29158, 0.30482, 0.3043, 0.29, 0.3)
+"""Slopes of eleven lines, about 0.30 with a standard deviation of 0.008."""
+OTHER = {**TABLE_1, "damping": 150.0}
+WHEEL = {"damping": 150.0}
+
+
+def paper_walk(slopes, n_steps, **given):
+    return vrw.walk(vrw.WheelParams(**WHEEL, slope=jnp.asarray(slopes)), START, n_steps, **given)
+
+
+def test_ten_steps_of_the_papers_wheel_are_those_in_an_absolute_frame():
+    walk, other = paper_walk(LINES, 10, options=TIGHT), uneven_ground.walk(OTHER, START, LINES)
+    assert int(walk.n_stepped) == len(other) == 10
+    durations, states = (np.stack([getattr(step, name) for step in other]) for name in
+                         ("durations", "section_state"))  # fmt: skip
+    assert abs(float(jnp.sum(walk.steps.durations)) - durations.sum()) < 1e-12
+    np.testing.assert_allclose(walk.steps.durations, durations, atol=1e-12)
+    np.testing.assert_allclose(walk.steps.section_state, states, atol=1e-12)
+    by_diffrax = paper_walk(LINES, 10, options=TIGHT, engine="diffrax")
+    np.testing.assert_allclose(by_diffrax.steps.durations, durations, atol=1e-12)
+
+
+def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
+    x, other = START, uneven_ground.walk(OTHER, START, LINES[:4])
+    for k, truth in enumerate(other):
+        params = vrw.WheelParams(**WHEEL, slope=jnp.asarray(LINES[k : k + 2]))
+        step = vrw.step(params, x, options=TIGHT)
+        np.testing.assert_allclose(vrw.return_map(params, x, options=TIGHT), step.section_state)
+        np.testing.assert_allclose(step.section_state, truth.section_state, atol=1e-12)
+        np.testing.assert_allclose(step.post_impact, truth.post_impact, atol=1e-12)
+        lost = truth.lost_landing, truth.lost_stopper, truth.lost_damping
+        energy = step.energy
+        np.testing.assert_allclose(
+            [energy.landing, energy.stopper, energy.damping], lost, atol=1e-11
+        )
+        assert abs(truth.energy_residual) < 1e-11
+        assert abs(float(step.margins.clearance_sls1) - truth.clearance) < 1e-10
+        x = step.section_state
+
+
+def test_derivatives_by_every_slope_are_differences_of_an_absolute_frame():
+    slopes, h = np.array(LINES[:4]), 1e-4
+
+    def other(change):
+        return uneven_ground.walk(OTHER, START, slopes + change)[-1].section_state
+
+    ends = lambda slopes: paper_walk(slopes, 3, options=TIGHT).steps.section_state[-1]
+    forward = jax.jacfwd(ends)(jnp.asarray(slopes))
+    np.testing.assert_allclose(jax.jacrev(ends)(jnp.asarray(slopes)), forward, atol=1e-12)
+    for j, unit in enumerate(h * np.eye(4)):
+        near, far = (other(a * unit) - other(-a * unit) for a in (1, 2))
+        np.testing.assert_allclose(forward[:, j], (8 * near - far) / (12 * h), atol=1e-8)
+
+
+def test_as_many_slopes_as_steps_use_the_last_one_twice():
+    walk, same = paper_walk(LINES[:3], 3), paper_walk((*LINES[:3], LINES[2]), 3)
+    np.testing.assert_array_equal(walk.steps.durations, same.steps.durations)
+    model = vrw.UnilateralWheel(friction=jnp.asarray([0.7, 0.5, 0.9]))
+    wheel = lambda slopes: vrw.WheelParams(slope=jnp.asarray(slopes))
+    walk = model.split_ground(wheel(LINES[:3]), 3)
+    longer = vrw.UnilateralWheel(friction=jnp.asarray([0.7, 0.5, 0.9, 0.1]))
+    same = longer.split_ground(wheel((*LINES[:3], LINES[2])), 3)
+    for row, other in zip(walk, same, strict=True):
+        np.testing.assert_array_equal(row, other)
+
+
+def test_equal_slopes_are_flat_ground():
+    flat, lines = paper_walk(0.3, 4), paper_walk(np.full(5, 0.3), 4)
+    np.testing.assert_allclose(lines.steps.section_state, flat.steps.section_state, atol=1e-13)
+
+
+def test_a_wall_ahead_that_no_wheel_may_stand_on_is_bad_input():
+    walk = paper_walk((0.3, 0.3, 2.0, 0.3), 3)
+    assert walk.steps.outcome.tolist() == [0, vrw.Outcome.BAD_INPUT, vrw.Outcome.BAD_INPUT]
+
+
+def test_a_batch_walks_over_its_lines_as_wheels_do_one_by_one():
+    n, draw = 4, np.random.default_rng(1)
+    slopes = 0.3 + 0.004 * draw.standard_normal((3, n + 1))
+    damping, starts = np.array([130.0, 150.0, 170.0]), np.tile(START, (3, 1))
+    asked = "slope", "damping", "section_state"
+
+    def one(damping, slope, x):
+        walk = vrw.walk(vrw.WheelParams(damping=damping, slope=slope), x, n)
+        return walk.steps.section_state[-1]
+
+    for given in (slopes, slopes[:, :n]):
+        params = vrw.WheelParams(damping=damping, slope=given)
+        found = vrw.step_batch(params, starts, n, derivatives=asked)
+        assert found.n_stepped.tolist() == [n] * 3
+        assert found.derivatives["slope"].section_state.shape == (3, 3, given.shape[1])
+        for i in range(3):
+            args = tuple(map(jnp.asarray, (damping[i], given[i], starts[i])))
+            np.testing.assert_allclose(found.section_state[i], one(*args), atol=1e-10)
+            by = jax.jacfwd(one, (0, 1, 2))(*args)
+            for name, truth in zip(("damping", "slope", "section_state"), by, strict=True):
+                own = found.derivatives[name].section_state[i]
+                np.testing.assert_allclose(own, truth, atol=1e-11)
+
+
+def test_a_walk_of_places_keeps_its_footholds_and_loses_what_dampers_and_impacts_take():
+    other = uneven_ground.walk(OTHER, START, LINES[:4])
+    walk = vrw.simulate(vrw.WheelParams(**WHEEL, slope=LINES[:4]), START, 3, options=TIGHT)
+    sin, cos = np.sin(LINES[0]), np.cos(LINES[0])
+    assert walk.attrs["slopes"] == list(LINES[:4])
+    energies = [walk.total_energy.values[walk.step.values == k] for k in range(3)]
+    for k, truth in enumerate(other):
+        x, z = (walk[name].values[walk.step.values == k] for name in ("foot_1_x", "foot_1_z"))
+        assert max(np.ptp(x), np.ptp(z)) == 0.0
+        place = x[0] * cos + z[0] * sin, z[0] * cos - x[0] * sin
+        np.testing.assert_allclose(place, truth.foothold - other[0].foothold, atol=1e-12)
+        lost = truth.lost_damping + truth.lost_stopper
+        assert abs(energies[k][0] - energies[k][-1] - lost) < 1e-10
+        if k:
+            assert abs(energies[k - 1][-1] - energies[k][0] - truth.lost_landing) < 1e-10
+
+
+def test_rigid_wheels_step_from_line_to_line_by_the_closed_formula():
+    half, slopes = np.pi / 8, (0.16, 0.12, 0.15, 0.1, 0.17)
+    params = vrw.WheelParams(leg_mass=1e-9, slope=slopes, gravity=1.0)
+    walk = vrw.walk(params, (half, 1.0, 0.0), 4, model=vrw.RigidWheel())
+    x, rates = 1.0, []
+    for line, ahead in itertools.pairwise(slopes):
+        first = x * np.cos(2 * half) ** 2 - 2 * (1 - np.cos(half - line))
+        x = first + 2 * (1 - np.cos(half + ahead)) if first > 0 else 0.0
+        rates.append(np.sqrt(x))
+    np.testing.assert_allclose(walk.steps.section_state[:, 1], rates, atol=1e-8)
+    assert 0 < int(walk.n_stepped) <= 4
+
+
+def test_a_step_between_landings_is_that_of_the_walk():
+    params, walk = vrw.WheelParams(**WHEEL), paper_walk(LINES[:4], 3)
+
+    def landed(x):
+        landing = transitions.land(params.symbols(), *x)
+        return np.array([landing.theta, landing.motion.dtheta]), float(landing.rear_impulse.normal)
+
+    states = [jnp.asarray(START), *walk.steps.section_state]
+    wheels = np.tile([[float(getattr(params, name))] for name in PARAMETER_NAMES], 3)
+    wheels[PARAMETER_NAMES.index("slope")] = LINES[:3]
+    starts = np.stack([landed(x)[0] for x in states[:3]], 1)
+    found = step_batch_after_landing(wheels, starts, np.array(LINES[1:4]))
+    np.testing.assert_allclose(
+        found.state, np.stack([landed(x)[0] for x in states[1:]], 1), atol=1e-13
+    )
+    np.testing.assert_allclose(found.rear_impulse, [landed(x)[1] for x in states[1:]], atol=1e-12)
+    np.testing.assert_allclose(found.durations.T, walk.steps.durations, atol=1e-13)
+
+
+def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
+    params = vrw.WheelParams()
+    landing = transitions.land(params.symbols(), *vrw.limit_cycle(params).section_state)
+    wheel = np.array([[float(getattr(params, name))] for name in PARAMETER_NAMES])
+    start = np.array([[float(landing.theta)], [float(landing.motion.dtheta)]])
+
+    def at(slopes, **given):
+        lanes = np.ones((1, len(slopes)))
+        return step_batch_after_landing(wheel * lanes, start * lanes, np.asarray(slopes), **given)
+
+    edge = 0.21
+    for _ in range(5):
+        found = at([edge], moved=("slope_ahead",))
+        edge = edge - found.stopper_margin[0] / found.jacobian[0, 3, 0]
+    near = at([edge - 1e-6, edge + 1e-6], moved=("slope_ahead",))
+    early = vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
+    assert near.outcome.tolist() == [early, vrw.Outcome.STEPPED]
+    slopes = near.jacobian[0, 3]
+    assert abs(slopes[1] - slopes[0]) < 1e-5 * slopes[0]
+    h, options = 1e-5, TIGHT
+    ends = [at([0.29 + d], options=options) for d in (h, -h)]
+    rows = [np.array([*end.state[:, 0], *end.rear_impulse, *end.stopper_margin]) for end in ends]
+    told = at([0.29], moved=("slope_ahead",)).jacobian[0, :, 0]
+    np.testing.assert_allclose(told, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
+
+
+@pytest.mark.parametrize("model", [None, vrw.RigidWheel(), vrw.UnilateralWheel()])
+def test_slopes_that_are_not_over_the_steps_are_one_sentence(model):
+    params = vrw.WheelParams(slope=LINES[:5])
+    sentence = (
+        r"slope has shape \(5,\), but a walk of 3 steps of one wheel takes one number, or an a"
+    )
+    with pytest.raises(ValueError, match=sentence):
+        vrw.walk(params, START, 3, model=model)
+    with pytest.raises(ValueError, match=sentence):
+        vrw.simulate(params, START, 3, model=model)
+    with pytest.raises(ValueError, match=r"slope has shape \(5,\), but a step of one wheel takes"):
+        vrw.step(params, START, model=model)
+
+
+def test_frictions_that_are_not_over_the_steps_are_one_sentence():
+    model = vrw.UnilateralWheel(friction=jnp.ones(5))
+    with pytest.raises(ValueError, match=r"friction has shape \(5,\), but a walk of 3 steps"):
+        vrw.walk(vrw.WheelParams(), START, 3, model=model)
+
+
+# --- With unilateral contact.
+
 SLOPES, FRICTIONS = (0.3, 0.33, 0.27, 0.31), (0.7, 0.5, 0.9, 0.6)
 
 
@@ -44,12 +248,21 @@ def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     np.testing.assert_allclose(turned[2:4], frame @ np.asarray(result[2:4]), atol=1e-15)
 
 
-def test_arrays_not_over_steps_are_refused_like_batches():
-    params, model = make_uneven_ground()
-    with pytest.raises(ValueError, match="one wheel"):
-        vrw.walk(params, START, 3, model=model)
-    with pytest.raises(ValueError, match="one wheel"):
-        vrw.walk(params, START, 4)  # the paper's rung: roles do not ask for it
+STEEP = 0.45
+"""Slope of a line ahead on which Leg 2 meets its stopper after the next foot has passed the
+continuation of the line of slope 0.3."""
+
+
+def test_a_steep_line_ahead_is_not_met_before_the_foot_is_there():
+    """At the stopper's impact that foot is already below the line on which the wheel stands."""
+    slopes, model = jnp.asarray((0.3, STEEP)), vrw.UnilateralWheel(friction=20.0)
+    params = vrw.WheelParams(damping=240.0, slope=slopes)
+    walk = vrw.walk(params, START, 1, model=model, options=TIGHT)
+    wheel = complementarity.ComplementarityWheel(
+        np.full(8, 20.0), c=240.0, slope=0.3, tilt=STEEP - 0.3
+    )
+    other = complementarity.compute_step(wheel, complementarity.paper_start(wheel, *START))
+    np.testing.assert_allclose(walk.steps.durations[0], other.durations, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -78,28 +291,59 @@ START_STATES = np.tile((0.1, 1.6, -0.1), (3, 1))
 
 
 @pytest.mark.slow
-def test_a_batch_on_uneven_ground_equals_single_wheels():
-    damping = np.array([250.0, 270.0, 300.0])
-    params, ground = vrw.WheelParams(damping=damping, slope=UNEVEN_SLOPES), vrw.UnilateralWheel
-    batch_result = vrw.step_batch(params, START_STATES, 3, model=ground(friction=UNEVEN_FRICTIONS))
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_batch_on_uneven_ground_equals_single_wheels(more):
+    damping, asked = np.array([250.0, 270.0, 300.0]), ("slope", "friction", "damping")
+    floors = np.concatenate([UNEVEN_SLOPES, UNEVEN_SLOPES[:, :1]], 1)[:, : 3 + more]
+    grounds = np.concatenate([UNEVEN_FRICTIONS, UNEVEN_FRICTIONS[:, :1]], 1)[:, : 3 + more]
+    params, ground = vrw.WheelParams(damping=damping, slope=floors), vrw.UnilateralWheel
+    batch_result = vrw.step_batch(params, START_STATES, 3, model=ground(friction=grounds))
+    moved = vrw.step_batch(
+        params, START_STATES, 3, model=ground(friction=grounds), derivatives=asked
+    )
     assert batch_result.n_stepped.tolist() == [3, 3, 3]
-    for i, (c, slope, friction) in enumerate(
-        zip(damping, UNEVEN_SLOPES, UNEVEN_FRICTIONS, strict=True)
-    ):
-        one = vrw.WheelParams(damping=c, slope=slope)
-        walk = vrw.walk(one, START_STATES[i], 3, model=ground(friction=friction))
-        # The same program for many and for one; XLA sums in another order.
-        np.testing.assert_allclose(batch_result.durations[i], walk.steps.durations[-1], atol=1e-11)
+
+    def one(slope, friction, damping):
+        wheel, model = vrw.WheelParams(damping=damping, slope=slope), ground(friction=friction)
+        return vrw.walk(wheel, START_STATES[0], 3, model=model).steps
+
+    for i, given in enumerate(zip(floors, grounds, damping, strict=True)):
+        given = tuple(map(jnp.asarray, given))
+        np.testing.assert_allclose(batch_result.durations[i], one(*given).durations[-1], atol=1e-11)
+        by = jax.jacfwd(lambda *given: one(*given).section_state[-1], (0, 1, 2))(*given)
+        for name, truth in zip(asked, by, strict=True):
+            np.testing.assert_allclose(moved.derivatives[name].section_state[i], truth, atol=1e-9)
+    engines = [
+        vrw.step_batch(params, START_STATES, 3, model=ground(friction=grounds), engine="diffrax")
+    ]
+    np.testing.assert_allclose(engines[0].durations, batch_result.durations, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_by_every_slope_and_friction_are_differences():
+    n = 3
+
+    def end(slope, friction):
+        wheel, model = vrw.WheelParams(damping=250.0, slope=slope), vrw.UnilateralWheel(friction)
+        return vrw.walk(wheel, START, n, model=model, options=TIGHT).steps.section_state[-1][:20]
+
+    given = jnp.asarray((*SLOPES[:n], 0.3)), jnp.asarray(FRICTIONS[:n])
+    by = jax.jacfwd(end, (0, 1))(*given)
+    for which in range(2):
+        for j, unit in enumerate(1e-5 * np.eye(len(given[which]))):
+            ends = [end(*(x + s * unit * (i == which) if i == which else x
+                          for i, x in enumerate(given))) for s in (1, -1)]  # fmt: skip
+            np.testing.assert_allclose(by[which][:, j], (ends[0] - ends[1]) / 2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
         ({"n_steps": 4}, r"slope has shape \(3, 3\), but there are 3 states and 4 steps: give one"),
+        ({"n_steps": 1}, r"for each and 1 or 2 of each over its steps"),
         ({"params": vrw.WheelParams(damping=[1.0, 2.0])}, r"damping has shape \(2,\), but there"),
-        ({"derivatives": ("slope",)}, "without derivatives: leave engine and derivatives out"),
-        ({"engine": "lanes"}, "needs vrw.UnilateralWheel and 'diffrax'"),
-        ({"model": None}, "needs vrw.UnilateralWheel and 'diffrax'"),
+        ({"derivatives": ("slope",), "engine": "diffrax"}, "without derivatives: leave engine"),
+        ({"model": None, "engine": "collocation"}, "which takes one slope, but slope is an array"),
     ],
 )
 def test_uneven_ground_unsupported_by_batches_is_refused_in_one_sentence(changes, sentence):

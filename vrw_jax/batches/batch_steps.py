@@ -30,8 +30,14 @@ from vrw_jax.batches.stiffness import (
     TSIT5_TOLERANCE_FACTOR,
     select_solver,
 )
-from vrw_jax.batches.uneven_ground import walk_uneven_ground
-from vrw_jax.batches.walk_batch import START_NAME, StepBatchResult, WalkBatch, lane_index
+from vrw_jax.batches.walk_batch import (
+    START_NAME,
+    StepBatchResult,
+    StepwiseParameter,
+    WalkBatch,
+    complete_batch_slopes,
+    lane_index,
+)
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models import (
     N_STEP_INPUTS,
@@ -65,6 +71,9 @@ BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
 PAPER_STEP_INPUTS = (START_NAME, *PARAMETER_NAMES)
 """Inputs with respect to which a step of the paper's model can be differentiated."""
 
+SLOPE, AHEAD = PARAMETER_NAMES.index("slope"), len(PARAMETER_NAMES) + 3
+"""Places among the numbers of a step (parameters, start, slope of the line ahead) of its slopes."""
+
 DIFFRAX_BATCH_SIZE = 256
 """Number of batch elements that the diffrax engine takes at a time."""
 
@@ -94,23 +103,19 @@ def step_batch(
     tolerance of 1e-6, from 300 1/s. It is Kvaerno5 by "diffrax" if explicit solvers need too many
     steps (from 4e5, or from 1.4e5) or Tsit5 failed.
 
-    "collocation" is faster still near a known gait. `durations` are those of DLS, SLS-I and SLS-II
-    to some per cent, as of a limit cycle or a neighbor's step. Later steps use those of the
-    previous step. Its error is fixed, about 1e-8 for 99 elements in 100, independent of `options`.
-    Each element is checked, and an element that fails the check is stepped by the lane engine.
-    `is_collocated` marks the elements that passed.
+    Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
+    collocation. With unilateral contact (`UnilateralWheel`, its friction a scalar or of the lanes'
+    axis) the only engine is "lanes". Not for use inside `jax.jit`: it compiles itself, once.
 
-    Derivatives go through all steps and their events. They are zero for an element whose walk
-    failed, and are not available by collocation. With unilateral contact (`UnilateralWheel`, with
-    friction a scalar or one value per element) the only engine is "lanes". It is "diffrax" if slope
-    or friction differ from step to step, with shape (elements, n_steps) as in `walk`. This function
-    cannot be used inside `jax.jit`; it compiles itself, once.
+    On uneven ground the slope, with unilateral contact friction too, has the shape (lanes, n_steps)
+    or (lanes, n_steps + 1), over the steps of each lane as in `walk`; derivatives by it have the
+    axis over steps last.
 
     Args:
-        params: the wheels; fields are scalars or of shape (elements,).
-        states: section states, shape (elements, 3), rad, rad/s, m/s, or full states with contact.
-        n_steps: largest number of steps.
-        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        params: the wheels; fields are scalars or of shape (lanes,); the slope as above.
+        states: section states, shape (lanes, 3), rad, rad/s, m/s, or real ground's own.
+        n_steps: at most so many.
+        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
         options: numerical choices of the steps.
         engine: "auto", "lanes", "diffrax" or "collocation", as above.
         durations: of the phases, shape (elements, 3), s, for "collocation".
@@ -142,10 +147,6 @@ def step_batch(
     checked_states = checked_states.astype(columns[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
     arguments = checked_model, columns, checked_states, n_steps, options, engine, params.n_legs
-    if any(
-        np.ndim(column) == 2 for column in (*columns, getattr(checked_model, FRICTION_NAME, 0.0))
-    ):
-        return walk_uneven_ground(*arguments, derivatives)
     derivative_names = _check_derivatives(
         derivatives, CONTACT_STEP_INPUTS if has_contact_kernel else PAPER_STEP_INPUTS, engine
     )
@@ -201,11 +202,12 @@ def _check_columns(
     friction = getattr(model, FRICTION_NAME, np.zeros(()))
     for name, column in zip((*PARAMETER_NAMES, FRICTION_NAME), (*columns, friction), strict=True):
         varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(column) == 2
-        if np.shape(column) not in ((), (n_states,), *[(n_states, n_steps)] * varies_by_step):
+        over_steps = [(n_states, n_steps), (n_states, n_steps + 1)] * varies_by_step
+        if np.shape(column) not in ((), (n_states,), *over_steps):
             raise ValueError(
                 f"{name} has shape {np.shape(column)}, but there are {n_states} states"
                 f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for each"
-                f"{' and each of its steps' * varies_by_step}."
+                f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * varies_by_step}."
             )
     dtype = np.promote_types(parameter_dtype, states.dtype)
     return [np.asarray(column, dtype) for column in columns]
@@ -222,11 +224,14 @@ def _step_paper_model(
     durations: Any,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
+    slopes, over_steps = _read_slopes(parameter_columns[SLOPE], n_steps, engine)
+    parameter_columns = [slopes[0] if i == SLOPE else x for i, x in enumerate(parameter_columns)]
     order = sort_by_work(parameter_columns, states)
     wheels = np.empty((len(parameter_columns), len(states)), states.dtype)
     for row, column in zip(wheels, parameter_columns, strict=True):
         row[:] = column[order] if column.ndim else column
-    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES)
+    slopes = slopes.take(order, -1) if over_steps else slopes
+    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES, over_steps)
     settings = n_legs, walks.input_indices
     engines = {NAMED_SOLVER_INDEX: _select_engine(engine, model, options, *settings)}
     solver_index = np.full(len(states), NAMED_SOLVER_INDEX, np.int32)
@@ -251,21 +256,25 @@ def _step_paper_model(
     if engine == "collocation":
         engine_name = engine
         walks.durations[:] = _check_durations(durations, states, wheels.dtype).T.take(order, -1)
-    for _ in range(n_steps):
+    for k in range(n_steps):
         active = walks.active_lanes()
+        if over_steps:
+            wheels[SLOPE] = slopes[k]
         if engine == "collocation" and len(active):
             index = lane_index(active, walks)
-            arguments = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
+            own = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
             walks.record_step(
-                active,
-                *_step_by_collocation(engines[NAMED_SOLVER_INDEX], model, n_legs, *arguments),
+                active, *_step_by_collocation(engines[NAMED_SOLVER_INDEX], model, n_legs, *own)
             )
             continue
         for engine_index, selected_engine in engines.items():
             lane_indices = active[solver_index[active] == engine_index]
             if len(lane_indices) > 0:
                 index = lane_index(lane_indices, walks)
-                result = selected_engine.take_step(wheels[:, index], walks.section_state[:, index])
+                ahead = (slopes[k + 1][index],) if over_steps else ()
+                result = selected_engine.take_step(
+                    wheels[:, index], walks.section_state[:, index], *ahead
+                )
                 if engine_index == STABLE_SOLVER_INDEX:
                     # A phase may last longer than `select_solver` assumes; the next is implicit.
                     has_failed = result[2] == Outcome.SOLVER_FAILED
@@ -276,6 +285,25 @@ def _step_paper_model(
                     )
                 walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
     return walks.to_result(order, solver_index, engine_name, solver_names)
+
+
+def _read_slopes(
+    slope: np.ndarray, n_steps: int, engine: str
+) -> tuple[Any, dict[str, StepwiseParameter]]:
+    """Slopes of the lines of all steps, and how a walk moves with them; on flat ground the slope
+    alone, as a list."""
+    if slope.ndim < 2:
+        return [slope], {}
+    if engine == "collocation":
+        raise ValueError(
+            "engine is 'collocation', which takes one slope, but slope is an array over steps: "
+            "take 'auto', 'lanes' or 'diffrax'."
+        )
+    n = slope.shape[1]
+    by_line = lambda k: ((0, k, 1.0), (1, min(k + 1, n - 1), 1.0))
+    return complete_batch_slopes(slope, n_steps), {
+        "slope": StepwiseParameter((SLOPE, AHEAD), n, by_line)
+    }
 
 
 def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
@@ -313,7 +341,8 @@ class _BatchEngine(NamedTuple):
     """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
 
     name: str
-    take_step: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+    take_step: Callable[..., tuple[np.ndarray, ...]]
+    """Of parameters, section states and, on uneven ground, slopes of the lines ahead."""
 
 
 def _select_engine(
@@ -345,6 +374,7 @@ def _step_by_lanes(
     input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
+    *ahead: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Take one gait step by the lane engine."""
     option_leaves, structure = jax.tree.flatten(options)
@@ -359,7 +389,10 @@ def _step_by_lanes(
         )
 
         def step_outputs(*lanes: Array) -> tuple:
-            params, x = wheel_from_parameters(lanes[:n_parameters], n_legs), lanes[n_parameters:]
+            params, x = (
+                wheel_from_parameters(lanes[:n_parameters], n_legs, *lanes[AHEAD:]),
+                lanes[n_parameters:AHEAD],
+            )
             result = gait_step(
                 params, x, current_options, tableau, stop_at_lift_off, straggler_count
             )
@@ -370,14 +403,21 @@ def _step_by_lanes(
             values, diagnostics = step_outputs(*lanes)
             return (*diagnostics, values)
         jacobian_of_step = (
-            scaled_jacobian_columns if len(input_indices) == N_STEP_INPUTS else jacobian_columns
+            scaled_jacobian_columns if len(input_indices) == len(lanes) else jacobian_columns
         )
         jacobian, values, diagnostics = jacobian_of_step(step_outputs, lanes, input_indices)
         return (*diagnostics, values, jacobian)
 
-    settings = ("gait step", n_legs, stop_at_lift_off, structure, input_indices)
-    max_group_size = (N_STEP_INPUTS,) if input_indices else ()
-    results = run_compiled(step, uniform, [*wheels, *states], settings, *max_group_size)
+    settings = (
+        "gait step",
+        n_legs,
+        stop_at_lift_off,
+        structure,
+        input_indices,
+        *("uneven" for _ in ahead),
+    )
+    max_group_size = (N_STEP_INPUTS + len(ahead),) if input_indices else ()
+    results = run_compiled(step, uniform, [*wheels, *states, *ahead], settings, *max_group_size)
     _, outcome, n_solver_steps, values, *jacobian = results
     return values[:3], values[3:], outcome, n_solver_steps, *jacobian
 
@@ -429,11 +469,12 @@ def _step_by_diffrax(
     input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
+    *ahead: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Take one step by the model's own step under `jax.vmap`, DIFFRAX_BATCH_SIZE elements at a
     time."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
-    rows = np.concatenate([wheels, states]).T
+    rows = np.concatenate([wheels, states, *(row[None] for row in ahead)]).T
     step_rows = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
     return jax.tree.map(
         lambda x: np.array(x).T, map_in_batches(step_rows, (DIFFRAX_BATCH_SIZE,), rows)
@@ -453,11 +494,8 @@ def _vmapped_step(
     def step_one(inputs: Array) -> tuple[Array, ...]:
         def step_from_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
             all_inputs = inputs.at[np.array(input_indices, int)].set(varied_inputs)
-            result = model.advance(
-                wheel_from_parameters(all_inputs[:n_parameters], n_legs),
-                all_inputs[n_parameters:],
-                options,
-            )
+            params = wheel_from_parameters(all_inputs[:n_parameters], n_legs, *all_inputs[AHEAD:])
+            result = model.advance(params, all_inputs[n_parameters:AHEAD], options)
             return jnp.concatenate([result.section_state, result.durations]), result
 
         varied_inputs = inputs[np.array(input_indices, int)]

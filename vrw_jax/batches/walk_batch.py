@@ -1,7 +1,8 @@
 """Results of batches of walks, and their derivatives with respect to starts and parameters."""
 
-from collections.abc import Sequence
-from typing import Any
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -18,8 +19,8 @@ from vrw_jax.wheel import Outcome
 
 
 class StepSensitivity(eqx.Module):
-    """Derivative of the end of a walk with respect to a parameter, or to the start, which adds an
-    axis."""
+    """How the end of a walk moves with its start or a parameter; the start and parameters that are
+    arrays over steps have an axis of their own."""
 
     section_state: Float[np.ndarray, "lanes section *start"]
     durations: Float[np.ndarray, "lanes 3 *start"]
@@ -83,14 +84,32 @@ class StepBatchResult(AbstractPrintable):
 START_NAME = "section_state"
 
 
+class StepwiseParameter(NamedTuple):
+    """A parameter that one step moves with in several places, or that is an array over steps."""
+
+    inputs: tuple[int, ...]  # its places among the numbers of a step
+    size: int | None  # values of a lane; None: one that is no array
+    parts: Callable[[int], tuple[tuple[int, int, float], ...]]
+    """Of a step: which of the inputs, which value, and how the one moves with the other."""
+
+
+def complete_batch_slopes(slopes: np.ndarray, n_steps: int) -> np.ndarray:
+    """Slopes of the lines that n steps use, (n_steps + 1, lanes): the last of n is used twice."""
+    return slopes.T if slopes.shape[1] > n_steps else np.concatenate([slopes.T, slopes.T[-1:]])
+
+
 class WalkBatch:
     """Batch of walks in progress. Lanes are the last axis of every array."""
 
     def __init__(
-        self, states: np.ndarray, derivative_names: Sequence[str], parameters: tuple[str, ...]
+        self,
+        states: np.ndarray,
+        derivative_names: Sequence[str],
+        parameters: tuple[str, ...],
+        over_steps: Mapping[str, StepwiseParameter],
     ) -> None:
-        """Start walks. `derivative_names` are START_NAME and names of these parameters, the first
-        values of a lane."""
+        """`asked`: START and names of these parameters, which lead the numbers of a lane; some may
+        be `over_steps`."""
         state_size, n_lanes = states.shape
         self.section_state, self.durations = states, np.zeros((3, n_lanes), states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
@@ -101,12 +120,17 @@ class WalkBatch:
             [name for name in derivative_names if name != START_NAME],
         )
         state_inputs = range(len(parameters), len(parameters) + state_size)
-        self.input_indices = (
-            (*(parameters.index(x) for x in self.parameter_names), *state_inputs)
-            if derivative_names
-            else ()
+        own = lambda name: StepwiseParameter(
+            (parameters.index(name),), None, lambda _: ((0, 0, 1.0),)
         )
-        self.jacobian = np.zeros((len(self.input_indices), state_size + 3, n_lanes), states.dtype)
+        self.columns = [over_steps.get(name, own(name)) for name in self.parameter_names]
+        inputs = [i for column in self.columns for i in column.inputs]
+        self.input_indices = (*inputs, *state_inputs) if derivative_names else ()
+        rows = [1 if column.size is None else column.size for column in self.columns]
+        self.begins = np.cumsum([0, *rows])  # of each name's rows, then of the start's
+        self.simple = not over_steps
+        n_rows = self.begins[-1] + state_size if derivative_names else 0
+        self.jacobian = np.zeros((n_rows, state_size + 3, n_lanes), states.dtype)
 
     def active_lanes(self) -> np.ndarray:
         """Return the indices of the lanes that continue."""
@@ -141,13 +165,14 @@ class WalkBatch:
         if not self.derivative_names:
             return {}
         self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian, n_parameters, state_size = (
-            self.jacobian.take(inverse_order, -1).T,
-            len(self.parameter_names),
-            len(self.section_state),
-        )
-        columns_by_name: dict[str, Any] = {name: i for i, name in enumerate(self.parameter_names)}
-        columns_by_name[START_NAME] = slice(n_parameters, None)
+        jacobian, state_size = self.jacobian.take(inverse_order, -1).T, len(self.section_state)
+        columns_by_name: dict[str, Any] = {START_NAME: slice(self.begins[-1], None)}
+        for name, column, begin in zip(
+            self.parameter_names, self.columns, self.begins[:-1], strict=True
+        ):
+            columns_by_name[name] = (
+                begin if column.size is None else slice(begin, begin + column.size)
+            )
         jacobian_by_name = {
             name: jacobian[:, :, columns_by_name[name]] for name in self.derivative_names
         }
@@ -178,6 +203,8 @@ class WalkBatch:
 
         Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
+        if not self.simple:
+            return self._after_uneven(index, step_jacobian)
         n_parameters, state_size = len(self.parameter_names), len(self.section_state)
         if not self.n_stepped[index].any():
             return step_jacobian
@@ -188,6 +215,26 @@ class WalkBatch:
         )
         chained[:n_parameters] += step_jacobian[:n_parameters]
         return chained
+
+    def _after_uneven(self, some: Any, by: np.ndarray) -> np.ndarray:
+        """The same, with rows for each value over steps; later steps' values move nothing yet."""
+        size, start = len(self.section_state), self.begins[-1]
+        n = len(by) - size
+        k = int(np.max(self.n_stepped[some], initial=0))
+        total = np.zeros((len(self.jacobian), *by.shape[1:]), by.dtype)
+        if k == 0:
+            total[start:] = by[n:]
+        else:
+            known = [range(b, min(b + k + 1, e)) for b, e in itertools.pairwise(self.begins)]
+            rows = np.array([*itertools.chain(*known), *range(start, len(total))])
+            before = self.jacobian[rows, :size][..., some]
+            total[rows] = sum(by[n + i] * before[:, i, None] for i in range(size))
+        first = 0
+        for column, begin in zip(self.columns, self.begins[:-1], strict=True):
+            for which, value, factor in column.parts(k):
+                total[begin + value] += factor * by[first + which]
+            first += len(column.inputs)
+        return total
 
 
 def lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:

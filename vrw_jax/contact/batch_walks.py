@@ -26,7 +26,13 @@ from vrw_jax.contact.section import (
 )
 from vrw_jax.contact.step_record import UnilateralStep
 from vrw_jax.contact.unilateral_wheel import UnilateralWheel
-from vrw_jax.contact.walk_kernel import BatchWalk, make_result_template, run_walks
+from vrw_jax.contact.walk_kernel import (
+    N_PARAMETERS,
+    N_UNEVEN_COLUMNS,
+    BatchWalk,
+    make_result_template,
+    run_walks,
+)
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions, map_in_batches
@@ -47,13 +53,11 @@ def walk_batch(
 ) -> tuple[np.ndarray, ...]:
     """Return the results of `n_steps` steps of many wheels with `n` legs.
 
-    They are section states, durations, outcomes, completed steps, solver steps and the length of
-    the last step, m. Static fields of the model apply to all wheels.
-
-    - `columns`: the parameters in their order and friction, shape (10, wheels);
-    - `states`: full section states, shape (wheels, 4 + 3 n).
+    `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
+    section states, shape (wheels, 4 + 3 n). On uneven ground, one step at a time, two columns
+    more: see `N_UNEVEN_COLUMNS`.
     """
-    config = _WalkConfig.from_model(model, options, n, False)
+    config = _WalkConfig.from_model(model, options, n, False, len(columns))
     walk = _run_walk(config, [columns, states.T], n_steps, options)
     summary = walk.step_result
     counts = walk.outcome, walk.n_stepped, walk.n_solver_steps
@@ -76,8 +80,8 @@ def step_batch_with_jacobian(
     codes) have zero derivatives. The number of rate tangents is the number that loaded feet leave
     independent (see `_IndependentRates`).
     """
-    config = _WalkConfig.from_model(model, options, n, True)
-    if len(states):  # first, because its compilation takes longest
+    config = _WalkConfig.from_model(model, options, n, True, len(columns))
+    if len(states):  # before others are asked for: it is long in coming
         _compile_walk(config, columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array)))
     code = np.round(states[:, 4 + 2 * n :]).astype(int)
     numbers = np.concatenate([columns.T, states], 1)
@@ -226,7 +230,7 @@ def _project_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarra
     lane_rows = np.repeat(states, 3 + n, 0)
     unit_rates = np.tile(units, (len(states), 1))
     lane_rows[:, 1:4], lane_rows[:, 4 + n : 4 + 2 * n] = unit_rates[:, :3], unit_rates[:, 3:]
-    rows = [*np.repeat(columns[:-1], 3 + n, 1), *lane_rows.T]
+    rows = [*np.repeat(columns[:N_PARAMETERS], 3 + n, 1), *lane_rows.T]
     rates = _apply_to_rows(n, "rates at a start", rows).T
     return np.swapaxes(rates.reshape(len(states), 3 + n, 3 + n), 1, 2)
 
@@ -291,22 +295,25 @@ class _WalkConfig(NamedTuple):
     max_events: int
     is_one_sided: bool
     uses_paper_rule: bool
-    has_tangents: bool  # full step results with the tangents of each lane
+    has_tangents: bool  # all that a step tells, and along directions of each lane
+    uneven: bool
 
     @classmethod
     def from_model(
-        cls, model: UnilateralWheel, options: StepOptions, n: int, has_tangents: bool
+        cls,
+        model: UnilateralWheel,
+        options: StepOptions,
+        n: int,
+        has_tangents: bool,
+        n_columns: int,
     ) -> "_WalkConfig":
-        """Return the configuration of this model and these options.
-
-        Raises `ValueError` for a model with restitution.
-        """
         if model.restitution is not None:
             raise ValueError(
                 "restitution is given, but in lanes feet don't come back: walk wheels one by one, "
                 "by vrw.walk, or map vrw.return_map over them."
             )
         static_options = eqx.filter(options, eqx.is_array, inverse=True)
+        uneven = n_columns > N_PARAMETERS + 1
         return cls(
             static_options,
             n,
@@ -314,6 +321,7 @@ class _WalkConfig(NamedTuple):
             model.has_one_sided_stoppers,
             model.uses_paper_rule,
             has_tangents,
+            uneven,
         )
 
     def make_walk(self, dynamic: StepOptions, n_steps: Array) -> BatchWalk:
@@ -321,14 +329,19 @@ class _WalkConfig(NamedTuple):
         options = eqx.combine(dynamic, self.static)
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # the caller looked
-        rules = self.is_one_sided, self.uses_paper_rule, self.has_tangents
-        return BatchWalk(self.n_legs, n_steps, self.max_events, *rules, options, tableau)
+        rules = (
+            self.is_one_sided,
+            self.uses_paper_rule,
+            self.has_tangents,
+            options,
+            tableau,
+            self.uneven,
+        )
+        return BatchWalk(self.n_legs, n_steps, self.max_events, *rules)
 
     def row_counts(self) -> tuple[int, ...]:
-        """Return the numbers of input rows: columns, states and, with tangents, the input of each
-        tangent.
-        """
-        sizes = len(PARAMETER_NAMES) + 1, full_section_size(self.n_legs)
+        """Of the arrays that are given: columns, states, and which of these directions are."""
+        sizes = N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.uneven, full_section_size(self.n_legs)
         return (*sizes, MAX_TANGENTS_PER_LANE) if self.has_tangents else sizes
 
     def result_structure(self, dtype: Any) -> Any:
@@ -385,7 +398,7 @@ def embed_section_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.
     """Return the full section states of three-number ones; others are returned unchanged."""
     if states.shape[1] != 3:
         return states
-    return _apply_to_rows(n, "full states", [*columns[:-1], *states.T]).T
+    return _apply_to_rows(n, "full states", [*columns[:N_PARAMETERS], *states.T]).T
 
 
 @functools.cache

@@ -22,7 +22,6 @@ from vrw_jax.contact.mechanics import (
     WheelMotion,
     find_slots,
     foot_heights,
-    foot_positions,
     foot_velocity,
     free_leg_motion,
     make_posture,
@@ -246,20 +245,6 @@ def stack_friction(friction: Friction) -> Array:
     return jnp.stack(friction) if isinstance(friction, tuple) else friction
 
 
-def _heights_above_ground(
-    dynamics: ModeDynamics, motion: WheelMotion, legs: LegDirections
-) -> LegArray:
-    """Return the height of every foot above its ground, m; the ground ahead begins under foot 1."""
-    heights = foot_heights(motion, legs)
-    if dynamics.tilt is None:
-        return heights
-    positions = foot_positions(motion, legs)
-    foremost_height = heights[-1] * jnp.cos(dynamics.tilt) + (
-        positions[-1] - positions[0]
-    ) * jnp.sin(dynamics.tilt)
-    return heights.at[-1].set(foremost_height)
-
-
 def evaluate_guards(
     dynamics: ModeDynamics, motion: WheelMotion, quantities: ContactQuantities, has_begun: Array
 ) -> list[Array]:
@@ -293,7 +278,7 @@ def evaluate_guards(
         else [jnp.where(dynamics.airborne, quantities.airborne_stopper, ones)]
     )
     return [
-        jnp.where(is_airborne, _heights_above_ground(dynamics, motion, quantities.legs), ones),
+        jnp.where(is_airborne, foot_heights(motion, quantities.legs, dynamics.tilt), ones),
         jnp.where(is_free_leg, s.L0 - motion.L, ones),
         if_watched(dynamics.contact != CONTACT_OFF, pressure),
         if_watched(has_cone, coefficient * normal - tangential),

@@ -510,9 +510,8 @@ def _merge_touching(
     """
     s, legs = law.s, leg_directions(law.s, motion.theta)
     dip_depth = law.rest_speed**2 / (2.0 * s.g)
-    is_touching = (foot_heights(motion, legs) <= dip_depth) & (
-        foot_speeds(motion, legs)[1] <= law.rest_speed
-    )
+    heights = foot_heights(motion, legs, law.tilt)
+    is_touching = (heights <= dip_depth) & (foot_speeds(motion, legs)[1] <= law.rest_speed)
     lands = event.lands | (is_touching & (contact_state.contact == CONTACT_OFF) & event.is_impact)
     fits_slots = (
         jnp.sum(lands | (contact_state.contact != CONTACT_OFF), axis=0, dtype=jnp.int32) <= 2

@@ -343,9 +343,20 @@ def foot_velocity(
     return FootVelocity((x[0], x[1]), (z[0], z[1]))
 
 
-def foot_heights(motion: WheelMotion, legs: LegDirections) -> LegArray:
-    """Return the height of every foot above the slope, m."""
-    return motion.z - motion.L * legs.cos
+def foot_heights(
+    motion: WheelMotion, legs: LegDirections, tilt: Elementwise | None = None
+) -> LegArray:
+    """Height of every foot above the slope, m.
+
+    The foremost foot's is above the line ahead, where that is steeper by `tilt`, rad; it begins
+    under Leg 1's foot.
+    """
+    heights = motion.z - motion.L * legs.cos
+    if tilt is None:
+        return heights
+    places = foot_positions(motion, legs)
+    ahead = heights[-1] * jnp.cos(tilt) + (places[-1] - places[0]) * jnp.sin(tilt)
+    return jnp.concatenate([heights[:-1], ahead[None]])
 
 
 def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:

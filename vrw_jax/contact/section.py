@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
 from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions
-from vrw_jax.models import PAPER_START, is_valid_start, replace_invalid
+from vrw_jax.models import PAPER_START, is_valid_slope, is_valid_start, replace_invalid
 from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
 
@@ -50,18 +50,23 @@ def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
 
 
 def replace_invalid_start(
-    params: WheelParams, friction: Elementwise, x: FullState, is_even_ground: bool = True
+    params: WheelParams, friction: Elementwise, x: FullState, tilt: Elementwise | None = None
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Return whether a step may begin at this input, and the input or, if not, a valid substitute.
 
-    If the ground is uneven, feet may be below the extended line of the next foothold's slope.
+    On uneven ground, where the line ahead is steeper by `tilt`, rad, feet may be below the line
+    that the next foothold continues.
     """
     safe_state = embed_section_state(
         WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
     )
     safe_x = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
     is_valid = is_valid_start(params, x) & (friction >= 0.0)
-    is_valid = is_valid & _is_possible(params.symbols(), x) if is_even_ground else is_valid
+    is_valid = is_valid & (
+        is_valid_slope(params.slope + tilt)
+        if tilt is not None
+        else _is_possible(params.symbols(), x)
+    )
     params, x = replace_invalid(is_valid, params, x, safe_x)
     return is_valid, params, jnp.where(is_valid, friction, 1.0), x
 

@@ -59,7 +59,9 @@ class ContactStepConfig(NamedTuple):
     def unpack(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return columns and section states of lanes, and the other settings."""
         wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
-        return jnp.stack([*stack_parameters(params), wheel.friction]), x, (wheel, params, options)
+        more = () if wheel.uneven is None else wheel.uneven
+        columns = jnp.stack([*stack_parameters(params), wheel.friction, *more])
+        return columns, x, (wheel, params, options)
 
     def make_walk(self, settings: Any) -> BatchWalk:
         """Return the batch settings of a walk of one step."""
@@ -72,7 +74,7 @@ class ContactStepConfig(NamedTuple):
             wheel.uses_paper_rule,
             self.is_detailed,
         )
-        return BatchWalk(params.n_legs, 1, *rules, options, tableau)
+        return BatchWalk(params.n_legs, 1, *rules, options, tableau, wheel.uneven is not None)
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return arrays in the structure of `compute_outputs`."""
@@ -262,11 +264,10 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
         lane, log = lax.while_loop(
             should_continue, record_interval_end, (initial, jax.tree.map(allocate, log_template))
         )
-        final_state, walk = (
-            (motion_from_point(lane.interval.point), lane.interval.contact_state),
-            config.make_walk(config.unpack(leaves)[2]),
-        )
-        summary = walk.summarize(final_state, lane.counters, lane.outcome)
+        final_state = motion_from_point(lane.interval.point), lane.interval.contact_state
+        columns, _, others = config.unpack(leaves)
+        walk = config.make_walk(others)
+        summary = walk.summarize(final_state, lane.counters, lane.outcome, walk.tilt(columns))
         rows = jax.vmap(lambda log: sample_compiled(leaves, log))(log)
         return SampledIntervals(
             log, summary, lane.outcome, *_unpack_samples(params.n_legs, log, rows)

@@ -55,13 +55,18 @@ N_MOVING_LEGS = 3
 _LEG_SLICES = slice(0, N_MOVING_LEGS), slice(N_MOVING_LEGS, None)
 _MASS_PARAMETERS = "hub_mass", "leg_mass", "leg_com"
 _SPRING_PARAMETERS = "natural_length", "stiffness", "damping"
-_INPUT_NAMES = *PARAMETER_NAMES, "friction"
+_INPUT_NAMES = *PARAMETER_NAMES, "friction", "friction_before"  # the latter on uneven ground
 PARAMETER_GROUPS = [
     tuple(map(_INPUT_NAMES.index, names))
-    for names in (_MASS_PARAMETERS, _SPRING_PARAMETERS, ("slope", "gravity"), ("friction",))
+    for names in (
+        _MASS_PARAMETERS,
+        _SPRING_PARAMETERS,
+        ("slope", "gravity"),
+        ("friction", "friction_before"),
+    )
 ]
-"""Groups of inputs with the same kind of effect; the stoppers' position acts through lengths
-alone."""
+"""Columns that act in one way; the place of stoppers acts by lengths alone, the line ahead only in
+guards."""
 
 CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
 """Function that returns some coordinates and rates of a tangent at a point."""
@@ -305,7 +310,8 @@ class TangentBasis(NamedTuple):
 
         _, push_columns = jax.linearize(configure_columns, columns)
         total = zero_response
-        for group in PARAMETER_GROUPS:
+        for alike in PARAMETER_GROUPS:
+            group = [i for i in alike if i < len(tangent)]
             group_tangent = jnp.stack(
                 [row if i in group else 0.0 * row for i, row in enumerate(tangent)]
             )

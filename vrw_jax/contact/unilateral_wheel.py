@@ -62,7 +62,15 @@ from vrw_jax.contact.step_record import (
 )
 from vrw_jax.contact.walk_kernel import StepSummary
 from vrw_jax.hybrid import MonitoredFunctions, integrate_phase, sample_phase
-from vrw_jax.models import PAPER_START, AbstractWheel, AdvanceResult, StepGround, can_use_lanes
+from vrw_jax.models import (
+    PAPER_START,
+    AbstractWheel,
+    AdvanceResult,
+    StepGround,
+    can_use_lanes,
+    check_step_values,
+    complete_slopes,
+)
 from vrw_jax.numerics import (
     Elementwise,
     ForwardFunction,
@@ -225,13 +233,18 @@ class UnilateralWheel(AbstractWheel):
         return _embedded(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        step_shape, inputs = (n_steps,), (params.slope, self.friction)
-        if not any(value.shape == step_shape for value in inputs):
+        """Slope and friction of a landing, friction of the feet before, and by how much the line
+        ahead is steeper."""
+        slope, friction = params.slope, self.friction
+        if slope.ndim == friction.ndim == 0:
             return None
-        slope, friction = (jnp.broadcast_to(value, step_shape) for value in inputs)
-        next_slope = jnp.append(slope[1:], slope[-1:])
+        flat = slope.ndim == 0
+        slopes = jnp.full(n_steps + 1, slope) if flat else complete_slopes(slope, n_steps)
+        if friction.ndim:
+            check_step_values(FRICTION_NAME, friction, n_steps)
+        friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
         previous_friction = jnp.append(friction[:1], friction[:-1])
-        return slope, friction, previous_friction, next_slope - slope
+        return slopes[:-1], friction, previous_friction, slopes[1:] - slopes[:-1]
 
     def with_ground(
         self, params: WheelParams, ground: StepGround
@@ -272,15 +285,12 @@ class UnilateralWheel(AbstractWheel):
         )
 
     def _is_supported_by_lanes(self, options: StepOptions) -> bool:
-        """Return whether the batch kernel supports this ground.
-
-        Raises `ValueError` if the options require that engine and it does not.
-        """
-        is_supported = self.restitution is None and self.uneven is None
+        """Whether the ground is such as lanes know."""
+        is_supported = self.restitution is None
         if options.engine == "lanes" and not is_supported:
             raise ValueError(
-                "engine is 'lanes', but lanes know neither feet that come back nor ground that "
-                "varies from step to step: take engine='auto' or 'diffrax'."
+                "engine is 'lanes', but lanes do not know feet that come back: take engine='auto' "
+                "or 'diffrax'."
             )
         return is_supported
 
@@ -356,11 +366,9 @@ def _run_event_loop(
     is_detailed: bool,
     has_log: bool = False,
 ) -> _EventLoopState:
-    """Return the event loop's state at the end of a step, integrated by diffrax."""
-    is_even_ground = wheel.uneven is None
-    is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, is_even_ground)
-    s, n = params.symbols(), params.n_legs
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
+    is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, tilt)
+    s, n = params.symbols(), params.n_legs
     law_arguments = s, _foot_friction(wheel, friction), options, wheel.has_one_sided_stoppers
     law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
     layout = make_guard_layout(n, wheel.has_one_sided_stoppers)

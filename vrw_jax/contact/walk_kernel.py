@@ -25,6 +25,7 @@ from vrw_jax.contact.batch_integrator import (
     motion_from_point,
     pack_coordinates,
 )
+from vrw_jax.contact.contact_modes import Friction
 from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
@@ -53,8 +54,18 @@ from vrw_jax.contact.step_record import (
 )
 from vrw_jax.integrator import ButcherTableau
 from vrw_jax.numerics import StepOptions, tree_where, zeros_like_output
-from vrw_jax.wheel import Outcome, Symbols, compute_symbols, stack_parameters, wheel_from_parameters
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    Outcome,
+    Symbols,
+    compute_symbols,
+    stack_parameters,
+    wheel_from_parameters,
+)
 
+N_PARAMETERS, N_UNEVEN_COLUMNS = len(PARAMETER_NAMES), 2
+"""Columns: so many parameters and friction; on uneven ground friction of the feet that landed
+before, and by how much the line ahead is steeper, rad."""
 STATUS_UNFINISHED = -1
 """Code of an unfinished lane in place of its outcome."""
 
@@ -153,17 +164,27 @@ class BatchWalk(NamedTuple):
     is_detailed: bool  # whether full results of the step are requested
     options: StepOptions
     tableau: ButcherTableau
+    uneven: bool = False  # columns have `N_UNEVEN_COLUMNS` more, and a walk is one step
 
     def make_dynamics(self, columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of the lanes in this contact state."""
         s, friction = self.unpack_columns(columns)
-        return make_mode_dynamics(s, friction, self.is_one_sided, contact_state, self.is_detailed)
+        given = self.is_one_sided, contact_state, self.is_detailed, self.tilt(columns)
+        return make_mode_dynamics(s, friction, *given)
 
-    def unpack_columns(self, columns: Array) -> tuple[Symbols, Array]:
-        """Return symbols and friction of the columns."""
-        return compute_symbols(self.n, *columns[:-1]), apply_friction_rule(
-            columns[-1], self.uses_paper_rule
+    def unpack_columns(self, columns: Array) -> tuple[Symbols, Friction]:
+        s, friction = (
+            compute_symbols(self.n, *columns[:N_PARAMETERS]),
+            apply_friction_rule(columns[N_PARAMETERS], self.uses_paper_rule),
         )
+        return s, (
+            friction,
+            apply_friction_rule(columns[N_PARAMETERS + 1], self.uses_paper_rule),
+        ) if self.uneven else friction
+
+    def tilt(self, columns: Array) -> Array | None:
+        """By which the line ahead is steeper, rad; None on flat ground."""
+        return columns[N_PARAMETERS + 2] if self.uneven else None
 
     def begin_walk(self, columns: Array, x: Array) -> LaneState:
         """Return the lanes at the first landing of their walk, before it is resolved."""
@@ -230,9 +251,8 @@ class BatchWalk(NamedTuple):
             opens_step, (new_counters, *new_records), (counters, details, accumulators)
         )
         guard = jnp.where(opens_step, layout.landing, interval.guard)
-        law = make_contact_law(
-            s, friction, self.options, self.is_one_sided, counts_solutions=self.is_detailed
-        )
+        given = s, friction, self.options, self.is_one_sided, self.is_detailed
+        law = make_contact_law(*given, tilt=self.tilt(columns))
         event_arguments = guard, counters.n_events, self.max_events
         result, event, event_outcome = process_event(
             law, layout, motion, contact_state, *event_arguments
@@ -255,8 +275,8 @@ class BatchWalk(NamedTuple):
         is_at_end = (interval.status != STATUS_RUNNING) & (lane.outcome == STATUS_UNFINISHED)
         return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane)
 
-    def compute_result(self, lane: LaneState) -> Any:
-        """Return the result of the last step, for finished lanes."""
+    def compute_result(self, lane: LaneState, tilt: Array | None) -> Any:
+        """Of the last step of lanes that go no further."""
         final_state, outcome = (
             (motion_from_point(lane.interval.point), lane.interval.contact_state),
             lane.outcome,
@@ -264,27 +284,38 @@ class BatchWalk(NamedTuple):
         if lane.details is not None and lane.accumulators is not None:
             accumulators = Accumulators(jnp.zeros_like(lane.accumulators[0]), *lane.accumulators)
             return make_unilateral_step(
-                *final_state, accumulators, lane.counters, lane.details, outcome, "lanes"
+                *final_state, accumulators, lane.counters, lane.details, outcome, "lanes", tilt
             )
-        return self.summarize(final_state, lane.counters, outcome)
+        return self.summarize(final_state, lane.counters, outcome, tilt)
 
     def summarize(
-        self, final_state: tuple[WheelMotion, ContactState], counters: StepCounters, outcome: Array
+        self,
+        final_state: tuple[WheelMotion, ContactState],
+        counters: StepCounters,
+        outcome: Array,
+        tilt: Array | None,
     ) -> StepSummary:
-        """Return the summary of a step with this final state."""
         step_length = jnp.where(
             outcome == Outcome.STEPPED, landing_position(self.n, final_state[0]), 0.0
         )
         return StepSummary(
-            final_section_state(*final_state, outcome), counters.durations, step_length
+            final_section_state(*final_state, outcome, tilt), counters.durations, step_length
         )
 
     def replace_invalid(self, columns: Array, x: Array) -> tuple[Array, Array, Array]:
-        """Return columns and states with valid input in every lane, and which lanes were valid."""
-        is_valid, params, friction, x = replace_invalid_start(
-            wheel_from_parameters(columns[:-1], self.n), columns[-1], x
+        """Columns and states that a walk may begin with, and which were so before."""
+        given = (
+            wheel_from_parameters(columns[:N_PARAMETERS], self.n),
+            columns[N_PARAMETERS],
+            x,
+            self.tilt(columns),
         )
-        return jnp.stack([*stack_parameters(params), friction]), x, is_valid
+        is_valid, params, friction, x = replace_invalid_start(*given)
+        rows = [*stack_parameters(params), friction]
+        if self.uneven:
+            others, tilt = columns[N_PARAMETERS + 1 :]
+            rows += [jnp.where(is_valid, others, 1.0), jnp.where(is_valid, tilt, 0.0)]
+        return jnp.stack(rows), x, is_valid
 
     def deactivate(self, lane: LaneState, is_valid: Array) -> LaneState:
         """Return the lane state with invalid lanes deactivated."""
@@ -331,5 +362,8 @@ def run_walks(walk: BatchWalk, columns: Array, x: Array) -> BatchWalkResult:
     should_continue = lambda lane: jnp.any(lane.outcome == STATUS_UNFINISHED)
     lane = lax.while_loop(should_continue, run_round, lane)
     return BatchWalkResult(
-        walk.compute_result(lane), lane.outcome, lane.n_stepped, lane.counters.n_solver_steps
+        walk.compute_result(lane, walk.tilt(columns)),
+        lane.outcome,
+        lane.n_stepped,
+        lane.counters.n_solver_steps,
     )

@@ -212,13 +212,18 @@ def walk_with_tangents(
     should_continue = lambda state: jnp.any(state[0].outcome == STATUS_UNFINISHED)
     lane, tangents = lax.while_loop(should_continue, advance_round, (lane, tangents))
 
-    def partition_result(lane_tangents: LaneTangents) -> tuple[Any, Any]:
+    def partition_result(lane_tangents: LaneTangents, tilt: Array | None) -> tuple[Any, Any]:
         return eqx.partition(
-            walk.compute_result(lane.replace_tangents(lane_tangents)), eqx.is_inexact_array
+            walk.compute_result(lane.replace_tangents(lane_tangents), tilt), eqx.is_inexact_array
         )
 
-    floats, push, others = jax.linearize(partition_result, lane.get_tangents(), has_aux=True)
-    push_tangent = lambda k, _: push(_unpack_at(tangents.rows, k, template).lane_tangents())
+    floats, push, others = jax.linearize(
+        partition_result, lane.get_tangents(), walk.tilt(columns), has_aux=True
+    )
+    tilt_at = lambda k: walk.tilt(_unpack_at(d_columns, k, columns))
+    push_tangent = lambda k, _: push(
+        _unpack_at(tangents.rows, k, template).lane_tangents(), tilt_at(k)
+    )
     result_tangents = tangents.map_tangents(push_tangent, tangents.allocate(n_rows(floats)))
     step_result = eqx.combine(floats, others)
     walk_result = BatchWalkResult(

@@ -7,6 +7,7 @@ from vrw_jax.models.batch_step import (
     gait_step,
     jacobian_columns,
     split_jacobian,
+    step_after_landing,
 )
 from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.rigid import RigidWheel
@@ -26,6 +27,12 @@ from vrw_jax.models.step_results import (
     Margins,
     StepResult,
     Trajectory,
+)
+from vrw_jax.models.uneven_slopes import (
+    check_step_values,
+    complete_slopes,
+    is_valid_slope,
+    split_slopes,
 )
 from vrw_jax.models.unit_scaling import scaled_jacobian_columns
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -6,7 +6,7 @@ onto lanes, for use in JAX programs.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,11 +29,13 @@ from vrw_jax.integrator import (
     with_batched_jvp,
 )
 from vrw_jax.models.phase_sequence import (
+    PAPER_START,
     PhaseResult,
     PhaseSequenceResult,
     make_advance_result,
     make_step_result,
     make_trajectory,
+    next_section,
     run_phases,
 )
 from vrw_jax.models.step_results import (
@@ -59,6 +61,8 @@ from vrw_jax.wheel import (
     Motion,
     Outcome,
     PhaseInstant,
+    SingleSupport1,
+    Symbols,
     WheelParams,
     transitions,
 )
@@ -146,16 +150,79 @@ def gait_step(
         straggler_count=straggler_count,
     )
     ends, has_stepped = sequence.ends, sequence.outcome == Outcome.STEPPED
-    section = (ends[2].q[0], *ends[2].v)
+    section = next_section(sequence)
     return BatchAdvanceResult(
         section_state=tuple(jnp.where(has_stepped, value, 0.0) for value in section),
         durations=tuple(end.duration for end in ends),
         outcome=sequence.outcome,
         solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        is_unfinished=ends[0].engine_carry.is_unfinished
-        | ends[1].engine_carry.is_unfinished
-        | ends[2].engine_carry.is_unfinished,
+        is_unfinished=ends[0].engine_carry.unfinished
+        | ends[1].engine_carry.unfinished
+        | ends[2].engine_carry.unfinished,
     )
+
+
+class LandingStep(NamedTuple):
+    """A step of every lane from just after a landing with both feet on the ground, and the next
+    landing."""
+
+    numbers: Array
+    """(theta+, dtheta+) just after the next landing, rad, rad/s; normal impulse of the rear foot in
+    it, both feet held, N s; `stopper_margin`, m^2/s: rows of lanes, zeros where not STEPPED but for
+    the last."""
+    outcome: Int[Array, " lanes"]
+    durations: Vector
+    solver_steps: Int[Array, " lanes"]
+    unfinished: Bool[Array, " lanes"]
+
+
+def step_after_landing(
+    params: WheelParams,
+    y: Vector,
+    options: StepOptions,
+    tableau: ButcherTableau,
+    stop_at_lift_off: bool,
+    few: Array | None = None,
+) -> LandingStep:
+    """One step of every lane from y = (theta+, dtheta+), in the frame of the line under both feet,
+    to just after the next landing, in the frame of the line ahead (see `split_slopes`)."""
+    theta, dtheta = y
+    x = theta + params.leg_angle, dtheta, 0.0 * dtheta
+    given = options, tableau, stop_at_lift_off, False, few
+    walked = run_batch_phases(params, x, *given, land=transitions.stand_on_both)
+    ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
+    at_landing = tuple(
+        jnp.where(stepped, own, jnp.asarray(safe, own.dtype))
+        for own, safe in zip(next_section(walked), PAPER_START, strict=True)
+    )
+    next_ = with_batched_jvp(transitions.land)(walked.s, *at_landing)
+    rows = next_.theta, next_.motion.dtheta, next_.rear.normal
+    told = [jnp.where(stepped, row, 0.0) for row in rows]
+    sls1 = walked.phases[1]
+    margin = with_batched_jvp(_stopper_margin)(walked.s, sls1.turn, ends[1].q, ends[1].v)
+    margin = jnp.where(walked.phases_happened[1], margin, 0.0)
+    return LandingStep(
+        numbers=jnp.stack([*told, margin]),
+        outcome=walked.outcome,
+        durations=tuple(end.duration for end in ends),
+        solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
+        unfinished=ends[0].engine_carry.unfinished
+        | ends[1].engine_carry.unfinished
+        | ends[2].engine_carry.unfinished,
+    )
+
+
+def _stopper_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
+    """How far SLS-I ended from meeting stopper and ground at once, m^2/s.
+
+    Where Leg 2 met its stopper, its rate times the landing foot's height; where that foot landed
+    before, minus its rate times the room that Leg 2 had left. Both vanish together, with equal
+    derivatives.
+    """
+    phase = SingleSupport1(s, (), False, turn)
+    motion = phase.motion_at(q, v)
+    height, falls = phase.landing_height(motion), -phase.landing_rate(motion)
+    return height * motion.dL2 - (s.L0 - motion.L2) * falls
 
 
 def run_batch_phases(
@@ -167,6 +234,7 @@ def run_batch_phases(
     records_margins: bool,
     straggler_count: Array | None = None,
     is_noinline: bool = False,
+    land: Callable[..., transitions.Landing] = transitions.land,
 ) -> PhaseSequenceResult:
     """Return all phases of every lane's step.
 
@@ -187,13 +255,12 @@ def run_batch_phases(
                 )
                 dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
                 dt0 = jnp.where(carry.has_run, dt0, carry.next_dt)
-        floats, static = eqx.partition(phase.s, eqx.is_array)
+        floats, static = eqx.partition((phase.s, phase.turn), eqx.is_array)
 
         def make_phase(floats: Any, constants: Vector) -> BatchPhase:
-            s = eqx.combine(floats, static)
-            return make_lane_phase(
-                dataclasses.replace(phase, s=s, constants=constants), records_margins, is_noinline
-            )
+            s, turn = eqx.combine(floats, static)
+            known = dataclasses.replace(phase, s=s, constants=constants, turn=turn)
+            return make_lane_phase(known, records_margins, is_noinline)
 
         end = integrate_batch_phase(
             make_phase,
@@ -217,8 +284,7 @@ def run_batch_phases(
             engine_carry=_PhaseCarry(end.next_dt, active, end.is_unfinished),
         )
 
-    land = with_batched_jvp(transitions.land)
-    return run_phases(run, params, x, stop_at_lift_off, land)
+    return run_phases(run, params, x, stop_at_lift_off, with_batched_jvp(land))
 
 
 def can_use_lanes(options: StepOptions) -> bool:
@@ -356,12 +422,16 @@ def build_step_jacobian(
 
     evaluate_lanes = lambda *leaves: jacobian_columns(config.compute_outputs, leaves, input_indices)
     cache_key = ("gait step with derivatives", *config.cache_key, input_indices)
-    evaluate = unbatch(
-        cached_lane_function(evaluate_lanes, make_template, cache_key, N_STEP_INPUTS)
-    )
+    calls = {
+        n: unbatch(cached_lane_function(evaluate_lanes, make_template, cache_key, n))
+        for n in (N_STEP_INPUTS, N_DIRECTIONS_UNEVEN)
+    }
 
     def jacobian(*leaves: Array) -> tuple:
-        columns, value, other = evaluate(*tighten_tolerances(*leaves))
+        n = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
+        columns, value, other = calls[N_STEP_INPUTS if n <= N_STEP_INPUTS else N_DIRECTIONS_UNEVEN](
+            *tighten_tolerances(*leaves)
+        )
         return (split_jacobian(columns, leaves, input_indices), value), other
 
     return jacobian
@@ -384,7 +454,9 @@ def split_jacobian(columns: Any, leaves: Sequence[Array], input_indices: Sequenc
 
 
 N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
-"""Number of all inputs of a step: machine code keeps one tangent per input in registers."""
+"""All numbers that a step moves with: machine code keeps one of each direction in registers."""
+N_DIRECTIONS_UNEVEN = N_STEP_INPUTS + 1
+"""The same on uneven ground: the slope of the line ahead, too."""
 
 
 def jacobian_columns(

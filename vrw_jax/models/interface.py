@@ -9,14 +9,14 @@ from jaxtyping import Array, Float
 
 from vrw_jax.models.section_states import SectionState
 from vrw_jax.models.step_results import AdvanceResult
+from vrw_jax.models.uneven_slopes import complete_slopes
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import is_traced
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams, wheel_from_parameters
 
-StepGround = tuple[Array, Array, Array, Array]
-"""Slope and friction of a landing, friction of the earlier footholds, and the tilt by which the
-ground ahead is steeper; or all of these over steps."""
+StepGround = tuple[Array, ...]
+"""Ground of one step, or of all steps: what `with_ground` needs."""
 
 
 class AbstractWheel(eqx.Module):
@@ -109,16 +109,19 @@ class AbstractWheel(eqx.Module):
         """Return a section state from which a walk may begin."""
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        """Return the ground of each of `n_steps` steps, if slope or friction are arrays over
-        steps.
-        """
-        return None
+        """Return the ground of each step if slope or friction are arrays over steps, else None."""
+        if jnp.ndim(params.slope) == 0:
+            return None
+        slopes = complete_slopes(params.slope, n_steps)
+        return (jnp.stack([slopes[:-1], slopes[1:]], axis=-1),)
 
     def with_ground(
         self, params: WheelParams, ground: StepGround
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step."""
-        raise NotImplementedError
+        """Return model and wheel on the ground of one step: slopes of two lines, see
+        `split_slopes`.
+        """
+        return self, eqx.tree_at(lambda wheel: wheel.slope, params, ground[0])
 
     def section_size(self, params: WheelParams) -> int:
         """Return the length of a section state."""

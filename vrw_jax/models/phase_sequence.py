@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.section_states import PAPER_START, StateValues, is_valid_start, replace_invalid
+from vrw_jax.models.section_states import PAPER_START, StateValues, replace_invalid
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -20,6 +20,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
+from vrw_jax.models.uneven_slopes import select_line
 from vrw_jax.numerics import Elementwise, Vector, sine_cosine, tree_where
 from vrw_jax.wheel import (
     AbstractPhase,
@@ -67,6 +68,7 @@ class PhaseSequenceResult(NamedTuple):
     ends: tuple[PhaseResult, ...]
     phases_happened: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
+    tilt: Elementwise | None = None  # by which the line ahead is steeper, rad; None: flat ground
 
 
 def run_phases(
@@ -76,12 +78,17 @@ def run_phases(
     stop_at_lift_off: bool,
     land: Callable[..., Landing] = transitions.land,
 ) -> PhaseSequenceResult:
-    """Return all phases of one step from the section state `x`, given entry by entry."""
-    is_valid = is_valid_start(params, x)
+    """One step from the section state `x`, its numbers one by one.
+
+    All of it is in the frame of the line under both feet of its double support; on uneven ground
+    (see `split_slopes`) only the touchdown, and the section state after it, are those of the next.
+    """
+    params, is_valid, tilt = select_line(params, x)
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
     s = params.symbols()
     landing = land(s, *x)
-    phases = make_phases(s, landing.distance, stop_at_lift_off)
+    turn = () if tilt is None else sine_cosine(tilt)
+    phases = make_phases(s, landing.distance, stop_at_lift_off, turn)
     theta, motion = landing.theta, landing.motion
     is_active = (
         is_valid & landing.keeps_rear_foot
@@ -108,7 +115,7 @@ def run_phases(
             is_active if phase is phases[-1] else is_active & (end.duration > 0.0)
         )
     return PhaseSequenceResult(
-        s, landing, phases, tuple(starts), tuple(ends), tuple(phases_happened), outcome_code
+        s, landing, phases, tuple(starts), tuple(ends), tuple(phases_happened), outcome_code, tilt
     )
 
 
@@ -120,9 +127,15 @@ def _safe_single_support(reference_array: Elementwise) -> tuple[Elementwise, Mot
     return theta, Motion(*sine_cosine(theta), *others)
 
 
+def next_section(walked: PhaseSequenceResult) -> Vector:
+    """(theta-, dtheta-, dL1-) where the step ended, in the frame of the line that is reached."""
+    theta, rates = walked.ends[2].q[0], walked.ends[2].v
+    return (theta if walked.tilt is None else theta - walked.tilt), *rates
+
+
 def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal result; its section state is zeros if the step failed."""
-    theta, _, dtheta, dL1 = (*sequence.ends[2].q, *sequence.ends[2].v)
+    """The lean result; its section state is zeros where there is none."""
+    theta, dtheta, dL1 = next_section(sequence)
     has_stepped = sequence.outcome == Outcome.STEPPED
     solver_steps = [end.n_solver_steps for end in sequence.ends]
     return AdvanceResult(

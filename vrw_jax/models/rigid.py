@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.section_states import SectionState, StateValues, is_valid_start, replace_invalid
+from vrw_jax.models.section_states import SectionState, StateValues, replace_invalid
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -18,6 +18,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
+from vrw_jax.models.uneven_slopes import select_line, split_slopes
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
@@ -108,11 +109,12 @@ class RigidWheel(AbstractWheel):
         """Return the step elementwise: for one wheel or for a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
-        is_valid = is_valid_start(params, x)
+        params, is_valid, tilt = select_line(params, x)
+        end = half_angle if tilt is None else half_angle + tilt
         params, x = replace_invalid(is_valid, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
         rate_before, rate_after = x[1], self._rate_ratio(s) * x[1]
-        rolling = RollingMotion(s, params.slope, rate_after)
+        rolling = RollingMotion(s, params.slope, rate_after, None if tilt is None else end)
 
         apex = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
         passes_apex = rolling.rate_squared(apex) > 0.0
@@ -123,10 +125,7 @@ class RigidWheel(AbstractWheel):
         outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
         has_stepped = outcome == Outcome.STEPPED
         safe_rolling = RollingMotion(s, params.slope, jnp.where(passes_apex, rate_after, 10.0))
-        rate_end, duration = (
-            jnp.sqrt(safe_rolling.rate_squared(half_angle)),
-            safe_rolling.time(half_angle),
-        )
+        rate_end, duration = jnp.sqrt(safe_rolling.rate_squared(end)), safe_rolling.time(end)
 
         zero = jnp.zeros_like(rate_before)
         if_valid = lambda value: jnp.where(is_valid, value, jnp.zeros_like(value))
@@ -148,7 +147,7 @@ class RigidWheel(AbstractWheel):
                 fore_foot_force=if_stepped(margin_minima[0]),
                 takeoff_acceleration=zero,
                 clearance_sls1=zero,
-                clearance_sls2=if_stepped(rear_foot_height(s, rolling.motion(half_angle + zero))),
+                clearance_sls2=if_stepped(rear_foot_height(s, rolling.motion(end + zero))),
                 locked_stopper_force=if_stepped(margin_minima[3:]),
                 rear_stopper_force=if_stepped(margin_minima[2]),
                 contraction=zero,
@@ -203,12 +202,14 @@ class RigidWheel(AbstractWheel):
     ) -> Trajectory:
         """Return the motion at equal angles instead of equal times."""
         result = self.take_step(params, x, options)
-        s = params.symbols()
+        params, ahead = split_slopes(params)
+        s, half = params.symbols(), 0.5 * params.leg_angle
+        end = half if ahead is None else half + ahead - params.slope
         rolling = RollingMotion(s, params.slope, result.post_impact[1])
         start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
         rolling_angles = jnp.where(
             result.outcome == Outcome.STEPPED,
-            jnp.linspace(-0.5 * s.alpha, 0.5 * s.alpha, n_samples),
+            jnp.linspace(-0.5 * s.alpha, end, n_samples),
             start_angles,
         )
         angles = jnp.stack([start_angles, start_angles, rolling_angles])
@@ -226,6 +227,9 @@ class RollingMotion(eqx.Module):
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at theta = -alpha/2, rad/s
+    end: Elementwise | None = (
+        None  # theta at the next landing, rad; None: alpha/2, as on flat ground
+    )
 
     def rate_squared(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta; negative where the wheel does not arrive."""
@@ -304,15 +308,15 @@ class RollingMotion(eqx.Module):
         Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
         """
         half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
+        end = half_angle if self.end is None else self.end
+        middle = 0.0 * self.initial_rate if self.end is None else 0.5 * (end - half_angle)
 
         def zoom(_round: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
             center, width = bracket
 
             def compare(i: Array, lowest: tuple[Array, Array]) -> tuple[Array, Array]:
                 theta = jnp.clip(
-                    center + width * (i * (2.0 / (N_GRID_ANGLES - 1)) - 1.0),
-                    -half_angle,
-                    half_angle,
+                    center + width * (i * (2.0 / (N_GRID_ANGLES - 1)) - 1.0), -half_angle, end
                 )
                 value = self.margins(theta)
                 return tree_where(value < lowest[1], (theta, value), lowest)
@@ -322,8 +326,9 @@ class RollingMotion(eqx.Module):
                 2.5 / N_GRID_ANGLES
             )
 
-        start_angles = jnp.stack([0.0 * self.initial_rate] * (1 + self.s.n))
-        theta, _ = lax.fori_loop(0, 5, zoom, (start_angles, half_angle))
+        start_angles = jnp.stack([middle] * (1 + self.s.n))
+        width = half_angle if self.end is None else 0.5 * (half_angle + end)
+        theta, _ = lax.fori_loop(0, 5, zoom, (start_angles, width))
         return self.margins(lax.stop_gradient(theta))
 
 

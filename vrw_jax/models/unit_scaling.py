@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.batch_step import N_STEP_INPUTS, jacobian_columns
+from vrw_jax.models.batch_step import jacobian_columns
 from vrw_jax.numerics import BatchFunction
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
@@ -25,13 +25,12 @@ _UNIT_POWERS = {
 """Powers of length, time and mass in the units of the wheel's parameters and of a step's
 outputs."""
 _STATE_UNITS = ("rad", "rad/s", "m/s")
-_INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE_UNITS)
+_INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE_UNITS, "rad")
 
 
 class UnitScaling(NamedTuple):
-    """Powers of one unit in each input (parameters, start) and output (section state,
-    durations).
-    """
+    """A unit: its power in each number of (parameters, start, slope of the line ahead) and of
+    (section state, durations)."""
 
     input_powers: tuple[int, ...]
     output_powers: tuple[int, ...]
@@ -86,10 +85,10 @@ def scaled_jacobian_columns(
 ) -> tuple:
     """Return `jacobian_columns` of a step's section state and durations for all inputs.
 
-    - `inputs`: parameters, then the start;
-    - `input_indices`: all of them, in the order of the returned columns.
+    `lanes`: parameters, then the start, then on uneven ground the slope of the line ahead; `moved`:
+    all of them, in the order of the columns told.
     """
-    computed_indices = [i for i in range(N_STEP_INPUTS) if i not in SCALING_BY_PARAMETER]
+    computed_indices = [i for i in range(len(inputs)) if i not in SCALING_BY_PARAMETER]
     columns, outputs, aux = jacobian_columns(function, inputs, computed_indices)
     scaled_outputs = {
         i: jnp.asarray(scaling.output_powers, outputs.dtype)[:, None] * outputs

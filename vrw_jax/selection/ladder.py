@@ -239,6 +239,10 @@ class LadderWheel(AbstractWheel):
     def fallback_model(self) -> UnilateralWheel:
         return self.unilateral_model
 
+    def split_ground(self, params: WheelParams, n_steps: int) -> None:
+        """Uneven ground is not for the ladder: its batches of slopes are refused as others are."""
+        return None
+
     def default_start(self, params: WheelParams) -> FullState:
         return self.unilateral_model.default_start(params)
 

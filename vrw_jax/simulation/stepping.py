@@ -218,7 +218,10 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
+    model, params, ground = read_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
+    if ground is not None:
+        model, params = model.with_ground(params, _take_first(ground, state.dtype))
     return model.take_step(params, state, options)
 
 
@@ -255,7 +258,10 @@ def return_map(
         >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
         (3, 3)
     """
+    model, params, ground = read_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
+    if ground is not None:
+        model, params = model.with_ground(params, _take_first(ground, state.dtype))
     return model.advance(params, state, options).section_state
 
 
@@ -349,11 +355,13 @@ def walk(
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
 
-    With unilateral contact, `params.slope` and the friction of the model may be arrays over steps,
-    which describe uneven ground. Lines of these slopes connect the footholds: the k-th line ends
-    where the k-th step begins with a landing. Each foot has the friction of its own landing. Forces
-    are along and normal to the line that ends at the last landing. A section state refers to the
-    line that ends at its landing.
+    On uneven ground `params.slope` is an array over steps: straight lines of these slopes join the
+    footholds. Both feet of step k's double support are on line k, which ends at the foothold on
+    which the step begins; the step ends when the next foot meets line k + 1. So n steps use n + 1
+    slopes; of n given ones the last is used twice. A section state is in the frame of the line that
+    ends at its landing: the start in that of line 0. Forces are along and normal to line k. With
+    unilateral contact the model's friction may be such an array too: each foot keeps the friction
+    of its own landing.
 
     Args:
         params: the wheel.
@@ -376,17 +384,30 @@ def walk(
         (5, (5, 3))
     """
     n_steps = check_int("n_steps", n_steps)
-    checked_model, ground_per_step = check_model(model, allows_arrays=True), None
-    if isinstance(params, WheelParams):
-        ground_per_step = checked_model.split_ground(params, n_steps)
-    if ground_per_step is not None:
-        checked_model, params = checked_model.with_ground(
-            params, jax.tree.map(lambda row: row[0], ground_per_step)
-        )
+    checked_model, params, ground_per_step = read_ground(params, model, n_steps)
     params, state, checked_model, options = validate_arguments(
         params, x, checked_model, options, engine
     )
+    if ground_per_step is not None:
+        ground_per_step = tuple(row.astype(state.dtype) for row in ground_per_step)
     return _scan_steps(checked_model, params, state, options, n_steps, ground_per_step)
+
+
+def read_ground(
+    params: Any, model: ModelLike | None, n_steps: int
+) -> tuple[AbstractWheel, Any, StepGround | None]:
+    """Rung, wheel and the ground of each step: None if flat, else both stand where it begins."""
+    rung = check_model(model, allows_arrays=True)
+    over_steps = rung.split_ground(params, n_steps) if isinstance(params, WheelParams) else None
+    if over_steps is None:
+        return rung, params, None
+    rung, _ = rung.with_ground(params, tuple(row[0] for row in over_steps))
+    first = jnp.reshape(params.slope, -1)[0]
+    return rung, eqx.tree_at(lambda wheel: wheel.slope, params, first), over_steps
+
+
+def _take_first(over_steps: StepGround, dtype: Any) -> StepGround:
+    return tuple(row[0].astype(dtype) for row in over_steps)
 
 
 N_APPROACH_STEPS = 100

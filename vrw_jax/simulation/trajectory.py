@@ -7,7 +7,7 @@ labels refer to the present step, so theta and the lengths jump at a landing.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,15 +27,15 @@ from vrw_jax.contact import (
     unpack_state,
 )
 from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_variables, provenance
-from vrw_jax.models import AbstractWheel, Trajectory
+from vrw_jax.models import AbstractWheel, Trajectory, complete_slopes, split_slopes
 from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import SELECTION_ATTRS
 from vrw_jax.simulation.stepping import (
     ModelLike,
     SectionLike,
-    check_model,
     check_single_wheel,
+    read_ground,
     validate_arguments,
 )
 from vrw_jax.validation import check_int, check_not_traced
@@ -62,7 +62,9 @@ def simulate(
 ) -> xr.Dataset:
     """Return a walk from the section state `x` as a labelled trajectory over time.
 
-    By default the walk starts at the default start of the model, near the gait of Table 1.
+    Without `x` the walk begins at the rung's own start, near the gait of Table 1. Uneven ground is
+    given as in `vrw.walk`: places are then in the frame of line 0; angles and forces are those of
+    the line that the step stands on, whose slopes are the attribute `slopes`.
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
@@ -93,13 +95,20 @@ def simulate(
     """
     check_not_traced("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
+    given = params
+    rung, params, ground = read_ground(params, model, n_steps)
     check_single_wheel(params, "simulate one at a time")
-    start = check_model(model).default_start(params) if x is None else x
-    params, x, model, options = validate_arguments(params, start, model, options, engine)
+    start = rung.default_start(params) if x is None else x
+    params, x, model, options = validate_arguments(params, start, rung, options, engine)
     make_spec = make_contact_spec if model.reports_contacts else make_phase_spec
-    s = jax.tree.map(float, params).symbols()
-    spec = make_spec(params, s, model, options, n_samples)
-    sampled_walk = sample_walk(spec, x, n_steps, float(s.Mt * s.g * s.sin_phi))
+    s, wheels, lines = jax.tree.map(float, params).symbols(), [(model, params)], None
+    if ground is not None:
+        rows = zip(*(row.astype(x.dtype) for row in ground), strict=True)
+        wheels = [model.with_ground(params, row) for row in rows]
+        slopes = given.slope if given.slope.ndim else jnp.full(n_steps, given.slope)
+        lines = Lines(np.asarray(complete_slopes(slopes, n_steps), float), float(s.Mt * s.g))
+    spec = make_spec(wheels, options, n_samples)
+    sampled_walk = sample_walk(spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), lines)
     columns = sampled_walk.columns
     data = make_variables({name: columns[name] for name in spec.variable_names}, "time")
     for name in filter(columns.__contains__, SELECTION_ATTRS):
@@ -112,6 +121,9 @@ def simulate(
         "start": np.asarray(x).tolist(),
     }
     provenance_attrs = spec.attrs | provenance(params, model, options)
+    if lines is not None:
+        provenance_attrs |= {"frame": FRAME_ON_LINES, "slopes": lines.slopes.tolist()}
+        del provenance_attrs["parameter_slope"]
     coordinates = {name: data.pop(name) for name in ("step", "phase") if name in data}
     return xr.Dataset(data, spec.coordinates | coordinates, attrs | provenance_attrs)
 
@@ -124,18 +136,17 @@ class SampledStep(NamedTuple):
     outcome: Outcome
     next_section_state: Array  # section state at the end of the step
     period: float  # s
-    step_length: float  # distance from the landing of this step to the next landing, m
+    step_length: float  # from this step's landing to the next, along the line that it stands on, m
+    rise: float  # and normal to it: 0 on flat ground
 
 
 class TrajectorySpec(NamedTuple):
     """Specification of a trajectory: how a model samples a step, and the variables."""
 
-    sample_step: Callable[[Array], SampledStep]  # samples the step from a section state
-    variable_names: tuple[str, ...]  # measures over time
-    slope_position_names: tuple[
-        str, ...
-    ]  # those of the measures that are positions along the slope
-    coordinates: dict[str, Any]  # coordinates other than those among the measures
+    sample_step: Callable[[Array, int], SampledStep]  # of a step from a section state
+    variable_names: tuple[str, ...]  # measures that are told over time
+    slope_position_names: tuple[str, ...]  # of these, places along the slope
+    coordinates: dict[str, Any]  # coordinates beside those among the names
     attrs: dict[str, object]
 
 
@@ -151,28 +162,72 @@ HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
 """Energies that are measured relative to the height of the first foot of the walk."""
 
 
-def sample_walk(
-    spec: TrajectorySpec, x: Array, n_steps: int, downslope_weight: float
-) -> SampledWalk:
-    """Return the samples of up to `n_steps` steps from the section state x.
+FRAME_ON_LINES = (
+    "places: x downhill along line 0, z normal to it, first foot at the origin; angles and forces: "
+    "along and normal to the line under both feet of the step's double support"
+)
 
-    Positions along the slope, in m, are relative to the first landing. Energies that depend on the
-    height, in J, decrease by `downslope_weight`, in N, times the distance.
+
+class Lines(NamedTuple):
+    """Uneven ground: slopes of its lines, rad, and the wheel's weight, N."""
+
+    slopes: np.ndarray
+    weight: float
+
+    def place(
+        self, part: dict[str, np.ndarray], along: Sequence[str], k: int, place: np.ndarray
+    ) -> None:
+        """Step k's places in the frame of line 0 and its energies from the walk's first foot, where
+        its own first foot is at `place`."""
+        for name in along:
+            normal = f"{name[:-1]}z"
+            x, z = self.rotate(k, part[name], part[normal])
+            part[name], part[normal] = x + place[0], z + place[1]
+        first = self.slopes[0]
+        height = place[1] * np.cos(first) - place[0] * np.sin(first)
+        for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            part[name] = part[name] + self.weight * height
+
+    def rotate(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
+        """A vector of the frame of line k in that of line 0."""
+        angle = self.slopes[k] - self.slopes[0]
+        sin, cos = np.sin(angle), np.cos(angle)
+        return x * cos + z * sin, z * cos - x * sin
+
+
+def sample_walk(
+    spec: TrajectorySpec,
+    x: Array,
+    n_steps: int,
+    downslope_weight: float,
+    lines: Lines | None = None,
+) -> SampledWalk:
+    """Steps from the section state x, as many as it can.
+
+    Places along the slope, m, count from the first landing; energies that are `FALLING`, J, lose
+    `weight_along`, N, times the way. On uneven ground see `Lines.place`.
     """
     parts: list[dict[str, np.ndarray]] = []
     outcome, n_stepped, time, position = Outcome.STEPPED, 0, 0.0, 0.0
+    foothold = np.zeros(2)
     while outcome == Outcome.STEPPED and n_stepped < n_steps:
-        sampled_step = spec.sample_step(x)
+        sampled_step = spec.sample_step(x, n_stepped)
         has_occurred, part = sampled_step.durations > 0.0, dict[str, np.ndarray]()
         selection = (
             slice(None) if has_occurred.all() else has_occurred
         )  # a full slice copies nothing
         for name, values in sampled_step.columns.items():
             part[name] = values[selection].reshape(-1, *values.shape[2:])
-        for name in spec.slope_position_names:
-            part[name] = part[name] + position
-        for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            part[name] = part[name] - downslope_weight * position
+        if lines is None:
+            for name in spec.slope_position_names:
+                part[name] = part[name] + position
+            for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
+                part[name] = part[name] - downslope_weight * position
+        else:
+            lines.place(part, spec.slope_position_names, n_stepped, foothold)
+            foothold = foothold + lines.rotate(
+                n_stepped, sampled_step.step_length, sampled_step.rise
+            )
         part["time"] = part["time"] + time
         part["step"] = np.full(len(part["time"]), n_stepped)
         parts.append(part)
@@ -204,7 +259,7 @@ def _compile_trace(
 def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample), from Leg 1's foot.
 
-    The column `ahead` is the position along the slope of the leg that lands next, in m.
+    `ahead` and `above` are added: where the landing leg's foot is, m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
     kinetic, gravitational, elastic = np.moveaxis(np.asarray(trajectory.energy), -1, 0)
@@ -212,6 +267,7 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     rear_leg = rear_direction(s, motion.sin, motion.cos)
     hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
+    lands = landing_direction(s, motion.sin, motion.cos)
     return {
         "time": np.array(trajectory.time),
         "x": zero,
@@ -236,31 +292,36 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
         "foot_2_z": hub_z - L2 * rear_leg.cos,
         "hub_x": hub_x,
         "hub_z": hub_z,
-        "ahead": hub_x - s.L0 * landing_direction(s, motion.sin, motion.cos).sin,
+        "ahead": hub_x - s.L0 * lands.sin,
+        "above": hub_z - s.L0 * lands.cos,
     }
 
 
-def make_phase_spec(
-    params: WheelParams, s: Symbols, model: AbstractWheel, options: StepOptions, n_samples: int
-) -> TrajectorySpec:
-    """Return the specification for models whose steps consist of the paper's phases."""
-    leaves, structure = jax.tree.flatten((params, options))
-    sample_phases = _compile_trace(model, structure, n_samples)
+Wheels = list[tuple[Any, WheelParams]]
+"""Rung and wheel of all steps, or of each."""
 
-    def sample_step(x: Array) -> SampledStep:
-        """Return the samples of the step from x."""
-        trajectory = sample_phases(x, *leaves)
+
+def make_phase_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
+    """Of rungs that step through the paper's phases."""
+
+    def prepared(model: AbstractWheel, params: WheelParams) -> tuple:
+        leaves, structure = jax.tree.flatten((params, options))
+        s = jax.tree.map(float, split_slopes(params)[0]).symbols()
+        return s, _compile_trace(model, structure, n_samples), leaves
+
+    of_steps = [prepared(*wheel) for wheel in wheels]
+
+    def sample_step(x: Array, k: int) -> SampledStep:
+        s, trace, leaves = of_steps[k if len(of_steps) > 1 else 0]
+        trajectory = trace(x, *leaves)
         columns, durations = _make_columns(s, trajectory), np.asarray(trajectory.durations)
-        landing_position = columns.pop("ahead")
+        landing_position, above = columns.pop("ahead"), columns.pop("above")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
         phases_occurred = np.flatnonzero(durations > 0.0)
-        step_length = (
-            float(landing_position[phases_occurred[-1], -1]) if phases_occurred.size else 0.0
-        )
+        place = (landing_position, above) if phases_occurred.size else ()
+        way = tuple(float(x[phases_occurred[-1], -1]) for x in place) or (0.0, 0.0)
         outcome, period = Outcome(int(trajectory.outcome)), float(durations.sum())
-        return SampledStep(
-            columns, durations, outcome, trajectory.section_state, period, step_length
-        )
+        return SampledStep(columns, durations, outcome, trajectory.section_state, period, *way)
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
@@ -307,20 +368,21 @@ def _make_contact_columns(
     return trace, columns | {"tangential": trace.tangential, "normal": trace.normal}
 
 
-def make_contact_spec(
-    params: WheelParams, s: Symbols, model: Any, options: StepOptions, n_samples: int
-) -> TrajectorySpec:
-    """Return the specification for models with contacts, over time and leg.
+def make_contact_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
+    """Of rungs that walk on contacts, over time and leg; legs bear the labels of their step.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
     including both ends. For a `LadderWheel`, `rung` and `reason` give the model used at each time
     and the cause (see `ModelChoice`).
     """
 
-    def sample_step(x: Array) -> SampledStep:
-        """Return the samples of the step from x."""
+    frictions = [float(model.friction) for model, _ in wheels]
+    n_legs = wheels[0][1].n_legs
+
+    def sample_step(x: Array, k: int) -> SampledStep:
+        wheel = wheels[k if len(wheels) > 1 else 0]
         trace, columns = jax.tree.map(
-            np.array, _make_contact_columns(model, params, x, options, n_samples)
+            np.array, _make_contact_columns(*wheel, x, options, n_samples)
         )
         shape = (len(trace.duration), n_samples)
         repeat_over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
@@ -329,6 +391,8 @@ def make_contact_spec(
             name: np.full(shape, int(value)) for name, value in trace.model_selection.items()
         }
         columns["on_stopper"] = repeat_over_samples(trace.locked)
+        happened = np.flatnonzero(trace.duration > 0.0)
+        foremost = columns["foot_z"][happened[-1], -1, -1] if happened.size else 0.0
         return SampledStep(
             columns,
             trace.duration,
@@ -336,12 +400,13 @@ def make_contact_spec(
             jnp.asarray(trace.section_state),
             float(trace.duration.sum()),
             float(trace.step_length),
+            float(foremost),
         )
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first landing at the origin",
-        "friction": float(model.friction),
+        "friction": frictions[0] if len(set(frictions)) == 1 else frictions,
     }
     names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
-    leg_coordinate = {"leg": np.arange(1, params.n_legs + 1)}
+    leg_coordinate = {"leg": np.arange(1, n_legs + 1)}
     return TrajectorySpec(sample_step, names, ("hub_x", "foot_x"), leg_coordinate, attrs)

@@ -30,6 +30,7 @@ from vrw_jax.wheel.phases import (
     AbstractPhase,
     PhaseInstant,
     PhaseMargins,
+    SingleSupport1,
     make_phases,
 )
 from vrw_jax.wheel.transitions import Landing

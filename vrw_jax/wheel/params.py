@@ -319,6 +319,12 @@ def stack_parameters(params: WheelParams) -> Array:
     return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
 
 
-def wheel_from_parameters(parameters: Array | tuple[Array, ...], n_legs: int) -> WheelParams:
-    """Return the wheel with these parameters: the inverse of `stack_parameters`."""
-    return WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
+def wheel_from_parameters(
+    parameters: Array | tuple[Array, ...], n_legs: int, ahead: Elementwise | None = None
+) -> WheelParams:
+    """The inverse of `parameters_of`; on uneven ground with the slope of the line `ahead` of a
+    step, rad, beside its own."""
+    wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
+    if ahead is None:
+        return wheel
+    return eqx.tree_at(lambda wheel: wheel.slope, wheel, jnp.stack([wheel.slope, ahead]))

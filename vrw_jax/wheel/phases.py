@@ -22,6 +22,7 @@ from vrw_jax.wheel.geometry import (
     DoubleSupportCircle,
     Motion,
     double_support_circle,
+    landing_direction,
     landing_foot_height,
     rear_foot_height,
 )
@@ -56,8 +57,10 @@ class AbstractPhase(abc.ABC):
     """A phase of the wheel `s`."""
 
     s: Symbols
-    constants: Vector  # constants of the phase: in double support the distance of the feet, m
-    stop_at_lift_off: bool  # whether a negative normal force on foot 1 ends the phase
+    constants: Vector  # what the phase holds constant: in double support the feet's distance, m
+    stop_at_lift_off: bool  # whether a ground that would have to pull ends it
+    turn: Vector = ()
+    """Sine and cosine of the angle by which the line ahead is steeper; empty on flat ground."""
 
     name: ClassVar[str]
     n_dof: ClassVar[int]
@@ -117,6 +120,28 @@ class AbstractPhase(abc.ABC):
     @abc.abstractmethod
     def reset_map(self, motion: Motion) -> Motion:
         """Return the motion just after the phase's regular end."""
+
+    def landing_height(self, motion: Motion) -> Elementwise:
+        """Height of the next leg's foot above the line on which it lands, m.
+
+        That line begins at Leg 1's foot: in its frame the condition has the form of flat ground.
+        """
+        return landing_foot_height(self.s, self._rotate(motion))
+
+    def landing_rate(self, motion: Motion) -> Elementwise:
+        """The rate of `landing_height`, m/s."""
+        turned = self._rotate(motion)
+        lands = landing_direction(self.s, turned.sin, turned.cos)
+        across = self.s.L0 * lands.sin - turned.L1 * turned.sin
+        return turned.dL1 * turned.cos + across * turned.dtheta
+
+    def _rotate(self, motion: Motion) -> Motion:
+        """The motion in the frame of the line ahead."""
+        if not self.turn:
+            return motion
+        sin, cos = self.turn
+        turned = motion.sin * cos - motion.cos * sin, motion.cos * cos + motion.sin * sin
+        return motion._replace(sin=turned[0], cos=turned[1])
 
     def motion_at(self, q: Vector, v: Vector) -> Motion:
         """Return the full motion at the phase's own coordinates q and rates v."""
@@ -257,7 +282,7 @@ class DoubleSupport(AbstractPhase):
         return instant.rear_force.normal
 
     def own_guards(self, instant: PhaseInstant) -> Vector:
-        return self.s.L0 - instant.motion.L2, landing_foot_height(self.s, instant.motion)
+        return self.s.L0 - instant.motion.L2, self.landing_height(instant.motion)
 
     def own_margins(self, instant: PhaseInstant) -> Vector:
         return ()
@@ -297,7 +322,7 @@ class SingleSupport1(AbstractPhase):
         return self.s.L0 - instant.motion.L2
 
     def own_guards(self, instant: PhaseInstant) -> Vector:
-        return (landing_foot_height(self.s, instant.motion),)
+        return (self.landing_height(instant.motion),)
 
     def own_margins(self, instant: PhaseInstant) -> Vector:
         return (rear_foot_height(self.s, instant.motion),)
@@ -335,7 +360,7 @@ class SingleSupport2(AbstractPhase):
         return (1.0 / M.M11) * rows[0], (1.0 / M.M22) * rows[1]
 
     def end_guard(self, instant: PhaseInstant) -> Elementwise:
-        return landing_foot_height(self.s, instant.motion)
+        return self.landing_height(instant.motion)
 
     def own_guards(self, instant: PhaseInstant) -> Vector:
         return ()
@@ -363,11 +388,12 @@ PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, 
 
 
 def make_phases(
-    s: Symbols, distance: Elementwise, stop_at_lift_off: bool
+    s: Symbols, distance: Elementwise, stop_at_lift_off: bool, turn: Vector = ()
 ) -> tuple[AbstractPhase, ...]:
-    """Return the phases of a step that starts with the feet `distance` m apart."""
+    """The phases of a step that begins with the feet that far apart, m; `turn` of the line ahead,
+    see `AbstractPhase.turn`."""
     phase_constants = ((distance,), (), ())
     return tuple(
-        phase(s, constants, stop_at_lift_off)
+        phase(s, constants, stop_at_lift_off, turn)
         for phase, constants in zip(PAPER_PHASES, phase_constants, strict=True)
     )

@@ -173,6 +173,33 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     )
 
 
+def stand_on_both(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, _dL1: Elementwise
+) -> Landing:
+    """The motion after a landing that leaves both feet on the ground, by its rate `dtheta` just
+    after it, rad/s; impulses and losses, which need the motion before it, are zero.
+
+    theta is the angle just before the landing, in the labels of the step that ends, as in `land`.
+    """
+    before = motion_before_landing(s, theta, dtheta, 0.0 * dtheta)
+    sin, cos = landing_direction(s, before.sin, before.cos)
+    distance = s.L0 * s.sin_alpha / before.cos
+    circle = double_support_circle(s, distance, sin, cos)
+    rates = dtheta, circle.G1 * dtheta, circle.G2 * dtheta
+    zero = 0.0 * (theta + dtheta)
+    none = FootForce(zero, zero)
+    return Landing(
+        theta=theta - s.alpha,
+        motion=Motion(sin, cos, s.L0 + zero, before.L1, *rates),
+        distance=distance,
+        keeps_rear_foot=zero == 0.0,
+        fore_impulse=none,
+        rear_impulse=none,
+        energy_lost=zero,
+        hub_jump=(zero, zero),
+    )
+
+
 def stop_leg_2(s: Symbols, motion_before: Motion) -> Motion:
     """Return the motion after Leg 2, at L2 = L0, has met its stopper."""
     M = mass_matrix(s, motion_before.L1, motion_before.L2)

@@ -1,0 +1,145 @@
+"""The paper's wheel on uneven ground, in an absolute frame: an oracle without turning frames.
+
+The five coordinates of ``five_coordinates`` with x horizontal, z upwards and theta from the
+vertical, so that gravity is vertical and no slope enters the equations of motion. Straight lines
+join the footholds: line k, of slope phi[k], leads from foothold k - 1 to foothold k. Feet stay
+where they landed. Step k begins with the landing on foothold k; its rear foot leaves where the
+ground no longer presses it along the normal of line k, and it ends where the next foot meets line
+k + 1, which begins at foothold k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .constrained_wheel import Array, Params, Phase, Wheel, run_phase
+from .five_coordinates import ATOL, RTOL
+
+STEPPED = "touchdown"
+
+
+class Step(NamedTuple):
+    """One step: how it ended; durations of DLS, SLS-I, SLS-II, s; losses, J."""
+
+    outcome: str
+    section_state: Array  # (theta-, dtheta-, dL1-) in the frame of line k + 1
+    durations: Array
+    post_impact: Array  # (theta+, dtheta+) in the frame of line k
+    foothold: Array  # on which the step begins, (x, z), m
+    lost_landing: float
+    lost_stopper: float
+    lost_damping: float
+    energy_residual: float  # J, over the step without the landing
+    clearance: float  # of Leg 2's foot over line k when Leg 2 meets its stopper, m
+    fore_force: float  # normal to line k on the fore foot just before the next landing, N
+
+
+def normal(slope: float) -> Array:
+    """Unit vector out of a line, (x, z)."""
+    return np.array([math.sin(slope), math.cos(slope)])
+
+
+def walk(
+    params: Params,
+    x: Sequence[float],
+    slopes: Sequence[float],
+    *,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+) -> list[Step]:
+    """Steps until one fails, one for each pair of neighbouring slopes."""
+    wheel = Wheel({**params, "slope": 0.0})
+    length, alpha = params["locked_length"], wheel.alpha
+    theta, dtheta, dL1 = (float(value) for value in x)
+    reach = length * math.cos(theta - alpha) / math.cos(theta)
+    q = np.array([0.0, 0.0, theta + float(slopes[0]), reach, length])
+    v = np.array([0.0, 0.0, dtheta, dL1, 0.0])
+    steps: list[Step] = []
+    for k in range(len(slopes) - 1):
+        q, v, step = _step(wheel, q, v, float(slopes[k]), float(slopes[k + 1]), rtol, atol)
+        steps.append(step)
+        if step.outcome != STEPPED:
+            break
+    return steps
+
+
+def _exchanged(wheel: Wheel, q: Array, v: Array) -> tuple[Array, Array]:
+    """Labels of the step that begins: the leg at theta - alpha, which has landed, becomes Leg 1."""
+    length = wheel.params["locked_length"]
+    x, z, theta, reach, _ = q
+    new = theta - wheel.alpha
+    hub = np.array([x + reach * math.sin(theta), z + reach * math.cos(theta)])
+    along, across = (
+        np.array([math.sin(theta), math.cos(theta)]),
+        np.array([math.cos(theta), -math.sin(theta)]),
+    )
+    hub_rate = v[:2] + v[3] * along + reach * v[2] * across
+    foot = hub - length * np.array([math.sin(new), math.cos(new)])
+    rate = hub_rate - length * v[2] * np.array([math.cos(new), -math.sin(new)])
+    return np.array([*foot, new, length, reach]), np.array([*rate, v[2], 0.0, v[3]])
+
+
+def _step(
+    wheel: Wheel, q: Array, v: Array, slope: float, ahead: float, rtol: float, atol: float
+) -> tuple[Array, Array, Step]:
+    params, out = wheel.params, normal(slope)
+    length, above = params["locked_length"], normal(ahead)
+    options = {"rtol": rtol, "atol": atol, "max_step": 1e-2}
+    q, before = _exchanged(wheel, q, v)
+    foothold, rear = q[:2].copy(), np.array(wheel.foot2(q))
+    v, impulse = wheel.impact(q, before, "DLS")
+    planted = bool(out @ impulse[2:4] >= 0.0)
+    if not planted:
+        v, _ = wheel.impact(q, before, "SLS-I")
+    lost_landing = wheel.kinetic(q, before) - wheel.kinetic(q, v)
+    post_impact, begins = np.array([q[2] - slope, v[2]]), wheel.energy(q, v)
+
+    def touchdown(q: Array, v: Array) -> float:
+        new = q[2] - wheel.alpha
+        hub = q[:2] + q[3] * np.array([math.sin(q[2]), math.cos(q[2])])
+        return float(above @ (hub - length * np.array([math.sin(new), math.cos(new)]) - foothold))
+
+    def pressed(foot: int, mode: str) -> Any:
+        return lambda q, v: float(out @ wheel.acceleration(q, v, mode)[1][foot : foot + 2])
+
+    stopper = lambda q, v: length - float(q[4])
+    fell = lambda q, v: float(v[2])
+    phases: list[Phase] = []
+    modes: dict[str, dict[str, Any]] = {
+        "DLS": {"takeoff": pressed(2, "DLS"), "stopper early": stopper, "early": touchdown},
+        "SLS-I": {"stopper": stopper, "early": touchdown, "lift": pressed(0, "SLS-I")},
+        "SLS-II": {STEPPED: touchdown, "lift": pressed(0, "SLS-II")},
+    }
+    outcome, lost_stopper, clearance = "", 0.0, 0.0
+    for mode, guards in modes.items():
+        if mode == "DLS" and not planted:
+            phases.append(Phase(mode, 0.0, q, v, 0.0, "takeoff", []))
+            continue
+        if mode == "SLS-II":
+            after, _ = wheel.impact(q, v, mode)
+            lost_stopper, v = wheel.kinetic(q, v) - wheel.kinetic(q, after), after
+            clearance = float(out @ (np.array(wheel.foot2(q)) - rear))
+        phase = run_phase(wheel, mode, q, v, {**guards, "fell back": fell}, **options)
+        phases.append(phase)
+        q, v, outcome = phase.q, phase.v, phase.event
+        if outcome != next(iter(guards)):
+            break
+    damped = math.fsum(phase.dissipated for phase in phases)
+    step = Step(
+        outcome=outcome,
+        section_state=np.array([q[2] - ahead, v[2], v[3]]),
+        durations=np.array([phase.duration for phase in phases]),
+        post_impact=post_impact,
+        foothold=foothold,
+        lost_landing=lost_landing,
+        lost_stopper=lost_stopper,
+        lost_damping=damped,
+        energy_residual=wheel.energy(q, v) - begins + damped + lost_stopper,
+        clearance=clearance,
+        fore_force=float(out @ wheel.acceleration(q, v, phases[-1].name)[1][:2]),
+    )
+    return q, v, step
