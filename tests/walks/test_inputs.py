@@ -64,6 +64,59 @@ def test_float32_is_refused_at_tolerances_it_cannot_resolve():
     assert "vrw.start_jax()" in str(caught.value)
 
 
+@pytest.fixture
+def switched_off():
+    """A wheel, lanes of wheels, a start and a gait of 64 bits, after which JAX goes back to 32."""
+    made = (
+        vrw.WheelParams(),
+        vrw.WheelParams(damping=np.array([100.0, 150.0])),
+        vrw.paper_start(),
+        vrw.limit_cycle(vrw.WheelParams()),
+    )
+    jax.config.update("jax_enable_x64", False)
+    try:
+        yield made
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+@pytest.mark_chunk.filterwarnings("ignore:Explicitly requested dtype")
+@pytest.mark_chunk.parametrize(
+    "call",
+    [
+        lambda one, many, x, gait: vrw.limit_cycle(one),
+        lambda one, many, x, gait: vrw.limit_cycle(one, guess=gait),
+        lambda one, many, x, gait: vrw.limit_cycle(one, model=vrw.UnilateralWheel(friction=0.7)),
+        lambda one, many, x, gait: vrw.limit_cycle(one, model=vrw.RigidWheel()),
+        lambda one, many, x, gait: vrw.limit_cycles(many),
+        lambda one, many, x, gait: jax.jit(lambda p: vrw.limit_cycle(p).speed)(one),
+        lambda one, many, x, gait: jax.grad(lambda p: vrw.limit_cycle(p).speed)(one),
+        lambda one, many, x, gait: jax.vmap(vrw.limit_cycle, in_axes=(many.in_axes,))(many),
+        lambda one, many, x, gait: vrw.sensitivities(one, measures=["speed"]),
+        lambda one, many, x, gait: vrw.step(one, x),
+        lambda one, many, x, gait: vrw.return_map(one, x),
+        lambda one, many, x, gait: vrw.walk(one, x, 2),
+        lambda one, many, x, gait: vrw.simulate(one, x, n_steps=1),
+        lambda one, many, x, gait: vrw.choose_model(one, x),
+        lambda one, many, x, gait: vrw.step_batch(many, np.tile(np.asarray(x), (2, 1)), 2),
+        lambda one, many, x, gait: vrw.basin(
+            one, {"theta_touchdown": 0.09, "dtheta_touchdown": [1.6], "dL1_touchdown": -0.1}
+        ),
+        lambda one, many, x, gait: vrw.continue_branch(one, "damping", (190.0, 230.0)),
+        lambda one, many, x, gait: vrw.continue_branches(many, "stiffness", (400.0, 600.0)),
+        lambda one, many, x, gait: vrw.continue_special_point("fold", ("damping", "slope"), gait),
+        lambda one, many, x, gait: vrw.tune(
+            one, "dls_fraction", ("damping",), {"damping": (150.0, 200.0)}
+        ),
+        lambda one, many, x, gait: vrw.scan(vrw.grid(damping=[150.0]), ["speed"], base=one),
+        lambda one, many, x, gait: vrw.measure_to_tolerance("speed", one, 1e-3, friction=50.0),
+    ],
+)
+def test_numbers_of_64_bits_are_not_computed_in_32_without_a_word(switched_off, call):
+    with pytest.raises(ValueError, match=r"float32 numbers.*vrw\.start_jax"):
+        call(*switched_off)
+
+
 def test_float32_works_if_requested():
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), vrw.WheelParams())
     start = vrw.paper_start().astype(jnp.float32)

@@ -22,6 +22,7 @@ from vrw_jax.cli.console import (
     INTERRUPTED_EXIT_CODE,
     print_error,
     report_errors,
+    show_warnings_as_sentences,
     stderr_console,
     stdout_console,
 )
@@ -58,6 +59,7 @@ def main() -> None:
     # collector takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _stop)
+    show_warnings_as_sentences()
     with printing.whole_output():
         app()
 

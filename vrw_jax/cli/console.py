@@ -3,9 +3,10 @@
 import contextlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console
@@ -76,6 +77,26 @@ def _give_up_output(error: OSError) -> None:
 def print_error(sentence: str) -> None:
     """Print a sentence about an error on stderr."""
     stderr_console.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
+
+
+def show_warnings_as_sentences() -> None:
+    """Print what the library warns of like any other sentence, without the place in its code."""
+    usual = warnings.showwarning
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1]):
+            print_error(str(message))
+        else:
+            usual(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show
 
 
 def _format_system_error(error: OSError) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -70,10 +71,15 @@ class CycleOptions:
         object.__setattr__(self, "mesh_intervals", mesh_intervals)
 
     def check_tolerances(self, dtype: np.dtype) -> None:
-        """Raise a ValueError if the tolerance is below the resolution of the number format."""
-        if self.tolerance < jnp.finfo(dtype).eps:
+        """Refuse a tolerance below what the number format can resolve.
+
+        A wheel of 64 bits counts as what JAX makes of it: 32 bits if `jax_enable_x64` is off.
+        """
+        computed = jax.dtypes.canonicalize_dtype(dtype)
+        if self.tolerance < jnp.finfo(computed).eps:
+            holder = "the wheel holds" if computed == dtype else "jax_enable_x64 is off: JAX takes"
             raise ValueError(
-                f"the wheel holds {np.dtype(dtype).name} numbers, in which no limit cycle is found "
+                f"{holder} {np.dtype(computed).name} numbers, in which no limit cycle is found "
                 f"to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 

@@ -287,6 +287,8 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
                 error_kw={"elinewidth": 0.7},
                 **bars,
             )
+        if measure_indices.is_constant:
+            axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(typeset_symbols(MEASURES[str(name)].long_name))
         axes.set_yticks(positions, [f"${MEASURES[p].mathtext}$" for p in parameters])
         axes.set_xlim(0.0, 1.05)

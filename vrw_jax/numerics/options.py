@@ -157,10 +157,12 @@ class StepOptions(AbstractPrintable):
                 )
 
     def check_tolerances(self, dtype: np.dtype) -> None:
-        """Refuse, in one sentence, an `rtol` below what the number format can resolve.
+        """Raise a ValueError for an `rtol` below the resolution of the number format.
 
-        `atol` has no such limit: states may be as small as their units make them.
+        `atol` has no such limit: states may be as small as their units make them. 64-bit arrays
+        that were made before `jax_enable_x64` was switched off count as 32-bit ones.
         """
+        dtype = jax.dtypes.canonicalize_dtype(dtype)
         min_tolerance = (
             MIN_TOLERANCE_EPS if dtype == np.float64 else TIGHTENING_FLOOR_EPS
         ) * float(jnp.finfo(dtype).eps)
@@ -169,7 +171,8 @@ class StepOptions(AbstractPrintable):
             return
         hint = f"ask for no less, as with StepOptions(rtol={1e2 * min_tolerance:.0e})"
         if dtype == np.float32:
-            hint = "call vrw.start_jax() before anything else, or " + hint
+            start = "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
+            hint = f"{start}, or {hint}"
         raise ValueError(
             f"rtol is {float(rtol):g}, but {np.dtype(dtype).name} numbers can't resolve less than "
             f"{min_tolerance:.0e}: {hint}."

@@ -6,6 +6,7 @@ computes the indices from the result with `scipy.stats.sobol_indices` (Saltelli 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -22,26 +23,31 @@ MIN_SOBOL_ROWS = 64
 N_RESAMPLES, INTERVAL_QUANTILES = 200, (0.025, 0.975)
 """Number of bootstrap resamples of the rows, and quantiles that bound the interval."""
 
+MAX_ROUNDOFF_SPREAD = 1e-11
+"""Largest spread of a measure, as a fraction of its largest magnitude, that counts as round-off;
+chosen because parameters that differ in their last digit alone leave measures spread by 4e-14 of
+it, and margins by 5e-12."""
+
 
 def sobol_indices(
     scan: xr.Dataset, measures: Iterable[str] = ("dls_fraction", "speed")
 ) -> xr.Dataset:
     """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
-    The first-order index is the share of a measure's variance that one parameter causes by itself.
-    The total index is the share that vanishes if the parameter is fixed. Each has the bounds
-    `lower` and `upper` of a 95 % bootstrap interval.
-
-    Rows with a sample that has no gait are omitted, and then as many more as leave a power of two.
-    The attribute `rows` is the number of rows used, and `left_out` is the share without a gait. If
-    that share is not small, the indices refer to gaits only, whose parameters are not independent.
+    The first-order index is the share of a measure's variance that one parameter makes by itself,
+    the total index the share that would vanish if it were known; each with `lower` and `upper` of a
+    95 % bootstrap interval. Rows with a sample that has no gait are left out, then as many more as
+    leave a power of two: `rows` of them count, and `left_out` is the share without a gait. Where it
+    is not small, the indices are those of gaits only, whose parameters are no longer independent.
+    A measure that varies by no more than round-off has no variance to share: its indices are 0, it
+    is marked in `is_constant`, and a warning names it.
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
         measures: names of variables of the scan.
 
     Returns:
-        A dataset of `first_order`, `total` and their intervals.
+        A dataset of `first_order`, `total`, their intervals and `is_constant`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -52,8 +58,6 @@ def sobol_indices(
         >>> indices.sel(measure="speed").first_order.values.round(1).tolist()
         [0.8, 0.2]
     """
-    from scipy.stats import sobol_indices as indices_of
-
     check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
     design = read_manifest(scan.attrs).get("design", {})
     if design.get("kind") != SALTELLI_KIND:
@@ -82,29 +86,55 @@ def sobol_indices(
         [scan[name].values.reshape(n_blocks, -1)[:, rows] for name in measure_names], axis=1
     )
 
-    def compute_indices(row_indices: np.ndarray) -> np.ndarray:
-        """Return both indices from some rows, shape (2, measures, parameters)."""
-        drawn_values = measure_values[..., row_indices]
-        scipy_indices = indices_of(
-            func={"f_A": drawn_values[0], "f_B": drawn_values[1], "f_AB": drawn_values[2:]}, n=n
-        )
-        index_kinds, shape = (
-            (scipy_indices.first_order, scipy_indices.total_order),
-            (len(measure_names), len(parameters)),
-        )
-        return np.stack([np.reshape(row_indices, shape) for row_indices in index_kinds])
-
-    generator = np.random.default_rng(0)  # seeded, so that the same scan gives the same intervals
+    generator = np.random.default_rng(0)  # the same scan gives the same intervals
+    compute_indices = _SobolIndices(measure_values)
     estimates = compute_indices(np.arange(n))
     resampled_estimates = [compute_indices(generator.integers(0, n, n)) for _ in range(N_RESAMPLES)]
     lower, upper = np.quantile(resampled_estimates, INTERVAL_QUANTILES, axis=0)
-    data = {}
+    constant = compute_indices.is_constant(measure_values)
+    if constant.any():
+        warnings.warn(
+            f"{', '.join(np.array(measure_names)[constant])}: constant over these samples but for "
+            "round-off, so that there is no variance to share, and the indices are 0.",
+            stacklevel=2,
+        )
+    data: dict[str, tuple] = {}
     for i, (name, label) in enumerate((("first_order", "first-order"), ("total", "total"))):
         attrs = {"units": "1", "long_name": f"{label} Sobol' index"}
         for suffix, bounds in (("", estimates), ("_lower", lower), ("_upper", upper)):
             data[name + suffix] = (("measure", "parameter"), bounds[i], attrs)
+    data["is_constant"] = ("measure", constant, {"long_name": "varies by round-off alone"})
     return xr.Dataset(
         data,
         coords={"measure": measure_names, "parameter": parameters},
         attrs={"rows": n, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits)},
     )
+
+
+class _SobolIndices:
+    """First-order and total indices from rows of a design, by measure and parameter."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values  # (2 + parameters, measures, rows)
+        self.roundoff = MAX_ROUNDOFF_SPREAD * np.abs(values).max(axis=(0, 2))
+
+    def is_constant(self, values: np.ndarray) -> np.ndarray:
+        """Return for each measure whether it varies by round-off alone between these samples."""
+        constant: np.ndarray = np.ptp(values[:2], axis=(0, 2)) <= self.roundoff
+        return constant
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Return both indices from some of the rows; 0 where nothing varies."""
+        from scipy.stats import sobol_indices as indices_of
+
+        drawn = self.values[..., rows]
+        varies = np.flatnonzero(~self.is_constant(drawn))
+        n_blocks, n_measures, _ = drawn.shape
+        both = np.zeros((2, n_measures, n_blocks - 2))
+        if len(varies):
+            drawn = drawn[:, varies]
+            functions = {"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}
+            found = indices_of(func=functions, n=len(rows))
+            both[0, varies] = np.reshape(found.first_order, (len(varies), -1))
+            both[1, varies] = np.reshape(found.total_order, (len(varies), -1))
+        return both
