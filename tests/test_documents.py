@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.rooms import ImportGraph
+from support.package_graph import ImportGraph
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted(
@@ -37,7 +37,7 @@ def find_missing_paths(text):
 
 
 def find_unknown_names(text):
-    """Modules and names in them, `room/module.name`, that are not there."""
+    """Modules and names in them, `package/module.name`, that do not exist."""
     for module, name in PLACE_PATTERN.findall(text.replace(".py`", "`")):
         dotted = "vrw_jax." + module.replace("/", ".")
         if dotted not in IMPORT_GRAPH.paths:

@@ -73,9 +73,9 @@ def test_friction_margins_use_the_friction_of_the_model(name):
 OUTCOMES = {
     "step": lambda m: vrw.step(LIFT_OFF_WHEEL, LIFT_OFF_START, model=m).outcome,
     "walk": lambda m: vrw.walk(LIFT_OFF_WHEEL, LIFT_OFF_START, 1, model=m).outcome,
-    "steps": lambda m: vrw.step_batch(LIFT_OFF_WHEEL, np.array([LIFT_OFF_START]), model=m).outcome[
-        0
-    ],
+    "step_batch": lambda m: vrw.step_batch(
+        LIFT_OFF_WHEEL, np.array([LIFT_OFF_START]), model=m
+    ).outcome[0],
     "simulate": lambda m: Outcome[vrw.simulate(LIFT_OFF_WHEEL, LIFT_OFF_START, 1, model=m).outcome],
     "basin": lambda m: vrw.basin(
         LIFT_OFF_WHEEL,
@@ -184,7 +184,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     functions = {name: f for name, f in public.items() if inspect.isfunction(f)}
     taking = {name for name, f in functions.items() if "model" in inspect.signature(f).parameters}
     assert taking - {"return_map"} == set(OUTCOMES) | set(GAITS)
-    measured = {"steps", "walk", "simulate", "return_map"}  # tell no margin of friction
+    measured = {"step_batch", "walk", "simulate", "return_map"}  # tell no margin of friction
     assert taking - measured == set(FRICTION)
 
 

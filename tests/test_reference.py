@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.hybrid import Termination
+from vrw_jax.hybrid import HybridSolution, Termination
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parent.parent
@@ -77,6 +77,14 @@ def test_every_public_name_is_in_the_reference():
     assert set(NAMES) | {"MEASURES"} == shown_values
     drawn_values = set(re.findall(r"^::: vrw_jax\.figures\.(\w+)$", pages, re.M))
     assert {name.removeprefix("plot.") for name in FIGURE_FUNCTIONS} == drawn_values
+
+
+def test_the_reference_shows_existing_names_and_the_result_of_a_hybrid_simulation():
+    page = (ROOT / "docs" / "reference" / "methods.md").read_text()
+    shown = re.findall(r"^::: vrw_jax\.([\w.]+)$", page, re.M)
+    things = [operator.attrgetter(name)(vrw) for name in shown]
+    assert HybridSolution in things
+    assert all(map(inspect.getdoc, things))
 
 
 def test_documentation_of_wheel_fields_agrees_with_their_domains():

@@ -133,15 +133,18 @@ _ON_MEASURES = """# Measures
 
 Every quantity has one name, symbol and unit, in steps, cycles, trajectories, scans, branches and
 figures alike: `vrw.MEASURES["speed"].unit`. Scans and tuning take the names of steps, margins and
-cycles, and scans derivatives too, as `"d speed / d damping"`. This page is told by the sources.
+cycles, and scans derivatives too, as `"d speed / d damping"`. This page is generated from the
+sources.
 """
 _GROUPS = (
-    ("Of a step", STEP_MEASURES, "What `vrw.step`, gaits and scans tell."),
-    ("Premises, as margins", MARGIN_MEASURES, "Positive where the premise holds: `step.monitors`, scans."),
-    ("Of a step on real ground", UNILATERAL_STEP_MEASURES, "Beside those of a step that every rung tells."),
+    ("Of a step", STEP_MEASURES, "Measures of `vrw.step`, gaits and scans."),
+    ("Margins", MARGIN_MEASURES, "Positive while the condition holds: "
+        "`step.margins`, scans."),
+    ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Beside those of a step "
+        "that every model has."),
     ("Of a gait", LIMIT_CYCLE_MEASURES, "Of a limit cycle."),
     ("Of a trajectory", TRAJECTORY_MEASURES, "Coordinates and variables of `vrw.simulate`."),
-    ("Of a trajectory on real ground", CONTACT_MEASURES, "Variables of each leg."),
+    ("Of a trajectory with unilateral contact", CONTACT_MEASURES, "Variables of each leg."),
     ("Parameters", PARAMETER_MEASURES, "Axes of scans and branches."),
 )  # fmt: skip
 

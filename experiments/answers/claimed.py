@@ -210,7 +210,8 @@ def count_results() -> None:
             vrw.Outcome(int(code)).name for code in own_values["outcomes"][~answered]
         )
         print(
-            f"{name}: {len(answered)} wheels, {answered.sum()} answered; no answer: {dict(lost_values)}"
+            f"{name}: {len(answered)} wheels, {answered.sum()} answered; no answer: "
+            f"{dict(lost_values)}"
         )
         for tol in TOLERANCES:
             values_here = answered & (np.abs(own_values["tol"] / tol - 1.0) < 1e-3)
@@ -243,7 +244,8 @@ def draw() -> None:
         outside = np.abs(cloud["wrong"]) > cloud["errors"]
         for status, kind in enumerate(KINDS):
             selection = (cloud["hows"] == status)[:, None] & ~outside
-            axis.plot(cloud["errors"][selection], wrong[selection], ".", ms=1.5, color=COLOURS[status],
+            axis.plot(cloud["errors"][selection], wrong[selection], ".", ms=1.5,
+            color=COLOURS[status],
                       rasterized=True)  # fmt: skip
             axis.plot([], [], "o", ms=3, color=COLOURS[status], label=kind)
         axis.plot(cloud["errors"][outside], wrong[outside], "kx", ms=4, label="outside")
@@ -261,7 +263,8 @@ def draw() -> None:
             values_here = [
                 retained & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
             ]
-            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in values_here], "o-", ms=3,
+            cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in values_here], "o-",
+            ms=3,
                       color=colour, label=name)  # fmt: skip
         cost.axhline(1.0, color=plots.DARK_GRAY, lw=0.6)
         cost.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="steps on real ground")

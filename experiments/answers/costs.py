@@ -48,7 +48,8 @@ def compare_with_unilateral_model(n: int, repeats: int) -> None:
         measured.statuses, (MeasureStatus.CHECKED_BY_ONE_STEP, MeasureStatus.CONTINUES_LOWER_GAIT)
     )
     print(
-        f"{n} wheels: {int((scan_result.outcome.values == 0).sum())} with an answer, {near.sum()} near"
+        f"{n} wheels: {int((scan_result.outcome.values == 0).sum())} with an answer, "
+        f"{near.sum()} near"
     )
     selection = {name: x[near] for name, x in (*columns.items(), ("friction", friction))}
     for name, wheels in (("all", design), ("near the paper's gait", vrw.samples(selection))):
@@ -84,7 +85,8 @@ def measure_means() -> None:
                     rows.append([
                         name, friction, measure, tol, int(mean.n_high_fidelity), mean.control,
                         f"{mean.error:.2g}", f"{mean.value - np.mean(values):.2g}", f"{cpu:.3f}",
-                        f"{single_result:.0f}", f"{one * 1e3:.2f}", f"{cpu / (single_result * one):.3f}",
+                        f"{single_result:.0f}", f"{one * 1e3:.2f}",
+                        f"{cpu / (single_result * one):.3f}",
                     ])  # fmt: skip
                     print(*rows[-1], flush=True)
     header = (

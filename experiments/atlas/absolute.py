@@ -54,7 +54,7 @@ class Mechanism:
         masses = exact(given.CRANK_MASS, given.ROD_MASS, given.SLIDER_MASS)
         inertias = exact(given.CRANK_INERTIA, given.ROD_INERTIA, given.SLIDER_INERTIA)
         self.mass = [x for m, j in zip(masses, inertias, strict=True) for x in (m, m, j)]
-        self.gravity, self.kept, self.friction = exact(
+        self.gravity, self.restitution, self.friction = exact(
             given.GRAVITY, given.RESTITUTION_COEFFICIENT, given.FRICTION
         )
         self.weight = [mpf(0)] * 9
@@ -211,7 +211,7 @@ def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
     event_values = integrate_until(flight, above, mechanism.start(), STEP)
     time, y = event_values.time, event_values.state
     result["first impact"] = time
-    y, sizes = mechanism.apply_impact(y, 1, mechanism.kept)
+    y, sizes = mechanism.apply_impact(y, 1, mechanism.restitution)
     result["crank's rate after it"] = y[11]
     result["impulse behind"], result["impulse ahead"] = sizes
     for bounce in range(2, bounces + 1):
@@ -219,7 +219,7 @@ def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
         length = -2 * rate / bend
         event_values = integrate_until(flight, above, y, min(length * mpf("1.02"), STEP))
         time, y = time + event_values.time, event_values.state
-        y, _ = mechanism.apply_impact(y, 1, mechanism.kept)
+        y, _ = mechanism.apply_impact(y, 1, mechanism.restitution)
         if bounce == 2:
             result["second impact"] = time
         if event_values.time < mpf("1e-20"):

@@ -189,7 +189,7 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
                         "other_outcome": f"{other} ({by_diffrax})",
                         "share": str(other / cases),
                         "stepped": str(step_result),
-                        "time_difference_s": f"{max(read_column(values_here, 'time_difference_s')):.1e}",
+                        "time_difference_s": f"{max(read_column(values_here, 'time_difference_s')):.1e}",  # noqa: E501
                     }
                 )
     return result_list
@@ -417,7 +417,7 @@ def events(rows: list[Row]) -> list[Row]:
             {"kind": kind}
             | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
             | {
-                "largest_time_difference": f"{max(read_column(selection, 'largest_time_difference')):.2e}"
+                "largest_time_difference": f"{max(read_column(selection, 'largest_time_difference')):.2e}"  # noqa: E501
             }
             | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
         )

@@ -133,14 +133,14 @@ class Dip:
         height = L1 * cos - L2 * (cos * peers.CA - sin * peers.SA)
         rise = evaluate_along(height)
         self.swing = Flow(list(y), rates, -1.0 * rise, 10)
-        self.told = multiprecision.compile_expressions(
+        self.height_and_rates = multiprecision.compile_expressions(
             [height, evaluate_along(rise), evaluate_along(evaluate_along(rise))], list(y)
         )
 
     def evaluate(self, state: Vector, P: Vector) -> Vector:
         """Height of foot 2, and its second and third derivatives by time."""
         reals = ([multiprecision.to_real(v) for v in values] for values in (state, P))
-        return [multiprecision.to_mpf(v) for v in self.told(*reals)]
+        return [multiprecision.to_mpf(v) for v in self.height_and_rates(*reals)]
 
     def lift_off(self, y: Vector, p: Vector, about: float) -> tuple[Vector, Vector]:
         """State at the end of double support, and the constants."""

@@ -17,7 +17,7 @@ import unicodedata
 from matplotlib.figure import Figure
 
 from experiments.atlas import cases
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 from experiments.shared.command import make_parser
 from experiments.shared.tables import (
     DOCS,

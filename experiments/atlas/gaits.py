@@ -16,7 +16,7 @@ from scipy.optimize import fsolve
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import METHODS, MethodRun, Part, modes
-from experiments.atlas.told import time_second_call
+from experiments.atlas.results import time_second_call
 from vrw_jax.continuation import solve_fixed_point
 from vrw_jax.hybrid import flow_jacobian_determinant, simulate_hybrid
 

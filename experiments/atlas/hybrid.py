@@ -20,7 +20,7 @@ import optimistix as optx
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from experiments.atlas.told import EXACT_ERROR, Row, compute_error, time_second_call
+from experiments.atlas.results import EXACT_ERROR, Row, compute_error, time_second_call
 from experiments.shared.command import require_extra
 from vrw_jax.hybrid import Guard, Mode, Termination, simulate_hybrid, time_errors
 
@@ -84,7 +84,7 @@ def _our_run(system: tuple[Part, ...], events: int, options: tuple) -> tuple[Cal
     parts, chosen = modes(system), vrw.StepOptions(**dict(options))
     return (
         jax.jit(lambda y: simulate_hybrid(parts, y, events=events, options=chosen)),
-        jax.jit(lambda y, told: time_errors(parts, y, told, chosen)),
+        jax.jit(lambda y, solution: time_errors(parts, y, solution, chosen)),
     )
 
 
@@ -100,7 +100,7 @@ def run_library(
     return MethodRun(
         "ours",
         np.asarray(result.times[:n]),
-        np.asarray(result.before[:n]),
+        np.asarray(result.states_before[:n]),
         np.asarray(result.guards[:n]),
         "" if stop == Termination.MAX_EVENTS_REACHED else stop.name,
         stop not in (Termination.MAX_EVENTS_REACHED, Termination.MAX_TIME_REACHED),
@@ -109,8 +109,8 @@ def run_library(
         f"{solver} {tolerance:g}",
         version("vrw-jax"),
         np.asarray(result.state),
-        np.asarray(result.resolution[:n]),
-        np.asarray(result.rounding[:n]),
+        np.asarray(result.time_tolerance[:n]),
+        np.asarray(result.time_roundoff[:n]),
         np.asarray(errors(y, result)[:n]),
     )
 
@@ -315,8 +315,10 @@ def make_row(
         if rounding[-1] > EXACT_ERROR:
             says += f", one rounding: {rounding[-1]:.1e}"
     return Row(
-        quantity, walk_result.method, solution, truth, compute_error(solution, truth, relative=relative), says,
-        walk_result.admits, walk_result.work, walk_result.seconds, walk_result.options, walk_result.version,
+        quantity, walk_result.method, solution, truth, compute_error(solution, truth,
+        relative=relative), says,
+        walk_result.admits, walk_result.work, walk_result.seconds, walk_result.options,
+        walk_result.version,
         condition, digits,
     )  # fmt: skip
 

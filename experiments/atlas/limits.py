@@ -95,7 +95,9 @@ def step_with_leg(
     values_array = jnp.asarray(True)
     phases = make_phases(s, landing.distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
-    run = lambda phase, y: integrate_phase(phase.field, phase.watched, y, values_array, options)
+    run = lambda phase, y: integrate_phase(
+        phase.vector_field, phase.guards, y, values_array, options
+    )
     first = run(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
     m = dls.motion(first.state)
     state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
@@ -349,5 +351,5 @@ def between() -> Rows:
                         "other_outcome": int((values_array & (mine != result)).sum()),
                         "other_by_diffrax": int((values_array & (other != result)).sum()),
                         "stepped": int((values_array & step_result).sum()),
-                        "time_difference_s": f"{np.max(gap[values_array & step_result], initial=0.0):.1e}",
+                        "time_difference_s": f"{np.max(gap[values_array & step_result], initial=0.0):.1e}",  # noqa: E501
                     }

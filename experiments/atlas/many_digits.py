@@ -4,7 +4,7 @@
 
 A case's own field, guards and resets on numbers of 40 digits, by extrapolated steps of the midpoint
 rule that keep 26; Newton's method on the map, with central differences of fourth order. Prints what
-`EXACT` in each case holds; minutes.
+`EXACT_GAIT` in each case holds; minutes.
 """
 
 from collections.abc import Sequence

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.atlas.told import Row, compute_error
+from experiments.atlas.results import Row, compute_error
 
 ROOT = Path(__file__).parents[2]
 
@@ -40,7 +40,8 @@ def make_rows(
         answer = answers.get(question, {"value": math.nan, "work": 0, "seconds": 0.0})
         solution = float(answer["value"])
         yield Row(
-            question, name.capitalize(), solution, truth, compute_error(solution, truth, relative=relative),
+            question, name.capitalize(), solution, truth, compute_error(solution, truth,
+            relative=relative),
             answer.get("says", result.get("says", "")), answer.get("admits", not answers),
             answer["work"], answer["seconds"], answer.get("options", result.get("options", "none")),
             result["version"],

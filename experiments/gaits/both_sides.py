@@ -25,7 +25,8 @@ from vrw_jax.branches.special_point_curves import (
     continue_special_points,
 )
 
-SPECIAL_POINT_NAMES = ("lambda_2_plus", "lambda_4_plus", "clearance_sls1", "clearance_sls2", "friction_fore",
+SPECIAL_POINT_NAMES = ("lambda_2_plus", "lambda_4_plus", "clearance_sls1", "clearance_sls2",
+"friction_fore",
            "friction_rear", "landing_friction_fore", "hit_planted_impulse")  # fmt: skip
 SECONDS = ("stiffness", "natural_length", "slope")
 POINTS = 24

@@ -85,7 +85,8 @@ def main() -> None:
     half = fit(features[:, fitted].T, unknowns[:, fitted].T)[0]
     error = np.abs(half.T @ features[:, checked] - unknowns[:, checked])
     print(
-        f"{solution_values.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th percentile:"
+        f"{solution_values.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th "
+        f"percentile:"
     )
     print("  theta+, dtheta+, durations:", np.quantile(error[:5], 0.99, axis=1).round(4))
     np.savez(

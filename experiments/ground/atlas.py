@@ -62,7 +62,7 @@ def scan_gaits(frictions: tuple[float, ...] = FRICTION) -> list[Row]:
                     | {"outcome": "STEPPED"}
                     | {name: f"{float(result[name][k]):.6g}" for name in MEASURES}
                     | {
-                        "flight": f"{float(result['duration_flight'][k] / result['period'][k]):.5g}",
+                        "flight": f"{float(result['duration_flight'][k] / result['period'][k]):.5g}",  # noqa: E501
                         "spectral_radius": f"{float(gaits.spectral_radius[k]):.5g}",
                         "stopper_force": f"{float(gaits.margins.stopper_force[k]):.5g}",
                         "solutions": int(gaits.steps.most_solutions[k].max()),

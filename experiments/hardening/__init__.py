@@ -1,0 +1,1 @@
+"""Hardening: damaged files, and random calls of the public functions."""

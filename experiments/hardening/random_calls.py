@@ -215,7 +215,7 @@ def main() -> None:
     chosen.folder.mkdir(parents=True, exist_ok=True)
     generator, rows = np.random.default_rng(chosen.seed), []
     with (chosen.folder / "random_calls.log").open("w") as log:
-        for number in range(chosen.n_calls):
+        for number in range(chosen.calls):
             name, drawn = draw_changes(generator)
             log.write(f"{number} {name} {json.dumps(drawn)}\n")
             log.flush()

@@ -38,7 +38,8 @@ def main() -> None:
         )
         both_values = duration_seconds + measure_cpu_seconds(begin, repeats, result=min)
     print(
-        f"{duration_seconds:.2f} s, {n / duration_seconds:.0f} points a second; with the branches {n / both_values:.0f}"
+        f"{duration_seconds:.2f} s, {n / duration_seconds:.0f} points a second; with the "
+        f"branches {n / both_values:.0f}"
     )
 
 

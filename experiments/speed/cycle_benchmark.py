@@ -227,7 +227,8 @@ def main() -> None:
     file = parse_and_start_jax(parser).file
     parts = [
         "# What limit cycles cost, and how often they are found",
-        f"`python -m experiments.speed.cycle_benchmark`; {describe_processor()}, jax {jax.__version__}. CPU "
+        f"`python -m experiments.speed.cycle_benchmark`; {describe_processor()}, jax "
+        f"{jax.__version__}. CPU "
         "seconds, one core; wall times on two. On a shared machine the same code has taken up to "
         "1.5 times more or less.",
     ]

@@ -144,7 +144,8 @@ def compare_with_others(n: int, repeats: int) -> list[dict]:
     requested, selection = COLUMNS["state, c, k, L\\*, φ"], slice(n // 16)
     exact = flatten_derivatives(
         vrw.step_batch(
-            make_wheels(rows[selection]), states[selection], options=vrw.StepOptions.tight(), engine="diffrax",
+            make_wheels(rows[selection]), states[selection], options=vrw.StepOptions.tight(),
+            engine="diffrax",
             derivatives=requested,
         ).derivatives,
         requested,

@@ -83,7 +83,7 @@ class _Phase:
         by_input = [*self.state, *moving]
         rows = [*slopes, *(hy.diff(guard, x) for x in by_input), *after]
         rows += [hy.diff(y, x) for y in after for x in by_input]
-        self.told, self.n_after = hy.cfunc(rows, self.state), len(after)
+        self.evaluate_end, self.n_after = hy.cfunc(rows, self.state), len(after)
 
     def __call__(
         self, x: np.ndarray, dx: np.ndarray, numbers: np.ndarray, dnumbers: np.ndarray
@@ -95,7 +95,7 @@ class _Phase:
         flow.state[:n], flow.state[n:] = x, self.identity
         flow.propagate_until(20.0)
         shifted = flow.state[n:].reshape(n, n + m) @ np.concatenate([dx, dnumbers])
-        result = self.told(flow.state[:n], pars=numbers[: self.told.nparams])
+        result = self.evaluate_end(flow.state[:n], pars=numbers[: self.evaluate_end.nparams])
         slopes, by_guard = result[:n], result[n : 2 * n + m]
         after = result[2 * n + m : 2 * n + m + self.n_after]
         by_after = result[2 * n + m + self.n_after :].reshape(self.n_after, n + m)

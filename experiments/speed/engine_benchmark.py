@@ -228,7 +228,8 @@ def write(table, shares, cost, out):
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     text = (
         f"{format_markdown(header, cells)}\n\n"
-        f"{describe_processor()}; Python {platform.python_version()}, {versions}; load average {quiet:.1f} "
+        f"{describe_processor()}; Python {platform.python_version()}, {versions}; load average "
+        f"{quiet:.1f} "
         f"on {os.cpu_count()} cores."
     )
     print(text)

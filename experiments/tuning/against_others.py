@@ -313,7 +313,8 @@ def main() -> None:
         target_values = settings.tune
         assert target_values is not None
         problem = make_tune_problem(
-            settings.make_wheel(), target_values.objective, tuple(target_values.bounds), target_values.bounds,
+            settings.make_wheel(), target_values.objective, tuple(target_values.bounds),
+            target_values.bounds,
             target_values.constraints,
         )  # fmt: skip
         result = results[name] = compare_methods(problem, n_starts, rows, name)

@@ -131,11 +131,11 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         if not fixed:
             controller = diffrax.PIDController(rtol=setting, atol=setting)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: phase.field(y)),
+            diffrax.ODETerm(lambda t, y, args: phase.vector_field(y)),
             solver, 0.0, 20.0, setting if fixed else 5e-3, y,
             stepsize_controller=controller,
             event=diffrax.Event(
-                lambda t, y, args, **_: phase.watched.values(y)[0], root_finder, direction=False
+                lambda t, y, args, **_: phase.guards.values(y)[0], root_finder, direction=False
             ),
             max_steps=20_000, throw=False,
         )  # fmt: skip

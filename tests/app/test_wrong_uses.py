@@ -209,8 +209,8 @@ WRONG_CONFIGS |= {
         "damping": f"[wheel]\ndamping = {DIGITS}",
         "slope": f"[wheel]\nslope = -{DIGITS}",
         "n_legs": f"[wheel]\nn_legs = {DIGITS}",
-        "friction": f'[model]\nrung = "unilateral"\nfriction = {DIGITS}',
-        "max_events": f'[model]\nrung = "unilateral"\nmax_events = {DIGITS}',
+        "friction": f'[model]\nname = "unilateral"\nfriction = {DIGITS}',
+        "max_events": f'[model]\nname = "unilateral"\nmax_events = {DIGITS}',
         "rtol": f"[options]\nrtol = {DIGITS}",
         "max_solver_steps": f"[options]\nmax_solver_steps = {DIGITS}",
         "solver": f"[options]\nsolver = {DIGITS}",
@@ -228,8 +228,7 @@ WRONG_CONFIGS |= {
         "a weight": f"[tune.objective]\nspeed = {DIGITS}\n[tune.bounds]\nslope = [0.2, 0.4]",
         "evaluations": f"[tune]\nevaluations = {DIGITS}\n[tune.bounds]\nslope = [0.2, 0.4]",
         "period": f'[branch]\nparameter = "slope"\nbounds = [0.2, 0.3]\nperiod = {DIGITS}',
-        "largest_step": f'[branch]\nparameter = "slope"\nbounds = [0.2, 0.3]\n'
-        f"largest_step = {DIGITS}",
+        "max_ds": f'[branch]\nparameter = "slope"\nbounds = [0.2, 0.3]\nmax_ds = {DIGITS}',
         "9,000 hexadecimal": f"[wheel]\ndamping = 0x{'f' * 9000}",
     }.items()
 }
@@ -499,13 +498,15 @@ ADDRESSES = ["tls://127.0.0.1:9", "tcp://127.0.0.1:99999", "tcp://", "", "inproc
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
-def test_a_cluster_that_does_not_answer_gets_one_sentence(address: str, folder: Path) -> None:
-    (folder / "my.toml").write_text(GRID_TABLE)
+def test_a_cluster_that_does_not_answer_gets_one_sentence(
+    address: str, working_folder: Path
+) -> None:
+    (working_folder / "my.toml").write_text(GRID_TABLE)
     with socket.create_server(("127.0.0.1", 0)) as server:  # takes a call, and says nothing
         if address == "silent":
             address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         assert_refused(
-            ("scan", "my.toml", "--dask", address), "no dask scheduler answers at", folder
+            ("scan", "my.toml", "--dask", address), "no dask scheduler answers at", working_folder
         )
 
 
@@ -515,31 +516,35 @@ PROCESSES = {
 }
 
 
-def process(folder: Path, arguments: tuple[str, ...], environment: dict, **more: object) -> object:
+def process(
+    working_folder: Path, arguments: tuple[str, ...], environment: dict, **more: object
+) -> object:
     root = str(Path(__file__).parents[2])
     return subprocess.run(
         [sys.executable, "-m", "vrw_jax", *arguments],
-        cwd=folder, text=True, env=os.environ | {"PYTHONPATH": root} | environment, **more,
+        cwd=working_folder, text=True, env=os.environ | {"PYTHONPATH": root} | environment, **more,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PROCESSES)
-def test_an_environment_that_can_t_be_meant_gets_one_sentence(name: str, folder: Path) -> None:
-    (folder / "my.toml").write_text(GRID_TABLE)
+def test_an_environment_that_can_t_be_meant_gets_one_sentence(
+    name: str, working_folder: Path
+) -> None:
+    (working_folder / "my.toml").write_text(GRID_TABLE)
     arguments, environment, expected = PROCESSES[name]
-    before = list_files(folder)
-    told = process(folder, arguments, environment, capture_output=True)
+    before = list_files(working_folder)
+    told = process(working_folder, arguments, environment, capture_output=True)
     assert told.returncode == 2, told.stderr
     assert told.stderr.startswith(f"vrw: {expected}")
     assert len(told.stderr.splitlines()) == 1
-    assert list_files(folder) == before
+    assert list_files(working_folder) == before
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
 @pytest.mark.parametrize("arguments", [("--version",), ("init", "new")])
-def test_a_full_device_gets_one_sentence(arguments: tuple[str, ...], folder: Path) -> None:
+def test_a_full_device_gets_one_sentence(arguments: tuple[str, ...], working_folder: Path) -> None:
     with open("/dev/full", "w") as full:
-        told = process(folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)
+        told = process(working_folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)
     assert told.returncode == 2
     assert len(told.stderr.splitlines()) == 1
     assert "No space left on device." in told.stderr

@@ -378,7 +378,8 @@ def test_collocation_rejects_falls_and_has_its_largest_errors_far_from_gaits():
     fixed = batch_result.is_collocated & step_result
     assert np.mean(fixed[step_result]) > 0.3
     off = np.abs(np.concatenate(
-        [batch_result.section_state - exact.section_state, batch_result.durations - exact.durations], 1
+        [batch_result.section_state - exact.section_state,
+            batch_result.durations - exact.durations], 1
     )).max(1)[fixed]  # fmt: skip
     # Its checks were set by lanes near gaits. Counted in 9,000 others: 5e-7 and 1.2e-5.
     assert np.quantile(off, 0.99) < 1e-6
@@ -390,7 +391,8 @@ def test_collocation_of_a_batch_element_is_bitwise_that_of_a_single_wheel():
     among = vrw.step_batch(params, STARTS, engine="collocation", durations=near)
     for i in (0, 3, 9):
         batch_result = vrw.step_batch(
-            truth.make_wheels(truth.REFERENCE_PARAMETERS[i : i + 1]), STARTS[i : i + 1], engine="collocation",
+            truth.make_wheels(truth.REFERENCE_PARAMETERS[i : i + 1]), STARTS[i : i + 1],
+            engine="collocation",
             durations=near[i : i + 1],
         )  # fmt: skip
         np.testing.assert_array_equal(batch_result.section_state[0], among.section_state[i])

@@ -89,7 +89,7 @@ def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: Abst
 def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
     """A rigid wheel's steps all contract towards one: it has gaits of one step alone."""
     model, wheel, start = (
-        vrw.RigidWheel(holds_rear_foot=True),
+        vrw.RigidWheel(held_landing=True),
         vrw.WheelParams(slope=0.1),
         (0.39, 1.5),
     )
@@ -108,7 +108,7 @@ def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is():
 
 def test_a_cycle_of_two_steps_has_two_as_its_minimal_period():
     """The ends of its steps differ; made up from a gait of one step."""
-    model, wheel = vrw.RigidWheel(holds_rear_foot=True), vrw.WheelParams(slope=0.1)
+    model, wheel = vrw.RigidWheel(held_landing=True), vrw.WheelParams(slope=0.1)
     gait = vrw.limit_cycle(wheel, model=model, guess=[0.39, 1.5, 0.0], period_n=2)
     place = lambda cycle: cycle.steps.section_state
     shift = 1e-5 * jnp.array([[1.0], [-1.0]])

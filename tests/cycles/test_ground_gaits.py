@@ -161,7 +161,8 @@ def test_a_unilateral_branch_consists_of_gaits_that_repeat(gait_near_slow_start)
         SLOW_WHEEL, guess=gait_near_slow_start, model=GROUND_MODEL, options=TIGHT_OPTIONS
     )
     branch = vrw.continue_branch(
-        SLOW_WHEEL, "friction", (0.65, 0.75), cycle=cycle, model=GROUND_MODEL, step_options=TIGHT_OPTIONS,
+        SLOW_WHEEL, "friction", (0.65, 0.75), cycle=cycle, model=GROUND_MODEL,
+        step_options=TIGHT_OPTIONS,
         options=ArclengthOptions(initial_ds=0.1, max_ds=0.1),
     )  # fmt: skip
     assert branch.outcome == vrw.Outcome.STEPPED

@@ -184,11 +184,9 @@ def test_reverse_mode_is_refused_in_a_sentence_that_names_forward_mode():
         lambda: jax.grad(by_restitution)(0.8),
     ]
     for call in refused:
-        with pytest.raises(
-            ValueError, match=r"^numerics.walk has no .* use forward mode, jax.jacf"
-        ):
+        with pytest.raises(ValueError, match=r"has no .* use forward mode, jax.jacf"):
             call()
-    with pytest.raises(ValueError, match=r"^numerics.segment_maps has no .* jax.jacfwd"):
+    with pytest.raises(ValueError, match=r"segment_maps has no .* jax.jacfwd"):
         jax.grad(cut)(1.0)
     forwards = jax.vmap(jax.jit(jax.jacfwd(time)))(jnp.ones(2))
     np.testing.assert_allclose(forwards, 0.5 * 2.6 * np.sqrt(2.0 / 9.81), rtol=1e-12)

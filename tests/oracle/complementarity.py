@@ -442,7 +442,7 @@ def _integrate_to_event(w, place):
 
     def rates(_, y):
         q, v = y[: 3 + N], y[3 + N :]
-        return np.r_[v, _solve_contact_forces(w, q, v, place.mode, place.held)[0]]
+        return np.r_[v, _solve_contact_forces(w, q, v, place.mode, place.is_locked)[0]]
 
     def by(t, y, end, h):
         return DOP853(rates, t, y, end, rtol=RTOL, atol=ATOL, first_step=h, max_step=4e-3)
@@ -518,5 +518,5 @@ def _relabel_legs(w, place):
     q[:2] = q[3] * np.array([np.sin(q[2]), np.cos(q[2])])
     sin, cos = np.sin(w.tilt), np.cos(w.tilt)
     v = np.r_[np.array([[cos, -sin], [sin, cos]]) @ place.v[:2], place.v[2], roll(place.v[3:])]
-    mode, held_values = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.held))
+    mode, held_values = (tuple(roll(np.array(x)).tolist()) for x in (place.mode, place.is_locked))
     return HybridState(q, v, mode, held_values)

@@ -200,8 +200,9 @@ def started(code="", **environment):
 
 def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     code = (
-        "vrw.start_jax(); import numpy as np; from vrw_jax.runtime import lane_program; "
-        "lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], [np.ones(4)])"
+        "vrw.start_jax(); import numpy as np; from vrw_jax.runtime import cached_lane_program; "
+        "cached_lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], "
+        "[np.ones(4)])"
     )
     made = started(code, XDG_CACHE_HOME=str(tmp_path / "a" / "b"))
     assert made.returncode == 0, made.stderr

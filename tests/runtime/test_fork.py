@@ -18,21 +18,21 @@ CALLS = {
     "walk": "vrw.walk(params, start, 2)",
     "return_map": "vrw.return_map(params, start)",
     "simulate": "vrw.simulate(params)",
-    "steps": "vrw.steps(params, np.asarray(start)[None])",
+    "step_batch": "vrw.step_batch(params, np.asarray(start)[None])",
     "limit_cycle": "vrw.limit_cycle(params)",
     "limit_cycles": "vrw.limit_cycles(several)",
     "sensitivities": "vrw.sensitivities(params)",
-    "answer": "vrw.answer('speed', params, 1e-3, friction=20.0)",
-    "average": "vrw.average('speed', several, 1e-3, friction=20.0)",
+    "measure_to_tolerance": "vrw.measure_to_tolerance('speed', params, 1e-3, friction=20.0)",
+    "multifidelity_mean": "vrw.multifidelity_mean('speed', several, 1e-3, friction=20.0)",
     "scan": "vrw.scan(vrw.grid(damping=[150.0]), ['speed'])",
     "basin": "vrw.basin(params, {'theta_post_impact': [-0.6], 'dtheta_post_impact': [1.0]})",
     "tune": "vrw.tune(params, 'speed', ['damping'], {'damping': (100.0, 300.0)})",
     "continue_branch": "vrw.continue_branch(params, 'damping', (150.0, 230.0))",
     "continue_map": "vrw.continue_map(lambda x, p: p * x * (1 - x), [0.5], 2.5, (2.0, 3.5))",
-    "newton_cycle": "vrw.newton_cycle(lambda x: 0.5 * x, [0.5])",
+    "solve_fixed_point": "vrw.solve_fixed_point(lambda x: 0.5 * x, [0.5])",
     "choose_model": "vrw.choose_model(params, start)",
     "WheelParams": "vrw.WheelParams(damping=150.0)",
-    "walk of any system": "numerics.walk(modes, [1.0, 0.0], events=1)",
+    "simulate_hybrid": "hybrid.simulate_hybrid(modes, [1.0, 0.0], events=1)",
     "start_jax": "vrw.start_jax()",
 }
 
@@ -40,7 +40,7 @@ PROGRAM = """
 import json, multiprocessing, sys, warnings
 import numpy as np, jax
 import vrw_jax as vrw
-from vrw_jax import numerics
+from vrw_jax import hybrid
 
 def call(text):
     try:
@@ -54,8 +54,8 @@ def child(queue, text):
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")  # JAX's own, in the parent
-    falls = numerics.Mode(lambda y: jax.numpy.stack([y[1], -9.81]), (
-        numerics.Guard(lambda y: y[0], lambda y: y),))
+    falls = hybrid.Mode(lambda y: jax.numpy.stack([y[1], -9.81]), (
+        hybrid.Guard(lambda y: y[0], lambda y: y),))
     modes = (falls,)
     if sys.argv[1] == "arrays":
         start, params = vrw.paper_start(), vrw.WheelParams()

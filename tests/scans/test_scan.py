@@ -134,6 +134,25 @@ def test_settings_of_every_model_can_be_stored(wheel):
     assert json.loads(attrs[scan_store.MANIFEST_ATTRIBUTE])["model"]["kind"] == type(wheel).__name__
 
 
+def test_settings_are_stored_under_the_names_of_version_0_1() -> None:
+    """Otherwise a scan would refuse a finished store of that version."""
+    settings = make_plan().settings
+    assert settings["model"] == {
+        "kind": "ViscoelasticWheel", "rung": "viscoelastic", "tells_contacts": False,
+        "lanes": "phases", "legs_yield": True, "parameter_names": list(PARAMETER_NAMES),
+        "friction": 1.0, "stop_at_lift_off": True,
+    }  # fmt: skip
+    assert settings["options"] == {
+        "kind": "Options", "solver": "Dopri8", "engine": "auto", "rtol": 1e-10, "atol": 1e-10,
+        "derivative_tightening": 20.0, "max_phase_time": 20.0, "max_solver_steps": 20_000,
+        "first_step": 5e-3, "event_steps": 100, "monitor_steps": 5,
+    }  # fmt: skip
+    assert settings["cycle_options"] == {
+        "kind": "CycleOptions", "steps": [10, 8, 3], "growth": 2.0, "tolerance": 1e-10,
+        "iterations": 12, "first_iterations": 4, "stages": 12, "block": 64,
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("kind", ["ViscoelasticWheel", "UnilateralWheel", "LadderWheel"])
 def test_the_two_stability_margins_of_version_0_1_are_distinguished(
     tmp_path: Path, kind: str

@@ -303,10 +303,12 @@ def test_too_large_a_design_is_refused_in_one_sentence(monkeypatch: pytest.Monke
 # Position, design, foreign variables, metadata
 
 
-def test_chunks_in_each_others_place_are_seen_though_their_marks_went_along(store: Path) -> None:
+def test_chunks_in_each_others_place_are_seen_though_their_marks_went_along(
+    complete_store: Path,
+) -> None:
     """Reference: the store as written. Each chunk's files agree with the mark beside them."""
-    whole = list_files(store)
-    for array in store.iterdir():
+    whole = list_files(complete_store)
+    for array in complete_store.iterdir():
         first, second = (array / "c" / number for number in ("1", "3"))
         if array.name == "bookkeeping":
             first, second = (array / "digest" / "c" / number for number in ("1", "3"))
@@ -315,14 +317,14 @@ def test_chunks_in_each_others_place_are_seen_though_their_marks_went_along(stor
             second.rename(first)
             (array / "aside").rename(second)
     with pytest.raises(ValueError, match=r"2 damaged chunks \(number 1, 3\)"):
-        open_scan(store)
+        open_scan(complete_store)
     with pytest.warns(UserWarning, match="2 damaged chunks"):
-        run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
-    assert list_files(store) == whole
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
+    assert list_files(complete_store) == whole
 
 
 def test_a_chunk_of_another_design_is_seen_though_its_mark_came_along(
-    store: Path, tmp_path: Path
+    complete_store: Path, tmp_path: Path
 ) -> None:
     other = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.32, 4))
     run_plan(
@@ -332,24 +334,24 @@ def test_a_chunk_of_another_design_is_seen_though_its_mark_came_along(
     )
     for path in (tmp_path / "other.zarr").rglob("c/1"):
         if path.is_dir():  # the files of a chunk, not a coordinate
-            place = store / path.relative_to(tmp_path / "other.zarr")
+            place = complete_store / path.relative_to(tmp_path / "other.zarr")
             shutil.copytree(path, place, dirs_exist_ok=True)
     with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
-        open_scan(store)
+        open_scan(complete_store)
 
 
 @pytest.mark.parametrize("keeps", [True, False], ids=["attributes kept", "attributes lost"])
-def test_a_variable_that_a_user_adds_is_no_damage(store: Path, keeps: bool) -> None:
-    before = open_scan(store).load()
+def test_a_variable_that_a_user_adds_is_no_damage(complete_store: Path, keeps: bool) -> None:
+    before = open_scan(complete_store).load()
     mine = xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs if keeps else {})
-    mine.to_zarr(store, mode="a")
-    after = open_scan(store).load()
+    mine.to_zarr(complete_store, mode="a")
+    after = open_scan(complete_store).load()
     xr.testing.assert_identical(after.drop_vars("mine")[list(before.data_vars)], before)
     np.testing.assert_array_equal(after.mine, mine.mine)
     again = CountingEngine()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run_plan(make_plan(), store, evaluate=again)
+        run_plan(make_plan(), complete_store, evaluate=again)
     assert again.n_calls == 0
 
 
@@ -368,21 +370,24 @@ METADATA = {
 @pytest.mark.parametrize("what", METADATA)
 @pytest.mark.parametrize("name", ["speed", "outcome", "damping", "bookkeeping/digest"])
 def test_damaged_metadata_of_an_array_are_said_and_mended(
-    store: Path, name: str, what: str
+    complete_store: Path, name: str, what: str
 ) -> None:
-    whole, place = list_files(store), store / name / "zarr.json"
+    whole, place = list_files(complete_store), complete_store / name / "zarr.json"
     text = METADATA[what](place.read_text())
     if text == place.read_text():
         text += "]"
     place.write_text(text) if text is not None else place.unlink()
     with pytest.raises(ValueError, match=rf"damaged metadata \({name}\)|can't be opened \({name}"):
-        open_scan(store)
-    assert f"damaged metadata ({name})" in running.find_store(make_plan(), store).damage_description
+        open_scan(complete_store)
+    assert (
+        f"damaged metadata ({name})"
+        in running.find_store(make_plan(), complete_store).damage_description
+    )
     again = CountingEngine()
     with pytest.warns(UserWarning, match="damaged metadata"):
-        run_plan(make_plan(), store, evaluate=again)
+        run_plan(make_plan(), complete_store, evaluate=again)
     assert again.n_calls == 0
-    assert list_files(store) == whole
+    assert list_files(complete_store) == whole
 
 
 def edited_root(store: Path, edit: object) -> None:
@@ -407,65 +412,68 @@ def inline(root: dict, name: str) -> dict:
 
 @pytest.mark.parametrize("what", ROOT)
 def test_damage_of_the_metadata_of_all_is_said_and_mended_or_harmless(
-    store: Path, what: str
+    complete_store: Path, what: str
 ) -> None:
-    whole, before = list_files(store), open_scan(store).load()
-    edited_root(store, ROOT[what])
+    whole, before = list_files(complete_store), open_scan(complete_store).load()
+    edited_root(complete_store, ROOT[what])
     if what == "no settings":
-        xr.testing.assert_identical(open_scan(store).load(), before)
+        xr.testing.assert_identical(open_scan(complete_store).load(), before)
         return
     with pytest.raises(ValueError, match=r"damaged metadata|can't be opened"):
-        open_scan(store)
+        open_scan(complete_store)
     again = CountingEngine()
     with pytest.warns(UserWarning, match="damaged metadata"):
-        run_plan(make_plan(), store, evaluate=again)
+        run_plan(make_plan(), complete_store, evaluate=again)
     assert again.n_calls == 0
-    assert list_files(store) == whole
+    assert list_files(complete_store) == whole
 
 
-def test_a_damaged_coordinate_that_is_not_swept_is_written_again(store: Path) -> None:
-    whole = list_files(store)
-    (store / "leg" / "c" / "0").unlink()
+def test_a_damaged_coordinate_that_is_not_swept_is_written_again(complete_store: Path) -> None:
+    whole = list_files(complete_store)
+    (complete_store / "leg" / "c" / "0").unlink()
     with pytest.raises(ValueError, match=r"damaged coordinates \(leg\)"):
-        open_scan(store)
+        open_scan(complete_store)
     with pytest.warns(UserWarning, match="damaged coordinates"):
-        run_plan(make_plan(), store, evaluate=CountingEngine(1))
-    assert list_files(store) == whole
+        run_plan(make_plan(), complete_store, evaluate=CountingEngine(1))
+    assert list_files(complete_store) == whole
 
 
-def as_before_marks_covered_settings(store: Path) -> None:
+def as_before_marks_covered_settings(complete_store: Path) -> None:
     """Makes a store what 0.1's successor wrote: no attributes of marks, marks of files alone."""
-    edited_root(store, lambda root: inline(root, "bookkeeping").update(attributes={}))
-    book = store / "bookkeeping" / "zarr.json"
+    edited_root(complete_store, lambda root: inline(root, "bookkeeping").update(attributes={}))
+    book = complete_store / "bookkeeping" / "zarr.json"
     book.write_text(json.dumps(json.loads(book.read_text()) | {"attributes": {}}, indent=2))
-    group, metadata = zarr.open_group(store, mode="r+"), soundness.StoredMetadata(store)
-    books = soundness.ChunkChecksums(store, group, metadata)
+    group, metadata = (
+        zarr.open_group(complete_store, mode="r+"),
+        soundness.StoredMetadata(complete_store),
+    )
+    books = soundness.ChunkChecksums(complete_store, group, metadata)
     for index in range(make_plan().layout.n_chunks):
         books.mark_chunk(index)
 
 
 @pytest.mark.parametrize("what", [None, *DAMAGE_CASES])
 def test_a_store_whose_marks_cover_files_alone_opens_and_its_damage_is_seen(
-    store: Path, what: str | None
+    complete_store: Path, what: str | None
 ) -> None:
-    before = open_scan(store).load()
-    as_before_marks_covered_settings(store)
-    whole = list_files(store)
-    xr.testing.assert_identical(open_scan(store).load(), before)
-    run_plan(make_plan(), store, evaluate=CountingEngine(1))
-    (xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs)).to_zarr(store, mode="a")
-    assert "mine" in open_scan(store)
+    before = open_scan(complete_store).load()
+    as_before_marks_covered_settings(complete_store)
+    whole = list_files(complete_store)
+    xr.testing.assert_identical(open_scan(complete_store).load(), before)
+    run_plan(make_plan(), complete_store, evaluate=CountingEngine(1))
+    (xr.Dataset({"mine": 2.0 * before.speed}, attrs=before.attrs)).to_zarr(complete_store, mode="a")
+    assert "mine" in open_scan(complete_store)
     if what is not None:
-        DAMAGE_CASES[what](store / "speed" / CHUNK_FILE)
+        DAMAGE_CASES[what](complete_store / "speed" / CHUNK_FILE)
         with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
-            open_scan(store)
+            open_scan(complete_store)
         with pytest.warns(UserWarning, match="1 damaged chunk"):
-            run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
-    (store / "speed" / "zarr.json").unlink()
+            run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
+    (complete_store / "speed" / "zarr.json").unlink()
     with pytest.warns(UserWarning, match=r"damaged metadata \(speed"):
-        run_plan(make_plan(), store, evaluate=CountingEngine(1))
-    shutil.rmtree(store / "mine")
-    kept = list_files(store)
+        run_plan(make_plan(), complete_store, evaluate=CountingEngine(1))
+    shutil.rmtree(complete_store / "mine")
+    kept = list_files(complete_store)
     assert {n: x for n, x in kept.items() if "/c/" in n} == {
         n: x for n, x in whole.items() if "/c/" in n
     }

@@ -59,7 +59,7 @@ def pad_to_batch(rows, width):
 @eqx.filter_jit
 def _compute_full_steps(vectors, starts, options, model, uses_lane_engine):
     options = options.with_engine("lanes" if uses_lane_engine else "diffrax")
-    step_one = lambda vector, start: model.step(truth.make_wheel(vector), start, options)
+    step_one = lambda vector, start: model.take_step(truth.make_wheel(vector), start, options)
     return jax.vmap(step_one)(vectors, starts)
 
 

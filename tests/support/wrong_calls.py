@@ -217,7 +217,8 @@ def register_wrong_calls() -> None:
     )
 
     # Several grounds where one is meant
-    grounds = vrw.UnilateralWheel(friction=np.array([0.5, 0.7]))
+    frictions = np.linspace(0.5, 0.9, 5)
+    grounds = vrw.UnilateralWheel(friction=frictions)
     for name, call in {
         "step": lambda: vrw.step(table_1, start, model=grounds),
         "return_map": lambda: vrw.return_map(table_1, start, model=grounds),
@@ -239,11 +240,9 @@ def register_wrong_calls() -> None:
             table_1, {"theta_post_impact": [-0.6], "dtheta_post_impact": [1.0]}, model=grounds
         ),
         "scan": lambda: vrw.scan(vrw.grid(damping=[100.0, 150.0]), ["speed"], model=grounds),
-        "ladder": lambda: vrw.step(
-            table_1, start, model=vrw.LadderWheel(friction=np.array([0.5, 0.7]))
-        ),
+        "ladder": lambda: vrw.step(table_1, start, model=vrw.LadderWheel(friction=frictions)),
     }.items():  # fmt: skip
-        add_wrong_call(f"{name} on two grounds", call, "ValueError", "friction has shape (2,)")
+        add_wrong_call(f"{name} on five grounds", call, "ValueError", "friction has shape (5,)")
     add_wrong_call(
         "explore on two grounds",
         lambda: vrw.explore(table_1, friction=np.array([0.5, 0.7])),
@@ -425,8 +424,8 @@ def register_wrong_calls() -> None:
     add_wrong_calls("measure_to_tolerance tol", lambda v: asks(tol=v), positive, "tol")
     wrong = (
         ("measure misspelt", {"measures": "spead"}, "ValueError", "did you mean 'speed'"),
-        ("measure of a step alone", {"measures": "slip"}, "ValueError", "every rung tells"),
-        ("no measure", {"measures": []}, "ValueError", "measures are none"),
+        ("measure of a step alone", {"measures": "slip"}, "ValueError", "every model has"),
+        ("no measure", {"measures": []}, "ValueError", "measures is empty"),
         ("measures as numbers", {"measures": [1.0]}, "TypeError", "measures"),
         ("a number as the wheel", {"params": 150.0}, "TypeError", "WheelParams"),
         ("frictions of other lanes", {"friction": [1.0, 2.0], "params": several}, "ValueError",
@@ -462,7 +461,7 @@ def register_wrong_calls() -> None:
         "multifidelity_mean: unknown measure",
         lambda: mean(measure="sped"),
         "ValueError",
-        "every rung tells",
+        "every model has",
     )
     add_wrong_call(
         "multifidelity_mean: several", lambda: mean(measure=["speed"]), "TypeError", "measure"
@@ -576,11 +575,8 @@ def register_wrong_calls() -> None:
         ("options of a cycle", lambda: run_hybrid([ball], options=vrw.CycleOptions()), "TypeError",
          "vrw.StepOptions()"),
         ("a mode that there isn't", lambda: run_hybrid([ball], mode=3), "ValueError", "mode is 3"),
-        ("a mode in no list", lambda: run_hybrid(ball), "TypeError", "a mode is"),
         ("a field as mode", lambda: run_hybrid([fall]), "TypeError", "give Mode(field, guards)"),
         ("no field", lambda: run_hybrid([ball._replace(field=None)]), "TypeError", "a function"),
-        ("a guard in no tuple", lambda: run_hybrid([ball._replace(guards=floor)]), "TypeError",
-         "give Guard("),
         ("a function as guard", lambda: run_hybrid([ball._replace(guards=(fall,))]), "TypeError",
          "give Guard("),
         ("a field of one row less", lambda: run_hybrid([ball._replace(field=lambda y: y[:1])]),

@@ -80,8 +80,8 @@ def switched_off():
         jax.config.update("jax_enable_x64", True)
 
 
-@pytest.mark_chunk.filterwarnings("ignore:Explicitly requested dtype")
-@pytest.mark_chunk.parametrize(
+@pytest.mark.filterwarnings("ignore:Explicitly requested dtype")
+@pytest.mark.parametrize(
     "call",
     [
         lambda one, many, x, gait: vrw.limit_cycle(one),

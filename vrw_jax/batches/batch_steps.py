@@ -206,7 +206,8 @@ def _check_columns(
         if np.shape(column) not in ((), (n_states,), *over_steps):
             raise ValueError(
                 f"{name} has shape {np.shape(column)}, but there are {n_states} states"
-                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for each"
+                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one "
+                f"for each"
                 f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * varies_by_step}."
             )
     dtype = np.promote_types(parameter_dtype, states.dtype)

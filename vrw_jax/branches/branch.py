@@ -144,7 +144,8 @@ class Branch:
         is_stable = self.stable
         lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
-            f"{self.values[-1]:.6g}{unit}, {int(is_stable.sum())} stable, {int((~is_stable).sum())} not.",
+            f"{self.values[-1]:.6g}{unit}, {int(is_stable.sum())} stable, "
+            f"{int((~is_stable).sum())} not.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
             f"  {len(self.special_points)} special points" + (":" if self.special_points else "."),

@@ -287,8 +287,11 @@ def _locate_zeros(
         solve_points, continuation.problem, continuation.options, jnp.asarray(continuation.bounds)
     )
 
-    parameter_at = {(i, 1.0 * end): side.p[i]
-                 for end, side in enumerate((left, right)) for i in range(len(requests))}  # fmt: skip
+    parameter_at = {
+        (i, 1.0 * end): side.p[i]
+        for end, side in enumerate((left, right))
+        for i in range(len(requests))
+    }
 
     def solve_at_fractions(
         fractions: np.ndarray, bracket_indices: np.ndarray
@@ -688,7 +691,7 @@ def continue_and_locate(
         point_indices = np.flatnonzero(all_points.wheel_indices == valid_range.wheel_index)
         positioned_points = [
             (
-                located_zero.bracket[0] + located_zero.place,
+                located_zero.bracket[0] + located_zero.fraction,
                 make_special_point(name, located_zero, valid_range.wheel_index, False, count),
             )
             for name, located_zero, count in inner_zeros

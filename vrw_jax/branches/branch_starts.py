@@ -71,10 +71,14 @@ class FindLimitCycle:
     def __call__(self) -> LimitCycle:
         """Return the gait at the border."""
         wheel, guess = jax.device_put((self.wheel, self.guess))
-        located = guess.located._replace(solution=jax.tree.map(jnp.asarray, self.z))
-        guess = dataclasses.replace(guess, located=located, system=self.finder.system)
+        collocation_state = guess.collocation_state._replace(
+            solution=jax.tree.map(jnp.asarray, self.z)
+        )
+        guess = dataclasses.replace(
+            guess, collocation_state=collocation_state, system=self.finder.system
+        )
         _, wheel = self.model.with_parameter(wheel, self.name, jnp.asarray(self.p))
-        found: LimitCycle = self.finder.cycle(wheel, guess)
+        found: LimitCycle = self.finder.find_cycle(wheel, guess)
         return found
 
 

@@ -179,7 +179,8 @@ def continue_branch(
     For other models the gaits are fixed points of their return map, as accurate as `step_options`.
     With unilateral contact `name` may be "friction" too. The start is then a `ReturnMapCycle` or,
     without one, the end of a walk. A branch continues where the order of contacts changes, with a
-    kink or a jump that is marked as a special point, and ends where friction is tan(slope). "auto" uses the model that is selected for the start. A violated margin of the paper's
+    kink or a jump that is marked as a special point, and ends where friction is tan(slope). "auto"
+    uses the model that is selected for the start. A violated margin of the paper's
     model is a special point with the name of the margin, beyond which unilateral contact is
     selected.
 
@@ -305,7 +306,8 @@ def _continue_from_starts(
             request, cycle
         )
         run = GaitContinuation(
-            branch_start.problem, options, branch_start.wheels, limits, request.model, request.step_options,
+            branch_start.problem, options, branch_start.wheels, limits, request.model,
+            request.step_options,
             request.params.n_legs,
         )  # fmt: skip
         has_start = branch_start.outcomes == Outcome.STEPPED

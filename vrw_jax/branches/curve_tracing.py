@@ -244,7 +244,8 @@ class CurveTracer(NamedTuple):
                 new_curves += accepted
                 remaining = [
                     seed for seed in remaining
-                    if not any(seed is s for s in batch_seeds) and not any(self._is_on_curve(seed, t) for t in accepted)
+                    if not any(seed is s for s in batch_seeds) and not any(self._is_on_curve(seed,
+                        t) for t in accepted)
                 ]  # fmt: skip
         return new_curves
 

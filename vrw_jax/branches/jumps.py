@@ -43,7 +43,7 @@ def follow_beyond_jumps(
         if not open_.any():
             break
         ends = take_rows(tracks.points, (rows, np.maximum(n_points - 1, 0)))
-        ways, before = np.sign(ends.fraction_rate), run.table(ends, owners)
+        ways, before = np.sign(ends.fraction_rate), run.make_table(ends, owners)
         for share in JUMP_SHARES:
             p = ends.p + ways * share * (bounds[1] - bounds[0])
             wanted = open_ & (p > bounds[0]) & (p < bounds[1])
@@ -53,7 +53,7 @@ def follow_beyond_jumps(
             more = jax.tree.map(np.asarray, follow(*given))
             first = take_rows(more.points, (rows, 0))
             found = wanted & (np.asarray(more.n_points) > 1)
-            found = found & run.is_alike(before, run.table(first, owners))
+            found = found & run.is_alike(before, run.make_table(first, owners))
             tracks = append_tracks(tracks, more, found)
             open_ = open_ & ~found
         given_up = given_up | open_

@@ -146,7 +146,7 @@ def with_ranks(
         if not is_zero(table, zero):
             continue
         last = groups[-1][-1] if groups else zero
-        apart = abs(zero.place - last.place) > SAME_PLACE
+        apart = abs(zero.fraction - last.fraction) > SAME_PLACE
         if not groups or last.bracket[:2] != zero.bracket[:2] or apart:
             groups.append([])
         groups[-1].append(zero)

@@ -129,8 +129,10 @@ def continue_special_points(
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:
         raise ValueError(
-            f"no special point {missing_names[0]!r} on branches along {first} and {second} within their "
-            f"bounds, but {', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
+            f"no special point {missing_names[0]!r} on branches along {first} and {second} "
+            f"within their "
+            f"bounds, but {', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to "
+            f"it, or wider "
             "bounds."
         )
     curves_by_name = {
@@ -140,6 +142,7 @@ def continue_special_points(
     lost_names = sorted(set(names) - set(curves_by_name))
     if lost_names:
         raise ValueError(
-            f"special point {lost_names[0]} at {seeds_by_name[lost_names[0]].parameter_values[0]:.9g} can't be followed from there."
+            f"special point {lost_names[0]} at "
+            f"{seeds_by_name[lost_names[0]].parameter_values[0]:.9g} can't be followed from there."
         )
     return tuple(curves_by_name[name] for name in names)

@@ -155,7 +155,8 @@ def _find_seeds_at_changes(
     seeds = []
     for axis in range(2):
         changes_on_axis = [change for change in changes if change.axis == axis]
-        sample_values = [{n: float(scan[n][i]) for n, i in zip(tracer.parameters, c.sample, strict=True)}
+        sample_values = [{n: float(scan[n][i]) for n, i in zip(tracer.parameters, c.sample,
+            strict=True)}
               for c in changes_on_axis]  # fmt: skip
         seeds += _find_seeds_on_branches(
             tracer, axis, [tracer.with_parameters(params, values) for values in sample_values]

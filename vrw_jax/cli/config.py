@@ -180,7 +180,8 @@ def parse_config(text: str, file_name: str = "config") -> Config:
         ) from error
     except RecursionError as error:
         raise ValueError(
-            f"{file_name}: lists or tables lie in each other too deeply: no key takes more than two."
+            f"{file_name}: lists or tables lie in each other too deeply: no key takes more than "
+            f"two."
         ) from error
     try:
         return _make_config(tables, text, file_name)

@@ -57,7 +57,8 @@ class ContactConfiguration(NamedTuple):
 
 
 class ForceSolution(NamedTuple):
-    """Forces of ground and slots' stoppers and the hub's motion: see `contact_modes.ContactSolution`."""
+    """Forces of ground and slots' stoppers and the hub's motion: see
+    `contact_modes.ContactSolution`."""
 
     tangential: SlotPair
     normal: SlotPair

@@ -28,7 +28,7 @@ class FixedPointResult(NamedTuple):
     - `x`: the point, shape (n,);
     - `jacobian`: of the map, or of its period_n-th iterate;
     - `residual`: largest entry of map(x) - x;
-    - `converged`, `iterations`: of Newton's method;
+    - `converged`, `n_iterations`: of Newton's method;
     - `termination`: of the simulation of a `ReturnMap` from `x`; None for any other map.
 
     Examples:
@@ -160,7 +160,8 @@ def _solve_checked(
     if getattr(output, "shape", None) != start.shape:
         description = getattr(output, "shape", type(output).__name__)
         raise ValueError(
-            f"the map gives {description} for a start of shape {start.shape}, but it must give its like: "
+            f"the map gives {description} for a start of shape {start.shape}, but it must give "
+            f"its like: "
             "take a map of a state to the next."
         )
     converted_map, closed_over = jax.closure_convert(iterate, start)

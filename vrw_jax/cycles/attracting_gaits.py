@@ -28,7 +28,8 @@ a share of the rigid rolling gait's rate. Of 4,800 random wheels with 5 to 16 le
 one of these starts or from a grid of 78. From these starts alone, 1,175 walk (ranges:
 experiments/gaits/off_the_box.py)."""
 
-FALLBACK_STARTS = ((0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
+FALLBACK_STARTS = ((0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1),
+(0.2, 0.8),
            (0.35, 1.0), (0.35, 1.1))  # fmt: skip
 """Starts of walks of the paper's model that are tried if none of WALK_STARTS leads to a gait. The
 first number is Leg 1's angle to the slope's normal at touchdown as a share of the angle between

@@ -92,7 +92,8 @@ def check_guess(guess: Any) -> Any:
     state = check_section_state(guess, "guess")
     if not is_traced(state) and not np.isfinite(state).all():
         raise ValueError(
-            f"guess is {format_numbers(state)}, but a search can begin at finite numbers only: give a "
+            f"guess is {format_numbers(state)}, but a search can begin at finite numbers only: "
+            f"give a "
             "neighbour's cycle, or a section state near the gait."
         )
     return state

@@ -61,7 +61,8 @@ class CycleOptions:
             object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
             raise ValueError(
-                f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the intervals in "
+                f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the "
+                f"intervals in "
                 "DLS, SLS-I and SLS-II: "
                 "give three whole numbers of at least 1, as (10, 8, 3)."
             )

@@ -57,7 +57,7 @@ def sensitivities(
     if unknown_names or not names:
         raise ValueError(
             f"measures holds {', '.join(unknown_names) or 'nothing'}"
-            f"{suggest_name(unknown_names[0], finder.differentiable_measures) if unknown_names else ''}, "
+            f"{suggest_name(unknown_names[0], finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
             "but the measures of a cycle are "
             f"{', '.join(finder.differentiable_measures)}: choose among these."
         )

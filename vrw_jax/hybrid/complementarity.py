@@ -48,7 +48,8 @@ def enumerate_lcp_solutions(
     n = free_gap.size
     if free_gap.ndim != 1 or matrix.shape != (n, n) or not 0 < n <= MAX_LCP_CONTACTS:
         raise ValueError(
-            f"matrix has shape {matrix.shape} and free {free_gap.shape}, but they must be (n, n) and "
+            f"matrix has shape {matrix.shape} and free {free_gap.shape}, but they must be (n, "
+            f"n) and "
             f"(n,) with n from 1 to {MAX_LCP_CONTACTS}."
         )
     if not is_traced(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():

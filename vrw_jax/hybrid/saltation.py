@@ -52,11 +52,12 @@ def flow_jacobian_determinant(
         return product * jnp.where(k < solution.n_events, factor, 1.0), None
 
     event_table = (
-        count, phase_starts, solution.states_before, solution.states_after, durations, first_guards[solution.modes] + solution.guards,
+        count, phase_starts, solution.states_before, solution.states_after, durations,
+        first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
     product = lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
-    return refuse_reverse_mode("volume_change", product)
+    return refuse_reverse_mode("flow_jacobian_determinant", product)
 
 
 def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:

@@ -50,12 +50,14 @@ def segment_maps(
     n_tangents = start.size if n_directions is None else n_directions
     if start.ndim != 1 or output_shape.shape != start.shape:
         raise ValueError(
-            f"the field gives shape {output_shape.shape} for a start of shape {start.shape}, but both must "
+            f"the field gives shape {output_shape.shape} for a start of shape {start.shape}, "
+            f"but both must "
             "be one row of the same length."
         )
     if not (0 < n_tangents <= start.size and n_segments > 0):
         raise ValueError(
-            f"directions is {n_tangents} and n_segments {n_segments}, but the first must be from 1 to "
+            f"directions is {n_tangents} and n_segments {n_segments}, but the first must be "
+            f"from 1 to "
             f"{start.size} and the other positive."
         )
     dim, size = start.size, start.size * (1 + n_tangents)

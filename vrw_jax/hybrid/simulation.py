@@ -210,7 +210,8 @@ def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: i
             _check_output_shape(f"the reset of {name}", guard.reset, start, start.shape)
             if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
                 raise ValueError(
-                    f"{name} leads to mode {guard.target_mode}, but there are {len(modes)}: count from 0."
+                    f"{name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
+                    f"count from 0."
                 )
 
 
@@ -225,7 +226,8 @@ def _check_output_shape(name: str, function: Callable, start: Array, shape: tupl
             else type(output).__name__
         )
         raise ValueError(
-            f"{name} gives {description} for a state of shape {start.shape}, but it must give floats of "
+            f"{name} gives {description} for a state of shape {start.shape}, but it must give "
+            f"floats of "
             f"shape {shape}: fields and resets give the state's shape, guards one number."
         )
 
@@ -359,8 +361,10 @@ def _simulate(
     zero_times = jnp.zeros(events) + zero
     constant_zeros = lax.stop_gradient(zero_times)
     initial_solution = HybridSolution(
-        times=zero_times, time_tolerance=constant_zeros, time_roundoff=constant_zeros, states_before=rows, states_after=rows,
-        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=zero, state=start, mode=zero_count + mode,
+        times=zero_times, time_tolerance=constant_zeros, time_roundoff=constant_zeros,
+        states_before=rows, states_after=rows,
+        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=zero, state=start,
+        mode=zero_count + mode,
         solver_steps=zero_count, termination=zero_count + _STILL_RUNNING,
     )  # fmt: skip
     is_running = lambda carry: opaque_condition(

@@ -203,7 +203,8 @@ STOPPER_MARGIN_MEASURES = _make_table(
 """Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
 violated."""
 
-SHARED_STEP_MEASURE_NAMES = tuple(name for name, measure in STEP_MEASURES.items() if measure.is_shared)
+SHARED_STEP_MEASURE_NAMES = tuple(name for name,
+    measure in STEP_MEASURES.items() if measure.is_shared)
 """Measures of `STEP` that every rung tells."""
 
 WITH_DERIVATIVES = tuple(name for name, measure in STEP_MEASURES.items() if not measure.is_code)
@@ -212,7 +213,8 @@ WITH_DERIVATIVES = tuple(name for name, measure in STEP_MEASURES.items() if not 
 UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
     name
     for name, measure in (STEP_MEASURES | UNILATERAL_STEP_MEASURES).items()
-    if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_code and name != "friction"
+    if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_code
+        and name != "friction"
 )
 """Measures of a step with unilateral contact that have derivatives."""
 

@@ -156,9 +156,9 @@ def gait_step(
         durations=tuple(end.duration for end in ends),
         outcome=sequence.outcome,
         solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        is_unfinished=ends[0].engine_carry.unfinished
-        | ends[1].engine_carry.unfinished
-        | ends[2].engine_carry.unfinished,
+        is_unfinished=ends[0].engine_carry.is_unfinished
+        | ends[1].engine_carry.is_unfinished
+        | ends[2].engine_carry.is_unfinished,
     )
 
 
@@ -196,7 +196,7 @@ def step_after_landing(
         for own, safe in zip(next_section(walked), PAPER_START, strict=True)
     )
     next_ = with_batched_jvp(transitions.land)(walked.s, *at_landing)
-    rows = next_.theta, next_.motion.dtheta, next_.rear.normal
+    rows = next_.theta, next_.motion.dtheta, next_.rear_impulse.normal
     told = [jnp.where(stepped, row, 0.0) for row in rows]
     sls1 = walked.phases[1]
     margin = with_batched_jvp(_stopper_margin)(walked.s, sls1.turn, ends[1].q, ends[1].v)
@@ -206,9 +206,9 @@ def step_after_landing(
         outcome=walked.outcome,
         durations=tuple(end.duration for end in ends),
         solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        unfinished=ends[0].engine_carry.unfinished
-        | ends[1].engine_carry.unfinished
-        | ends[2].engine_carry.unfinished,
+        unfinished=ends[0].engine_carry.is_unfinished
+        | ends[1].engine_carry.is_unfinished
+        | ends[2].engine_carry.is_unfinished,
     )
 
 

@@ -1,7 +1,5 @@
 """Types, options, trigonometry, helpers for automatic differentiation and for batches."""
 
-from typing import Any
-
 from vrw_jax.numerics.autodiff import (
     ExecutionWrapper,
     ForwardFunction,
@@ -48,11 +46,4 @@ from vrw_jax.numerics.options import EngineName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
-from vrw_jax.validation import RENAMED_IN_NUMERICS, describe_renamed
-
-
-def __getattr__(name: str) -> Any:
-    raise AttributeError(
-        describe_renamed("vrw_jax.numerics", name, RENAMED_IN_NUMERICS)
-        or f"vrw_jax.numerics has no {name!r}."
-    )
+from vrw_jax.validation import refuse_renamed_numerics as __getattr__

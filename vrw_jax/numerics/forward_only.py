@@ -14,7 +14,7 @@ _FORWARD_ONLY = Primitive("forward_only")
 
 def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
     raise ValueError(
-        f"numerics.{name} has no derivative in reverse mode, since the number of its solver steps "
+        f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
         "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "
         "jax.jacrev or jax.vjp."
     )
@@ -28,7 +28,7 @@ mlir.register_lowering(_FORWARD_ONLY, lambda _context, x, *, name: [x])
 
 
 def refuse_reverse_mode(name: str, tree: PyTree) -> PyTree:
-    """Return the results of `numerics.<name>`, with a sentence in place of reverse mode."""
+    """Return the results of `hybrid.<name>`, with a sentence in place of reverse mode."""
 
     def mark(leaf: Any) -> Any:
         marks = isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf)

@@ -150,7 +150,7 @@ def _require_one_form(name: str, mapping: Mapping | None, keywords: Mapping) -> 
 def _require_count(name: str, n: int | None) -> int:
     """Return the number of samples, which has no default."""
     if n is None:
-        raise TypeError(f"{name} has no number of samples: give n=1024, say.")
+        raise TypeError(f"n is None, but {name} needs a number of samples: give n=1024, say.")
     return n
 
 

@@ -71,6 +71,13 @@ STORED_FIELD_NAMES = {
     "UnilateralWheel": {"infinite_friction_rule": "infinite"},
 }
 """Names of fields in stores, where they differ from the names in Python, by class."""
+STORED_MODEL_NAMES = {
+    "model_name": "rung",
+    "reports_contacts": "tells_contacts",
+    "batch_kernel": "lanes",
+    "is_compliant": "legs_yield",
+}
+"""Names in stores of the class variables of all models, where they differ from those in Python."""
 
 EvaluateSamples = Callable[[SampleColumns], Mapping[str, np.ndarray]]
 """Function that returns the results of samples by variable, with the axis of samples first."""
@@ -273,7 +280,7 @@ def _record_fields(settings: object) -> dict[str, object]:
     """Return the class name and the fields of settings, as values of JSON."""
     kind = type(settings).__name__
     record: dict[str, object] = {"kind": STORED_KINDS.get(kind, kind)}
-    stored_names = STORED_FIELD_NAMES.get(kind, {})
+    stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(kind, {})
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
         if isinstance(value, StepOptions):

@@ -369,7 +369,8 @@ def shape_without_lanes(aval: Any) -> tuple[int, ...]:
 def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
     """Return the error for an axis as long as the lanes' that is another, or is moved there."""
     return NotImplementedError(
-        f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is the lanes', which come "
+        f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
+        f"the lanes', which come "
         "from arguments and stay the last; keep them there, and give other axes another length."
     )
 

@@ -63,7 +63,8 @@ def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) ->
     stacked_avals = [variable.aval for variable in equation.outvars[n_carry:]]
     if length == LANE_AXIS_SENTINEL and (stacked_avals or len(values) > n_constants + n_carry):
         raise NotImplementedError(
-            f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': do the same to "
+            f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': "
+            f"do the same to "
             "each by itself, and give other axes another length."
         )
     scanned = values[n_constants + n_carry :]

@@ -169,7 +169,8 @@ def _find_grid_names(grid: StartGrid) -> tuple[str, ...]:
             return names
     raise ValueError(
         f"the grid names {', '.join(grid) or 'nothing'}, but it must name all of "
-        f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give each a number or an axis."
+        f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
+        f"each a number or an axis."
     )
 
 

@@ -74,7 +74,8 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
         raise ValueError(
             f"friction has shape {shape}, but this is about one ground: give one number, or vary "
-            "it in a design of vrw.scan; vrw.step_batch takes one for each lane, vrw.walk one for each "
+            "it in a design of vrw.scan; vrw.step_batch takes one for each lane, vrw.walk one "
+            "for each "
             "of its steps."
         )
     return model

@@ -257,7 +257,8 @@ def _compile_trace(
 
 
 def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample), from Leg 1's foot.
+    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample), from Leg 1's
+    foot.
 
     `ahead` and `above` are added: where the landing leg's foot is, m.
     """

@@ -119,7 +119,8 @@ class MeasureResult(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return how the search for the gait ended, as a sentence; for a batch, each sentence with its count."""
+        """Return how the search for the gait ended, as a sentence; for a batch, each sentence with
+        its count."""
         return describe_ending(self.outcomes, Outcome)
 
     @property

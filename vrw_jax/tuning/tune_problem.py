@@ -232,7 +232,7 @@ class TuneProblem:
             )
         if not trial.is_finite:
             raise ValueError(
-                f"{trial.describe_nonfinite(self.objective_label, self.constraint_names, self.min_constraint_values)} at "
+                f"{trial.describe_nonfinite(self.objective_label, self.constraint_names, self.min_constraint_values)} at "  # noqa: E501
                 "the start, but a climb needs finite numbers: start from another wheel, or give an "
                 "objective and constraints that are finite there."
             )

@@ -63,11 +63,12 @@ class TuneResult:
     - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
     - `violated_margins`: violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
-    - `evaluations`: limit cycles, each with one step;
-    - `shortened`: trials that lost the gait or its branch, or whose numbers are not finite;
-    - `seconds`: of which `compile_seconds` went to compiling;
-    - `compile_seconds`: and to exploring, if there were many starts;
-    - `lanes`: where many starts got to before the climb.
+    - `n_evaluations`: number of limit cycles, each with one step;
+    - `n_backtracks`: number of trials that lost the gait or its branch, or whose numbers are not
+      finite;
+    - `seconds`: total time;
+    - `compile_seconds`: the part for compiling, and for exploring if there are many starts;
+    - `exploration`: results of many starts before the maximization.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}

@@ -1,4 +1,5 @@
-"""Checks of arguments, each with one sentence for what was given, what is allowed and what to do."""
+"""Checks of arguments, each with one sentence for what was given, what is allowed and what to
+do."""
 
 from vrw_jax.validation.checks import (
     check_bool,
@@ -19,8 +20,8 @@ from vrw_jax.validation.checks import (
     suggest_name,
 )
 from vrw_jax.validation.renamed import (
-    RENAMED_IN_NUMERICS,
     RENAMED_IN_PACKAGE,
     describe_renamed,
     refuse_renamed_arguments,
+    refuse_renamed_numerics,
 )

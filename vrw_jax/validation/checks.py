@@ -53,7 +53,8 @@ def check_known_name(name: Any, allowed_names: Sequence[str], description: str) 
     if not isinstance(name, str) or name not in allowed_names:
         allowed_text = ", ".join(allowed_names)
         raise ValueError(
-            f"{format_value(name)} is no {description}{suggest_name(name, allowed_names)}: choose from {allowed_text}."
+            f"{format_value(name)} is no {description}{suggest_name(name, allowed_names)}: "
+            f"choose from {allowed_text}."
         )
 
 
@@ -89,11 +90,13 @@ def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> in
     is_whole = is_number and (isinstance(value, int) or np.asarray(value).dtype.kind in "iu")
     if is_whole and int(value) > MAX_WHOLE:
         raise ValueError(
-            f"{name} is {format_value(value)}, but it must be at most {MAX_WHOLE:,}: give a smaller one."
+            f"{name} is {format_value(value)}, but it must be at most {MAX_WHOLE:,}: give a "
+            f"smaller one."
         )
     if not is_whole or int(value) < min_value:
         raise (ValueError if is_number else TypeError)(
-            f"{name} is {format_value(value)}, but it must be a whole number of at least {min_value}{reason}: "
+            f"{name} is {format_value(value)}, but it must be a whole number of at least "
+            f"{min_value}{reason}: "
             f"give {name} = {min_value}, say."
         )
     return int(value)
@@ -130,7 +133,8 @@ def check_range(name: str, bounds: Any) -> tuple[float, float]:
         low, high = bounds
     except (TypeError, ValueError):
         raise TypeError(
-            f"{name} is {format_value(bounds)}, but it is a lower and an upper bound: write (lower, upper)."
+            f"{name} is {format_value(bounds)}, but it is a lower and an upper bound: write "
+            f"(lower, upper)."
         ) from None
     low, high = (
         check_real(f"the lower end of {name}", low),
@@ -179,7 +183,8 @@ def _check_device() -> None:
     except (RuntimeError, AssertionError) as error:  # a plugin without its device asserts
         requested = os.environ.get("JAX_PLATFORMS")
         raise OSError(
-            f"JAX_PLATFORMS is {requested!r}, but JAX finds no device of that kind: unset it, or set it"
+            f"JAX_PLATFORMS is {requested!r}, but JAX finds no device of that kind: unset it, "
+            f"or set it"
             " to cpu, before Python starts."
         ) from error
 

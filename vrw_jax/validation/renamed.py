@@ -32,7 +32,7 @@ RENAMED_IN_NUMERICS = {
     "Options": "vrw_jax.StepOptions",
     "SectionCycle": "vrw_jax.FixedPointResult",
     "Stop": "vrw_jax.hybrid.Termination",
-    "arclength": "vrw_jax.continuation.arclength",
+    "arclength": "the module arclength of vrw_jax.continuation",
     "complementary": "vrw_jax.hybrid.enumerate_lcp_solutions",
     "multipliers": "vrw_jax.continuation.floquet_multipliers",
     "newton_cycle": "vrw_jax.solve_fixed_point",
@@ -43,6 +43,13 @@ RENAMED_IN_NUMERICS = {
     "walk": "vrw_jax.hybrid.simulate_hybrid",
 }
 """Names of `vrw_jax.numerics`."""
+
+
+def refuse_renamed_numerics(name: str) -> Any:
+    """Raise the AttributeError of `vrw_jax.numerics` for a name that it does not have."""
+    hint = f": it is called {RENAMED_IN_NUMERICS[name]} now" if name in RENAMED_IN_NUMERICS else ""
+    raise AttributeError(f"vrw_jax.numerics has no {name!r}{hint}.")
+
 
 FunctionType = TypeVar("FunctionType", bound=Callable)
 

@@ -178,7 +178,8 @@ class WheelParams(AbstractPrintable):
         )
         if leg_com is not None and locked_length is not None and not leg_com < locked_length:
             raise ValueError(
-                f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's mass sits "
+                f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's "
+                f"mass sits "
                 "between foot and hub: give leg_com < locked_length."
             )
         shapes = {name: shape for name in PARAMETER_DOMAINS if (shape := getattr(self, name).shape)}
@@ -308,7 +309,8 @@ def require_known_friction(value: Any) -> float:
     """
     if convert_friction(value).ndim or isinstance(value, jax.core.Tracer):
         raise TypeError(
-            f"friction is {format_value(value)}, but one known number is needed here: give a float; "
+            f"friction is {format_value(value)}, but one known number is needed here: give a "
+            f"float; "
             "several grounds, or a traced one, vrw.UnilateralWheel takes."
         )
     return float(value)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row
 from experiments.atlas.others import make_rows
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 G, R = 9.81, 0.8
 FALL = math.sqrt(2.0 / G)

@@ -25,7 +25,7 @@ import vrw_jax as vrw
 from experiments.atlas.chenciner_point import Point, chenciner_point
 from experiments.atlas.gaits import ReturnMap, gaits
 from experiments.atlas.hybrid import JAX, METHODS, GuardEdge, Part, make_row
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.continuation import solve_fixed_point
 from vrw_jax.hybrid import Guard, Mode, product_multipliers, segment_maps, simulate_hybrid
 
@@ -140,7 +140,8 @@ def torus_points() -> Iterator[Row]:
         ("k8 of exponent 1e-3, as published", k8, PAGES_K8, 8, time.process_time() - began),
     ):
         yield Row(
-            name, "ours", solution, truth, compute_error(solution, truth), "", not bool(first.converged),
+            name, "ours", solution, truth, compute_error(solution, truth), "",
+            not bool(first.converged),
             int(first.iterations), took, options, version("vrw-jax"), digits=digits,
         )  # fmt: skip
 
@@ -173,7 +174,8 @@ def rows() -> Iterator[Row]:
         ("logarithm of their product", sums, divergence),
     ):
         yield Row(
-            name, "ours", value, truth, compute_error(value, truth, relative=True), "", False, SEGMENTS,
+            name, "ours", value, truth, compute_error(value, truth, relative=True), "", False,
+            SEGMENTS,
             seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
         )  # fmt: skip
 

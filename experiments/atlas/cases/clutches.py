@@ -23,7 +23,7 @@ from experiments.atlas.hybrid import (
     make_row,
     run_library,
 )
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 SLIDING, STATIC_RATIO = 10.0, 1.1
 FAST_FREQUENCY, SLOW_FREQUENCY = 10.0 * mpmath.pi, 0.4 * mpmath.pi

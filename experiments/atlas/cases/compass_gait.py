@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
 from experiments.atlas.others import make_rows
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 G, LEG, HALF, MASS, HIP = 9.8, 1.0, 0.5, 5.0, 10.0
 SLOPE = math.radians(3.0)

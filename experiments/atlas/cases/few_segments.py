@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.collocation import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX
 from vrw_jax.hybrid import product_multipliers, segment_maps
 
@@ -83,7 +83,8 @@ def rows() -> Iterator[Row]:
         solution, seconds = time_second_call(lambda n=n: compute_collocation_multiplier(n))
         yield Row(
             "multiplier", f"collocation, {n} segments", solution, TRUTH,
-            compute_error(solution, TRUTH, relative=True), "", False, n, seconds, "4 Gauss nodes, equal",
+            compute_error(solution, TRUTH, relative=True), "", False, n, seconds, "4 Gauss "
+                "nodes, equal",
             version("vrw-jax"), STEEP,
         )  # fmt: skip
     result, seconds = time_second_call(
@@ -98,19 +99,22 @@ def rows() -> Iterator[Row]:
     )
     solution = float(result.y[0, -1])
     yield Row(
-        "multiplier", "SciPy", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "", False, result.nfev,
+        "multiplier", "SciPy", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "",
+        False, result.nfev,
         seconds, "DOP853 1e-13", version("scipy"), STEEP,
     )  # fmt: skip
     solve = eqx.filter_jit(
         lambda z: diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, z, _: jnp.stack(variational_field(z, JAX))), diffrax.Dopri8(), 0.0,
+            diffrax.ODETerm(lambda t, z, _: jnp.stack(variational_field(z, JAX))),
+            diffrax.Dopri8(), 0.0,
             PERIOD, 1e-3, z, stepsize_controller=diffrax.PIDController(rtol=1e-13, atol=1e-20),
         )
     )  # fmt: skip
     solved, seconds = time_second_call(lambda: jax.block_until_ready(solve(jnp.array([1.0, 0.0]))))
     answer, work = float(solved.ys[-1, 0]), int(solved.stats["num_steps"])
     yield Row(
-        "multiplier", "diffrax", answer, TRUTH, compute_error(answer, TRUTH, relative=True), "", False, work,
+        "multiplier", "diffrax", answer, TRUTH, compute_error(answer, TRUTH, relative=True), "",
+        False, work,
         seconds, "Dopri8 1e-13", version("diffrax"), STEEP,
     )  # fmt: skip
     names = hy.make_vars("u", "theta")
@@ -125,7 +129,8 @@ def rows() -> Iterator[Row]:
 
     (solution, work), seconds = time_second_call(by_taylor)
     yield Row(
-        "multiplier", "heyoka", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "", False, work,
+        "multiplier", "heyoka", solution, TRUTH, compute_error(solution, TRUTH, relative=True),
+        "", False, work,
         seconds, "Taylor 2.2e-16", version("heyoka"), STEEP,
     )  # fmt: skip
 

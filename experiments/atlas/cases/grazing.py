@@ -27,7 +27,7 @@ from experiments.atlas.hybrid import (
     modes,
     run_library,
 )
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.hybrid import simulate_hybrid
 
 RESTITUTION_COEFFICIENT = 0.8
@@ -103,7 +103,8 @@ def derivative() -> Iterator[Row]:
     )
     solution, seconds = time_second_call(lambda: float(slope(c)))
     yield Row(
-        "derivative of that time", "ours", solution, truth, compute_error(solution, truth, relative=True), "",
+        "derivative of that "
+            "time", "ours", solution, truth, compute_error(solution, truth, relative=True), "",
         False, 1, seconds, "Dopri8 1e-13", version("vrw-jax"), 0.5 / GRAZING_DEPTH,
     )  # fmt: skip
     h = 1e-8
@@ -140,7 +141,8 @@ def rows() -> Iterator[Row]:
         last = walk_result.states[-1][1] if len(walk_result.times) else math.nan
         jump = walk_result.end[1] - last  # of the rate; over the square root of twice a = w^2 and d
         yield make_row(
-            walk_result, "jump over √(2 a d)", -jump / (W * math.sqrt(2.0 * GRAZING_DEPTH)), NORDMARK,
+            walk_result, "jump over √(2 a "
+                "d)", -jump / (W * math.sqrt(2.0 * GRAZING_DEPTH)), NORDMARK,
             condition=0.5 / GRAZING_DEPTH,
         )  # fmt: skip
     fine = run_library(

@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.hybrid import product_multipliers, segment_maps
 
 SMALL_MULTIPLIER = math.exp(-48.0 * math.pi)
@@ -93,11 +93,14 @@ def rows() -> Iterator[Row]:
     for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
         (result, _), seconds = time_second_call(lambda n=n: compute_by_segments(n))
         for i, truth in enumerate((1.0, SMALL_MULTIPLIER)):
-            solution, known_values = float(result.values[i].real), bool(result.known[i])
+            solution, known_values = float(result.values[i].real), bool(result.is_known[i])
             says = "" if known_values else f"not known: uncertainty {result.relative_error[i]:.0e}"
             yield Row(
-                f"multiplier {truth:.1e}", name, solution, truth, compute_error(solution, truth, relative=True),
-                says, not known_values, n, seconds, f"Dopri8 1e-13, {n} segments", version("vrw-jax"),
+                f"multiplier "
+                    f"{truth:.1e}", name, solution, truth, compute_error(solution, truth,
+                    relative=True),
+                says, not known_values, n, seconds, f"Dopri8 1e-13, {n} "
+                    f"segments", version("vrw-jax"),
             )  # fmt: skip
     for name, call, options, package in PEERS:
         (matrix, work), seconds = time_second_call(call)

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve, nnls
 
 from experiments.atlas.others import make_rows
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.continuation import solve_fixed_point
 from vrw_jax.hybrid import LCPStatus, enumerate_lcp_solutions
 
@@ -54,7 +54,8 @@ def rows() -> Iterator[Row]:
         result, seconds = time_second_call(lambda a=a, b=b: enumerate_lcp_solutions([[a]], [b]))
         solution, code = int(np.sum(result.is_solution)), LCPStatus(int(result.status))
         yield Row(
-            name, "ours", solution, count, compute_error(solution, count), "" if count == 1 else code.name,
+            name, "ours", solution, count, compute_error(solution, count),
+            "" if count == 1 else code.name,
             count != 1, 2, seconds, "all combinations", version("vrw-jax"),
         )  # fmt: skip
         (force, residual), seconds = time_second_call(
@@ -69,7 +70,8 @@ def rows() -> Iterator[Row]:
             lambda angle=angle, rate=rate: penalty(angle, rate)
         )
         yield Row(
-            name, "SciPy, penalty ground", 1, count, compute_error(1, count), f"force {force:.3g}", False,
+            name, "SciPy, penalty ground", 1, count, compute_error(1, count), f"force "
+                f"{force:.3g}", False,
             work, seconds, f"Radau 1e-8, stiffness {STIFF:g}", version("scipy"),
         )  # fmt: skip
 
@@ -86,7 +88,8 @@ def rows() -> Iterator[Row]:
     friction = float(solution.x[1])
     yield Row(
         "least friction", "ours", friction, 4.0 / 3.0, compute_error(friction, 4.0 / 3.0),
-        "" if solution.converged else "not converged", not solution.converged, int(solution.iterations),
+        "" if solution.converged else "not "
+            "converged", not solution.converged, int(solution.iterations),
         seconds, "Newton", version("vrw-jax"),
     )  # fmt: skip
     (other, info, _, _), seconds = time_second_call(
@@ -95,7 +98,9 @@ def rows() -> Iterator[Row]:
         )
     )
     yield Row(
-        "least friction", "SciPy", float(other[1]), 4.0 / 3.0, compute_error(float(other[1]), 4.0 / 3.0), "",
+        "least "
+            "friction", "SciPy", float(other[1]), 4.0 / 3.0, compute_error(float(other[1]),
+            4.0 / 3.0), "",
         False, int(info["nfev"]), seconds, "fsolve 1.5e-8", version("scipy"),
     )  # fmt: skip
 

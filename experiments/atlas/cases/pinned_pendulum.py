@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 G, LONG_LENGTH, SHORT_LENGTH = 9.81, 1.0, 0.3
 START_ANGLE, PIN_ANGLE = math.pi / 6, -math.pi / 12

@@ -19,7 +19,7 @@ from experiments.atlas.cases.grazing import (
 )
 from experiments.atlas.gaits import gaits
 from experiments.atlas.hybrid import make_row
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 W, DEPTHS = 2.0, (1e-2, 1e-6)
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from experiments.atlas.gaits import ReturnMap, gaits
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
 from experiments.atlas.others import make_rows
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 G, SLOPE, ALPHA = 9.81, 0.08, math.pi / 8
 RATE_RATIO = math.cos(2.0 * ALPHA)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, make_row
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 SLOPE = 0.009
 LONG_PERIOD_GAIT = (0.200310900544287, -0.199832473004977)

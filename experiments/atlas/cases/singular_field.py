@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import METHODS, GuardEdge, MethodRun, Part, last_time, make_row
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 LEVELS = (1e-4, 1e-8)
 

@@ -27,7 +27,7 @@ from experiments.atlas.hybrid import (
     run_library,
 )
 from experiments.atlas.others import make_rows
-from experiments.atlas.told import Case, Row, compute_error, time_second_call
+from experiments.atlas.results import Case, Row, compute_error, time_second_call
 from vrw_jax.hybrid import LCPStatus, enumerate_lcp_solutions
 
 CRANK, ROD, HALF, HEIGHT, PLAY = 0.153, 0.306, 0.05, 0.025, 0.001  # m; of the slider: halves
@@ -255,7 +255,8 @@ def first_impulses() -> Iterator[Row]:
     says = "" if result.status == LCPStatus.UNIQUE_SOLUTION else LCPStatus(int(result.status)).name
     for name, solution in zip(("impulse behind", "impulse ahead"), result.force, strict=True):
         yield Row(
-            name, "ours", float(solution), TRUTH[name], compute_error(float(solution), TRUTH[name]), says,
+            name, "ours", float(solution), TRUTH[name], compute_error(float(solution),
+            TRUTH[name]), says,
             bool(says), len(result.is_solution), seconds, "complementary", version("vrw-jax"),
         )  # fmt: skip
 
@@ -266,10 +267,10 @@ def siconos() -> Iterator[Row]:
         name: globals()[name]
         for name in (
             "CRANK", "ROD", "HALF", "HEIGHT", "PLAY", "CRANK_MASS", "ROD_MASS", "SLIDER_MASS",
-            "CRANK_INERTIA", "ROD_INERTIA", "SLIDER_INERTIA", "GRAVITY", "KEPT", "FRICTION",
+            "CRANK_INERTIA", "ROD_INERTIA", "SLIDER_INERTIA", "GRAVITY", "FRICTION",
         )
     }  # fmt: skip
-    numbers |= {"BEGINS": RATES[0], "ROD_BEGINS": RATES[1]}
+    numbers |= {"BEGINS": RATES[0], "ROD_BEGINS": RATES[1], "RESTITUTION": RESTITUTION_COEFFICIENT}
     truths = {name: truth for name, truth in TRUTH.items() if name != "crank's rate after it"}
     yield from make_rows("siconos", "slider_crank", truths, "--crank", json.dumps(numbers))
 

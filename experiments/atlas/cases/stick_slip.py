@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from experiments.atlas.hybrid import METHODS, GuardEdge, MethodRun, Part, make_row, modes
-from experiments.atlas.told import Case, Row, compute_error
+from experiments.atlas.results import Case, Row, compute_error
 from vrw_jax.hybrid import simulate_hybrid
 
 BELT, STATIC, KINETIC = 0.2, 1.0, 0.5
@@ -70,7 +70,8 @@ def rows() -> Iterator[Row]:
         yield make_row(walk_result, "period", period(walk_result), PERIOD)
     solution, work, seconds = integrate_regularized(1e-3)
     yield Row(
-        "period", "SciPy, smoothed", solution, PERIOD, compute_error(solution, PERIOD), "", False, work, seconds,
+        "period", "SciPy, "
+            "smoothed", solution, PERIOD, compute_error(solution, PERIOD), "", False, work, seconds,
         "Radau 1e-8, tanh over 1e-3", version("scipy"),
     )  # fmt: skip
     options = vrw.StepOptions.tight()

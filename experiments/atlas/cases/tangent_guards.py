@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, make_row, run_library
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 DEPTH = 1e-8
 

@@ -23,7 +23,7 @@ from experiments.atlas.hybrid import (
     run_library,
     run_scipy,
 )
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 FAST_RATE, SLOW_RATE = 2.7e6, 3.5651205
 LEVELS = ((0.4, 5.5, 5.8), (-0.3, 2.73, 2.5))  # c2, c4, and where y1 switches

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 
 from experiments.atlas.gaits import ExactGait, ReturnMap, gaits
 from experiments.atlas.hybrid import GuardEdge, Part, make_row
-from experiments.atlas.told import Case, Row
+from experiments.atlas.results import Case, Row
 
 SLEEVE, BIRD, SLEEVE_INERTIA, BIRD_INERTIA = 3e-4, 4.5e-3, 5e-9, 7e-7  # kg, kg m^2
 STIFFNESS, GRAVITY, FRICTION, RESTITUTION_COEFFICIENT = 5.6e-3, 9.81, 0.3, 0.5  # N m/rad, m/s^2

@@ -73,7 +73,8 @@ def compute_drake_values(accuracy: float) -> list[dict]:
     return [
         {"case": case, "name": name, "value": value, "work": n, "seconds": t}
         for case, solution, n, t in (
-            ("rimless_wheel", result_by_name, work, seconds), ("compass_gait", other, extra_values, longer)
+            ("rimless_wheel", result_by_name, work, seconds), ("compass_gait", other,
+                extra_values, longer)
         )
         for name, value in solution.items()
     ]  # fmt: skip

@@ -70,7 +70,7 @@ def crank(numbers: dict[str, float], step: float) -> tuple[dict[str, float], flo
         mechanism.setComputeFGyrFunction(plugin, "turning")
         system = sk.NonSmoothDynamicalSystem(0.0, 0.027)
         system.insertDynamicalSystem(mechanism)
-        law = sk.NewtonImpactFrictionNSL(numbers["KEPT"], 0.0, numbers["FRICTION"], 2)
+        law = sk.NewtonImpactFrictionNSL(numbers["RESTITUTION"], 0.0, numbers["FRICTION"], 2)
         contacts = []
         for corner in CORNERS:
             names = f"{plugin}:{corner}_gap", f"{plugin}:{corner}_rates"

@@ -1,4 +1,4 @@
-"""What a case tells: a row for each method, and who is right, says so, or is wrong silently."""
+"""Results of a case: one row per method, and its verdict: right, says so, or silently wrong."""
 
 import math
 import re
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 ACCEPTED_ERROR, EXACT_ERROR, TOLERANCE_EXCESS_FACTOR = 1e-9, 1e-12, 100.0
 """An error that counts as right at all; what is asked of a closed form times the problem's own
-condition; over the tolerance that a method was asked for: see `Row.within`."""
+condition; over the tolerance that a method was asked for: see `Row.is_within_request`."""
 
 
 class Row(NamedTuple):
