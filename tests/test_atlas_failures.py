@@ -29,7 +29,7 @@ def test_a_case_has_a_reference_rows_a_figure_and_a_section_of_the_page(name):
     assert all((case.title, case.breaks, case.truth, case.source))
     assert any(row["case"] == name for row in FAILURE_TABLE)
     assert (ROOT / "docs" / "figures" / f"failure_{name}.png").exists()
-    page = (ROOT / "docs" / "stability_atlas.md").read_text()
+    page = (ROOT / "docs" / "verification" / "failures.md").read_text()
     assert f"### {case.title}\n" in page
     assert f"](#{failures.anchor(case.title)})" in page
     assert f"<!-- failure {name} -->" in page

@@ -21,9 +21,10 @@ PAGES = [
     if "```python" in page.read_text()
 ]
 SLOW_PAGES = {
-    "README.md", "docs/any_system.md", "docs/own_loops.md", "docs/ladder.md", "docs/unilateral.md",
-    "docs/engine.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
-    "docs/answers.md", "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
+    "README.md", "docs/any_system.md", "docs/own_loops.md", "docs/explanation/ladder.md",
+    "docs/explanation/contact_model.md", "docs/explanation/batches.md",
+    "docs/explanation/tolerances.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
+    "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
 }  # fmt: skip
 """Pages that compile for long, or that a test of their own runs in the quick suite."""
 

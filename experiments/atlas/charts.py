@@ -38,7 +38,7 @@ STYLES = {  # of Okabe and Ito, a marker each
 AXES = {"c/m": r"$c/m$ [s$^{-1}$] at $k$ = 500 N/m", "k/m": r"$k/m$ [s$^{-2}$] at $c/m$ = 100/s"}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "0.5")
 SIGNS = re.compile("λ([24])⁺ → 0")
-FAST_MODE_RATIO = 1.03  # rate of SLS-I's fast mode over c/m, docs/physics.md
+FAST_MODE_RATIO = 1.03  # rate of SLS-I's fast mode over c/m, docs/explanation/physics.md
 
 
 def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
@@ -442,7 +442,7 @@ def as_table(rows: list[Row]) -> str:
 
 def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
     """Every chart and table of the page whose data exist."""
-    page = DOCS / "stability_atlas.md"
+    page = DOCS / "verification" / "failures.md"
     known_by_name = {name: read_table(path) for name, path in tables.items() if path.exists()}
     result_by_name = {
         "switch": ("stiffness", automatic),

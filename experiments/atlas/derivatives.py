@@ -115,7 +115,8 @@ SCUFFING_DISTANCES = np.logspace(
 
 
 class Dip:
-    """Foot 2 in SLS-I from the equations of docs/physics.md, at 35 digits but for sin and cos pi/4.
+    """Foot 2 in SLS-I from the equations of docs/explanation/physics.md, at 35 digits but for sin
+    and cos pi/4.
 
     Those are doubles, which moves heights by 1e-17 m.
     """

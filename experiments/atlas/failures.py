@@ -4,7 +4,8 @@
 
 Each case is a module of experiments/atlas/cases with its truth. The rows of the table are what each
 method gave in one run of the whole: its answer, its error, its own words, what it cost.
-docs/stability_atlas.md opens with them. With --only these cases are run again; `run` tells when.
+docs/verification/failures.md opens with them. With --only these cases are run again; `run` tells
+when.
 """
 
 import importlib
@@ -39,7 +40,7 @@ ORDER = (
     "singular_field", "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
 )  # fmt: skip
 NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules(cases.__path__)}]
-TEXT = DOCS / "stability_atlas.md"
+TEXT = DOCS / "verification" / "failures.md"
 
 
 def import_case(name: str) -> Case:

@@ -3,8 +3,8 @@
     python -m experiments.atlas.run [--only NAME] [--cases 1000000] [--redraw]
 
 Each map is a function that fills one small table (csv) and one that draws it. A table that exists
-is kept; those of events and of dips go on where they were stopped. docs/stability_atlas.md reads
-them.
+is kept; those of events and of dips go on where they were stopped. docs/verification/failures.md
+reads them.
 """
 
 import csv

@@ -2,12 +2,13 @@
 
     python -m experiments.gaits.both_sides [folder]
 
-The eight borders of the branch along the damping (docs/branches.md) are followed over the damping
-and each of stiffness, natural length and slope; beside random points of each curve gaits are
-searched for from their parameters alone. An indicator's gaits are on one side only. Writes
-`both_sides.csv` to `results/` or the folder given: by curve how many points were asked, at how many
-the signs are right with the gaits found cold (which may be none, or another gait of the wheel), at
-how many with the curve's own gait as a guess, and at how many neither. Some minutes of one core.
+The eight borders of the branch along the damping (docs/explanation/branches.md) are followed over
+the damping and each of stiffness, natural length and slope; beside random points of each curve
+gaits are searched for from their parameters alone. An indicator's gaits are on one side only.
+Writes `both_sides.csv` to `results/` or the folder given: by curve how many points were asked, at
+how many the signs are right with the gaits found cold (which may be none, or another gait of the
+wheel), at how many with the curve's own gait as a guess, and at how many neither. Some minutes of
+one core.
 """
 
 from typing import NamedTuple

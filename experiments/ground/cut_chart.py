@@ -5,7 +5,8 @@
 Dips that an impact would leave shallower than a hundredth of the absolute tolerance are not
 followed (1e-13 m at least). Wheels over friction and damping walk ten steps; from there one step by
 each tolerance is held against the tightest. With stoppers that hold hardly a contact dips, and what
-is left is the integration; with those that only push it is more, see docs/unilateral.md.
+is left is the integration; with those that only push it is more, see
+docs/explanation/contact_model.md.
 """
 
 import matplotlib.pyplot as plt

@@ -3,9 +3,10 @@
     python -m experiments.speed.compile_benchmark
 
 Compiles programs of this package with and without XLA's fusion emitters, which `vrw.start_jax`
-switches off, and writes `docs/figures/compile_benchmark.csv` and the table of `docs/numerics.md`.
-CPU seconds of one core, no cache; each pair of a program's times is taken in turn. Limit cycles
-are found by machine code that does not come from XLA: making it counts as tracing.
+switches off, and writes `docs/figures/compile_benchmark.csv` and the table of
+`docs/explanation/numerics.md`. CPU seconds of one core, no cache; each pair of a program's times is
+taken in turn. Limit cycles are found by machine code that does not come from XLA: making it counts
+as tracing.
 """
 
 import time
@@ -99,7 +100,7 @@ def main() -> None:
     table = format_markdown(
         TABLE_COLUMNS.values(), [[row[name] for name in TABLE_COLUMNS] for row in rows]
     )
-    replace_block(DOCS / "numerics.md", "compile times", table)
+    replace_block(DOCS / "explanation" / "numerics.md", "compile times", table)
 
 
 if __name__ == "__main__":

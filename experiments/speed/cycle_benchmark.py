@@ -2,8 +2,8 @@
 
     python -m experiments.speed.cycle_benchmark [file]
 
-Writes `docs/cycles.md`, or the file given. Times are CPU seconds of one core, the least of some,
-unless called wall; take them on an idle machine.
+Writes `docs/benchmarks/cycles.md`, or the file given. Times are CPU seconds of one core, the least
+of some, unless called wall; take them on an idle machine.
 """
 
 import os
@@ -223,7 +223,7 @@ def measure_hit_rates() -> str:
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("file", type=Path, nargs="?", default=DOCS / "cycles.md")
+    parser.add_argument("file", type=Path, nargs="?", default=DOCS / "benchmarks" / "cycles.md")
     file = parse_and_start_jax(parser).file
     parts = [
         "# What limit cycles cost, and how often they are found",

@@ -6,7 +6,8 @@ Wheels near their own cycles (1 % off), as in `engine_benchmark`; values and Jac
 and durations in one run. Errors: 99th percentile over lanes of the largest entry, against the
 diffrax engine at `Options.tight()`. Times in batches are CPU time of one core, the least of the
 repeats; alone and to a first answer they are wall time. Then the seven columns of state, c, k, L*
-and phi beside peers, speed over error. Writes three tables into `docs/engine.md`, and a chart.
+and phi beside peers, speed over error. Writes three tables into `docs/explanation/batches.md`, and
+a chart.
 """
 
 import itertools
@@ -253,7 +254,9 @@ def main() -> None:
         f"{describe_processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     )
     replace_block(
-        DOCS / "engine.md", "derivatives", f"{batches}\n\n{one}\n\n{compared}\n\n{result}"
+        DOCS / "explanation" / "batches.md",
+        "derivatives",
+        f"{batches}\n\n{one}\n\n{compared}\n\n{result}",
     )
 
 

@@ -233,7 +233,7 @@ def write(table, shares, cost, out):
         f"on {os.cpu_count()} cores."
     )
     print(text)
-    replace_block(out / "engine.md", "speeds", text)
+    replace_block(out / "explanation" / "batches.md", "speeds", text)
     draw(table, shares, cost, figures)
 
 

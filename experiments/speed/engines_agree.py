@@ -5,8 +5,8 @@
 Wheels and starts of a wide box: many step, others fall in every way. Both engines at the default
 options; lanes whose outcome differs, or whose state or durations do by more than 1e-8, are looked
 at again: at tolerances of 1e-13 by both, whether they come to rest, at 1e-12, then at starts 1e-10
-and 1e-8 away by the lanes alone. Writes a table into `docs/engine.md`, and names the lanes for
-which no reason was found.
+and 1e-8 away by the lanes alone. Writes a table into `docs/explanation/batches.md`, and names the
+lanes for which no reason was found.
 """
 
 from collections.abc import Callable
@@ -160,7 +160,9 @@ def main() -> None:
     unexplained = (
         f"\n\nNo reason was found for lanes {left_part.tolist()}." if len(left_part) else ""
     )
-    replace_block(DOCS / "engine.md", "agreement", f"{table}\n\n{spread}{unexplained}")
+    replace_block(
+        DOCS / "explanation" / "batches.md", "agreement", f"{table}\n\n{spread}{unexplained}"
+    )
     print(table, spread, unexplained)
 
 

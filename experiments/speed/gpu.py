@@ -5,8 +5,8 @@
 Steps, seven columns of their Jacobians, limit cycles and a scan in float64, on JAX's default
 device, where that is a GPU; without one it says so and writes nothing. The same lanes are then
 computed by the CPU in a process of its own. A rate is lanes over the wall time of the second call;
-what the first call took beyond it is compiling. Writes a table into `docs/engine.md`; `--rehearse`
-goes the same way on a CPU and prints the table instead.
+what the first call took beyond it is compiling. Writes a table into `docs/explanation/batches.md`;
+`--rehearse` goes the same way on a CPU and prints the table instead.
 """
 
 import os
@@ -124,7 +124,7 @@ def main() -> None:
     if chosen.rehearse:
         print(result)
     else:
-        replace_block(DOCS / "engine.md", "gpu", result)
+        replace_block(DOCS / "explanation" / "batches.md", "gpu", result)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ A group of eight lanes goes through each phase together. Told is how many steps 
 tries over how many its lanes do on average: 1 where none waits. Orders are as given, by c/m, that
 of `vrw.steps`, and by the steps of SLS-I themselves, which no one knows before. Printed are also
 fits of SLS-I's steps, of which `work_order` has the powers rounded, over that of c/m. Writes a
-table into `docs/engine.md`.
+table into `docs/explanation/batches.md`.
 """
 
 import functools
@@ -100,7 +100,7 @@ def main() -> None:
         fit = powers(rows, states, steps)
         fits.append((scene, *(f"{x / fit[0]:.2f}" for x in fit)))
     table = format_markdown(("wheels", "as given", "c/m", "`vrw.steps`", "SLS-I's steps"), result)
-    replace_block(DOCS / "engine.md", "waiting", table)
+    replace_block(DOCS / "explanation" / "batches.md", "waiting", table)
     print(table)
     print(format_markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
 

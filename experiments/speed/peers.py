@@ -3,7 +3,7 @@
 Each starts just after the landing and ends at the next touchdown, watching the paper's own three
 events alone: a little less than what the library's engines do. Each returns, lane by lane,
 (theta-, dtheta-, dL1-), the three durations and the number of evaluations. The equations are those
-of docs/physics.md, written out for numbers and for heyoka's expressions alike.
+of docs/explanation/physics.md, written out for numbers and for heyoka's expressions alike.
 """
 
 import ctypes

@@ -386,7 +386,7 @@ def draw(rows: list[Row], batches: list[Row]) -> None:
                 save(chart, FIGURES, f"work_precision_{name}_{work}")
         save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
     write_page(rows, FIGURES / "work_precision.html", works(unit))
-    page = DOCS / "work_precision.md"
+    page = DOCS / "benchmarks" / "work_precision.md"
     replace_block(page, "what to use", table(rows))
     replace_block(page, "defaults", on_the_front(rows))
     replace_block(page, "floors", floors(rows))

@@ -308,7 +308,7 @@ def evaluate_walker_map(_, x, slope):
     return WALKER_STEP(x, slope)[0]
 
 
-# docs/physics.md: section state, period, multipliers at slope 0.009.
+# docs/explanation/physics.md: section state, period, multipliers at slope 0.009.
 STABLE_CYCLE = ((0.200310900544, -0.199832473005), 3.88246375285, -0.19009984107 + 0.55759877668j)
 UNSTABLE_CYCLE = ((0.193937369810, -0.203866927442), 3.09610586808, (4.00386435893, 0.45958958980))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from vrw_jax import simd
 
-PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "developer" / "machine_code.md").read_text()
 
 
 def test_the_page_has_the_table_of_primitives():

@@ -22,9 +22,9 @@ IMPLICIT_SOLVER = "Kvaerno5"
 """Solver of wheels that are too stiff for explicit ones."""
 IMPLICIT_COST_EVALS = 6e4
 """Number of evaluations of an explicit solver with the same cost as IMPLICIT_SOLVER at a tolerance
-of 1e-6 (docs/stability_atlas.md). The cost of the implicit solver scales as the tolerance to the
-power of -0.17, from 1e-4 to 1e-10. At the limit of stability the cost of explicit solvers does not
-depend on it."""
+of 1e-6 (docs/verification/failures.md). The cost of the implicit solver scales as the tolerance to
+the power of -0.17, from 1e-4 to 1e-10. At the limit of stability the cost of explicit solvers does
+not depend on it."""
 
 
 def select_solver(parameters: np.ndarray, options: StepOptions) -> np.ndarray:

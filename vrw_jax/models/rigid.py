@@ -49,7 +49,7 @@ class RigidWheel(AbstractWheel):
     - `held_landing`: False is the classic landing, whose rear foot leaves without an impulse
       (angular momentum about the new foot is kept). True is the stiff limit of the paper's own
       landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel`, as
-      docs/physics.md derives it.
+      docs/explanation/physics.md derives it.
 
     Examples:
         >>> params = vrw.WheelParams(slope=0.15)

@@ -4,8 +4,8 @@ With the foot of Leg 1 at rest the wheel has the coordinates (theta, L1, L2). Wr
 velocity in the frame of Leg 1, the mass matrix does not depend on theta. Every phase follows from
 one set of `equation_terms`. Double support restricts them to the circle of the hub, with one degree
 of freedom. Single support I is their 3 x 3 solve. Single support II drops L2 and has two degrees of
-freedom. The constraints of eq. (2) hold by construction. The page docs/physics.md derives every
-line.
+freedom. The constraints of eq. (2) hold by construction. The page docs/explanation/physics.md
+derives every line.
 """
 
 from typing import NamedTuple
