@@ -20,7 +20,7 @@ from vrw_jax.branches.continuation_problems import (
 from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import ContinuationPoint
 from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycles, make_finder, transfer_to_mesh
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.simulation import walk_toward_gait
 from vrw_jax.wheel import WheelParams
@@ -174,8 +174,10 @@ def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchSta
     )
 
 
-START_FUNCTIONS: dict[str, Callable[[BranchRequest, Any], BranchStart]] = {
-    "viscoelastic": start_from_collocation,
-    "unilateral": start_from_unilateral_gaits,
+START_FUNCTIONS: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] = {
+    GaitMethod.COLLOCATION: start_from_collocation,
+    GaitMethod.CONTACT_WALKS: start_from_unilateral_gaits,
+    GaitMethod.RETURN_MAP: start_from_walks,
+    GaitMethod.SELECTION: start_from_walks,
 }
-"""Start functions by name of the model; all other models use `start_from_walks`."""
+"""Start functions by gait method."""

@@ -26,7 +26,7 @@ from vrw_jax.branches.branch_location import (
     QuantityTable,
     continue_and_locate,
 )
-from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest, start_from_walks
+from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest
 from vrw_jax.branches.continuation_problems import SLIDES_AWAY, BranchWheel
 from vrw_jax.continuation import (
     ArclengthOptions,
@@ -302,9 +302,7 @@ def _continue_from_starts(
     """
     refines_mesh = request.cycle_options is None
     for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
-        branch_start = START_FUNCTIONS.get(request.model.model_name, start_from_walks)(
-            request, cycle
-        )
+        branch_start = START_FUNCTIONS[request.model.capabilities.gait_method](request, cycle)
         run = GaitContinuation(
             branch_start.problem, options, branch_start.wheels, limits, request.model,
             request.step_options,

@@ -321,7 +321,7 @@ def scan(
       vrw scan configs/quickstart.toml --dask tcp://host:8786
     """
     with report_errors():
-        settings, folder = _load_config_for(config, folder, "design")
+        settings, folder = _load_config_for(config, folder, "design", "scan")
         plan, store = scanning.plan_config_scan(settings, chunk), folder / "scan.zarr"
         from vrw_jax.scans import forecast_scan
 
@@ -393,7 +393,7 @@ def tune(
       vrw gait results/steady/wheel.toml
     """
     with report_errors():
-        settings, folder = _load_config_for(config, folder, "tune")
+        settings, folder = _load_config_for(config, folder, "tune", "tune")
         tune_config = settings.tune
         assert tune_config is not None
         _require_writable(folder)
@@ -438,7 +438,7 @@ def continue_(
       vrw continue configs/branch_damping.toml --out results/along_c --no-picture
     """
     with report_errors():
-        settings, folder = _load_config_for(config, folder, "branch")
+        settings, folder = _load_config_for(config, folder, "branch", "branch")
         branch_config = settings.branch
         assert branch_config is not None
         _require_writable(folder)
@@ -514,23 +514,17 @@ MISSING_TABLE_MESSAGES = {
 }
 """Messages about a config that lacks the table that a command needs."""
 
-SUPPORTED_MODELS = {
-    "design": ("viscoelastic", "unilateral", "auto"),
-    "map": ("viscoelastic",),
-    "tune": ("viscoelastic", "unilateral"),
-    "branch": ("viscoelastic", "unilateral", "rigid"),
-}
-"""Models that each command supports."""
-
 
 def _load_config_for(
-    path: Path, folder: Path | None, table: str, command: str = ""
+    path: Path, folder: Path | None, table: str, command: str
 ) -> tuple["Config", Path]:
     """Return the config and the folder of the result; raise if the needed table is missing."""
     settings = _load_config(path)
     if getattr(settings, table) is None:
         raise ValueError(f"{settings.file_name} {MISSING_TABLE_MESSAGES[table]}")
-    supported = SUPPORTED_MODELS[command or table]
+    from vrw_jax.selection import list_config_names
+
+    supported = list_config_names(command)
     if settings.model_name not in supported:
         raise ValueError(
             f"{settings.file_name} names the model {settings.model_name}, but this command takes "

@@ -13,26 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.contact import UnilateralWheel
 from vrw_jax.hybrid import make_solver
-from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import CATALOGS, MAX_LISTED_SAMPLES, TOLERANCE_CATALOG, check_measures
 from vrw_jax.scans import design as designs
-from vrw_jax.selection import LadderWheel
+from vrw_jax.selection import find_model_class, list_config_names
 from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, WheelParams
 
 RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
 DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
 TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
-MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
-    "viscoelastic": ViscoelasticWheel,
-    "unilateral": UnilateralWheel,
-    "rigid": RigidWheel,
-    "auto": LadderWheel,
-}
-"""Model classes by the name in a config."""
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
 MAX_COUNT = 2**53
@@ -136,7 +128,7 @@ class Config:
 
     def make_model(self) -> AbstractWheel:
         """Return the model with its settings."""
-        return MODEL_CLASSES[self.model_name](**self.model_settings)
+        return find_model_class(self.model_name)(**self.model_settings)
 
     def make_options(self) -> StepOptions:
         """Return the numerical options of the steps."""
@@ -203,7 +195,8 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
             "design: keep one."
         )
     model_name, model = _parse_model(_get_table(tables, "model"))
-    names = MODEL_CLASSES[model_name].parameter_names
+    model_class = find_model_class(model_name)
+    names = model_class.parameter_names
     design = (
         _parse_design(design_kinds[0], _get_table(tables, design_kinds[0]), names)
         if design_kinds
@@ -221,7 +214,7 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
         model_name=model_name,
         model_settings=model,
         option_values=_parse_options(_get_table(tables, "options")),
-        scan=_parse_scan(_get_table(tables, "scan"), MODEL_CLASSES[model_name].model_name),
+        scan=_parse_scan(_get_table(tables, "scan"), model_class),
         gait=_parse_gait(_get_table(tables, "gait")),
         tune=_parse_tune(_get_table(tables, "tune")) if "tune" in tables else None,
         branch=_parse_branch(_get_table(tables, "branch"), names) if "branch" in tables else None,
@@ -274,9 +267,9 @@ def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | in
     """Return the name and the settings of the model of `[model]`."""
     _refuse_renamed_keys(table, "[model]")
     model_name = table.get("name", Config.model_name)
-    check_known_name(model_name, tuple(MODEL_CLASSES), "model")
+    check_known_name(model_name, list_config_names(), "model")
     assert isinstance(model_name, str)
-    defaults = {setting.name: setting.default for setting in fields(MODEL_CLASSES[model_name])}
+    defaults = {setting.name: setting.default for setting in fields(find_model_class(model_name))}
     _require_known_keys(
         table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
     )
@@ -316,7 +309,7 @@ def _parse_like_defaults(
     return values
 
 
-def _parse_scan(table: Mapping[str, object], model_name: str) -> ScanConfig:
+def _parse_scan(table: Mapping[str, object], model_class: type[AbstractWheel]) -> ScanConfig:
     """Return the settings of `[scan]`; raise if the model does not have a measure."""
     _require_known_keys(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
     measures = table.get("measures")
@@ -325,7 +318,7 @@ def _parse_scan(table: Mapping[str, object], model_name: str) -> ScanConfig:
             requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
             raise _make_error("measures", measures, requirement)
         catalog = (
-            CATALOGS.get(model_name, CATALOGS["viscoelastic"])
+            CATALOGS.get(model_class.capabilities.gait_method, CATALOGS[GaitMethod.COLLOCATION])
             if "tol" not in table
             else TOLERANCE_CATALOG
         )
@@ -423,9 +416,10 @@ def _parse_design(
     """Return the design of a table that sweeps some of the parameters `names`."""
     design_keys = ("n", "seed") if kind in RANDOM_DESIGNS else ()
     if FRICTION_NAME in table and FRICTION_NAME not in names:
+        choices = [f'name = "{x}"' for x in list_config_names("scan", FRICTION_NAME)]
         raise ValueError(
             f"[{kind}] sweeps friction, which does not affect this model: write [model] "
-            'and below it name = "unilateral" or name = "auto".'
+            f"and below it {' or '.join(choices)}."
         )
     _require_known_keys(table, (*design_keys, *names), f"[{kind}]", "settings")
     swept = {name: value for name, value in table.items() if name not in design_keys}

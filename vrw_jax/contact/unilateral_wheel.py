@@ -66,6 +66,8 @@ from vrw_jax.models import (
     PAPER_START,
     AbstractWheel,
     AdvanceResult,
+    GaitMethod,
+    ModelCapabilities,
     StepGround,
     can_use_lanes,
     check_step_values,
@@ -173,6 +175,12 @@ class UnilateralWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "unilateral"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="unilateral",
+        gait_method=GaitMethod.CONTACT_WALKS,
+        commands=frozenset({"scan", "tune", "branch", "explore"}),
+        fixed_by_tolerance=("restitution", "infinite_friction_rule", "uneven", "max_events"),
+    )
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
     reports_contacts: ClassVar[bool] = True
     batch_kernel: ClassVar[str] = "legs"

@@ -16,6 +16,7 @@ from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.cycles.unilateral_finder import UnilateralFinder
+from vrw_jax.models import GaitMethod
 from vrw_jax.numerics import StepOptions
 from vrw_jax.printing import format_numbers
 from vrw_jax.simulation import (
@@ -31,10 +32,13 @@ from vrw_jax.wheel import WheelParams
 Guess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
 """A neighbor's cycle, or a section state near the wanted gait."""
 
-FINDER_CLASSES: dict[str, type[AbstractGaitFinder]] = {
-    "viscoelastic": CollocationFinder, "unilateral": UnilateralFinder
-}  # fmt: skip
-"""Finder class by name of the model; all other models use `ReturnMapFinder`."""
+FINDER_CLASSES: dict[GaitMethod, type[AbstractGaitFinder]] = {
+    GaitMethod.COLLOCATION: CollocationFinder,
+    GaitMethod.CONTACT_WALKS: UnilateralFinder,
+    GaitMethod.RETURN_MAP: ReturnMapFinder,
+    GaitMethod.SELECTION: ReturnMapFinder,
+}
+"""Finder class by gait method."""
 
 
 def make_finder(
@@ -49,7 +53,7 @@ def make_finder(
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
-    make_from_options = FINDER_CLASSES.get(resolved_model.model_name, ReturnMapFinder).from_options
+    make_from_options = FINDER_CLASSES[resolved_model.capabilities.gait_method].from_options
     return make_from_options(resolved_model, n_legs, check_options(step_options), period_n,
                 CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 

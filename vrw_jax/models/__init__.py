@@ -9,6 +9,7 @@ from vrw_jax.models.batch_step import (
     split_jacobian,
     step_after_landing,
 )
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.section_states import (

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.section_states import SectionState
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.models.uneven_slopes import complete_slopes
@@ -30,7 +31,9 @@ class AbstractWheel(eqx.Module):
     """
 
     model_name: eqx.AbstractClassVar[str]
-    """Name of the model, by which other packages look up what they hold for it."""
+    """Name of the model in results."""
+    capabilities: eqx.AbstractClassVar[ModelCapabilities]
+    """What the library offers for the model."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
     """Inputs of the motion: the wheel's parameters and, where the motion depends on it,
     friction."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.section_states import SectionState, StateValues, replace_invalid
 from vrw_jax.models.step_results import (
@@ -59,6 +60,11 @@ class RigidWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "rigid"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="rigid",
+        gait_method=GaitMethod.RETURN_MAP,
+        commands=frozenset({"branch", "explore"}),
+    )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False

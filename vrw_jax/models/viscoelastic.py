@@ -24,6 +24,7 @@ from vrw_jax.models.batch_step import (
     build_step_sampler,
     can_use_lanes,
 )
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
@@ -119,6 +120,11 @@ class ViscoelasticWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "viscoelastic"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="viscoelastic",
+        gait_method=GaitMethod.COLLOCATION,
+        commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
+    )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     batch_kernel: ClassVar[str] = "phases"

@@ -23,7 +23,7 @@ from vrw_jax.cycles import (
     find_slow_gaits,
     make_finder,
 )
-from vrw_jax.models import ViscoelasticWheel
+from vrw_jax.models import GaitMethod, ViscoelasticWheel
 from vrw_jax.numerics import map_in_batches
 from vrw_jax.scans.collocation_engine import (
     CollocationEngine,
@@ -209,13 +209,13 @@ def make_engine(
     """Return the engine for the samples of a scan of this model, or to a tolerance."""
     if request.tol is not None:
         return ToleranceEngine(request)
-    engine_class: Any = ENGINE_CLASSES[request.model.model_name]
+    engine_class: Any = ENGINE_CLASSES[request.model.capabilities.gait_method]
     return engine_class(request, threads)
 
 
 ENGINE_CLASSES = {
-    "viscoelastic": CollocationEngine,
-    "unilateral": UnilateralEngine,
-    "ladder": LadderEngine,
+    GaitMethod.COLLOCATION: CollocationEngine,
+    GaitMethod.CONTACT_WALKS: UnilateralEngine,
+    GaitMethod.SELECTION: LadderEngine,
 }
-"""Engine classes by model, for the models that a scan supports."""
+"""Engine classes by gait method, for the methods that scans support."""

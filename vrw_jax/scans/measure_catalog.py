@@ -12,7 +12,7 @@ from vrw_jax.measures import (
     UNILATERAL_DIFFERENTIABLE_NAMES,
     measure_attrs,
 )
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.selection import SELECTION_ATTRS
 from vrw_jax.tolerance import MEASURE_FUNCTIONS
 from vrw_jax.validation import suggest_name
@@ -89,11 +89,11 @@ LADDER_CATALOG = MeasureCatalog(
     64,
 )
 CATALOGS = {
-    "viscoelastic": PAPER_CATALOG,
-    "unilateral": UNILATERAL_CATALOG,
-    "ladder": LADDER_CATALOG,
+    GaitMethod.COLLOCATION: PAPER_CATALOG,
+    GaitMethod.CONTACT_WALKS: UNILATERAL_CATALOG,
+    GaitMethod.SELECTION: LADDER_CATALOG,
 }
-"""Catalogs by model, for the models with compliant legs."""
+"""Catalogs by gait method, for the methods that scans support."""
 TOLERANCE_CATALOG = MeasureCatalog(
     tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
@@ -104,7 +104,7 @@ ERROR_SUFFIX = "_error"
 
 def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCatalog:
     """Return the catalog of a model, or that of scans to a tolerance if `tol` is given."""
-    return CATALOGS[model.model_name] if tol is None else TOLERANCE_CATALOG
+    return CATALOGS[model.capabilities.gait_method] if tol is None else TOLERANCE_CATALOG
 
 
 def error_variable_name(measure: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.measures import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
-from vrw_jax.models import AbstractWheel, ViscoelasticWheel
+from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
@@ -36,6 +36,7 @@ from vrw_jax.scans.store import (
     choose_chunk_shape,
     find_first_difference,
 )
+from vrw_jax.selection import describe_models
 from vrw_jax.simulation import ModelLike, check_model, check_options
 from vrw_jax.validation import check_int, check_names, check_positive, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
@@ -45,11 +46,6 @@ MAX_SCAN_SAMPLES = 1_000_000_000
 
 DEFAULT_CHUNK_SIZE = 4096
 """Default number of samples per chunk; a killed scan can lose so many."""
-
-TOLERANCE_REFERENCE_SETTINGS = {
-    "unilateral": ("restitution", "infinite_friction_rule", "uneven", "max_events")
-}
-"""Models that a tolerance can refer to, and their fields that must have the default value."""
 
 STORED_KINDS = {"StepOptions": "Options"}
 """Names of classes in stores, where they differ from the names in Python: stores of version 0.1
@@ -166,12 +162,12 @@ def plan_scan(
     if not model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
-            'vrw.ViscoelasticWheel(), vrw.UnilateralWheel() or "auto".'
+            f"{describe_models('scan')}."
         )
     if FRICTION_NAME in design.names and FRICTION_NAME not in model.parameter_names:
         raise ValueError(
             "the design sweeps friction, which does not affect the paper's wheel: give "
-            'model=vrw.UnilateralWheel() or "auto".'
+            f"model={describe_models('scan', FRICTION_NAME)}."
         )
     tol = None if tol is None else _check_tolerance(model, check_positive("tol", tol))
     catalog = select_catalog(model, tol)
@@ -194,7 +190,7 @@ def plan_scan(
 def _check_tolerance(model: AbstractWheel, tol: float) -> float:
     """Return the tolerance; raise if no tolerance can refer to the model."""
     fields: dict[str, Any] = type(model).__dataclass_fields__
-    default_only_fields = TOLERANCE_REFERENCE_SETTINGS.get(model.model_name)
+    default_only_fields = model.capabilities.fixed_by_tolerance
     if default_only_fields is None or any(
         getattr(model, name) != fields[name].default for name in default_only_fields
     ):
@@ -283,8 +279,8 @@ def _record_fields(settings: object) -> dict[str, object]:
     stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(kind, {})
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
-        if isinstance(value, StepOptions):
-            continue  # recorded separately
+        if isinstance(value, StepOptions | ModelCapabilities):
+            continue  # options are recorded separately, capabilities are code
         if value is None or isinstance(value, bool | int | str):
             record[stored_names.get(name, name)] = value
         elif isinstance(value, tuple):

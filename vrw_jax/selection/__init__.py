@@ -11,3 +11,9 @@ from vrw_jax.selection.ladder import (
     find_selection_reason,
     refuse_ladder,
 )
+from vrw_jax.selection.registry import (
+    MODEL_CLASSES,
+    describe_models,
+    find_model_class,
+    list_config_names,
+)

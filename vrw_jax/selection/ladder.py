@@ -32,6 +32,9 @@ from vrw_jax.models import (
     AbstractContactStep,
     AbstractWheel,
     AdvanceResult,
+    GaitMethod,
+    ModelCapabilities,
+    RigidWheel,
     StepResult,
     ViscoelasticWheel,
     replace_invalid,
@@ -67,7 +70,9 @@ SELECTION_ATTRS: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
         "flag_values": [RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL],
-        "flag_meanings": "RigidWheel ViscoelasticWheel UnilateralWheel",
+        "flag_meanings": " ".join(
+            entry.__name__ for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
+        ),
     },
     "reason": {
         "long_name": "why that model was used",
@@ -221,6 +226,11 @@ class LadderWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "ladder"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="auto",
+        gait_method=GaitMethod.SELECTION,
+        commands=frozenset({"scan"}),
+    )
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
     reports_contacts: ClassVar[bool] = True
 

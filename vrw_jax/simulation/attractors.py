@@ -78,10 +78,6 @@ def _walk_round_batched(
     return np.stack(states, 1), np.stack(codes, 1)
 
 
-ROUND_WALKERS: dict[str, Callable[..., tuple]] = {"unilateral": _walk_round_batched}
-"""Functions that walk one round of many starts, for models that do not walk it by blocks."""
-
-
 def walk_until_periodic(
     params: WheelParams,
     starts: np.ndarray,
@@ -100,13 +96,12 @@ def walk_until_periodic(
     outcome = np.full(n, int(Outcome.STEPPED))
     period, n_walked = np.zeros(n, int), np.zeros(n, int)
     unsettled = np.arange(n)
-    batched_walker = ROUND_WALKERS.get(model.model_name)
-    walk_wheels_and_states = functools.partial(batched_walker or _walk_block, model, options)
-    walk_round = (
-        walk_wheels_and_states
-        if batched_walker
-        else functools.partial(map_in_batches, walk_wheels_and_states, (STARTS_PER_BLOCK,))
-    )
+    walk_round: Callable[..., tuple]
+    if model.batch_kernel == "legs":
+        walk_round = functools.partial(_walk_round_batched, model, options)
+    else:
+        walk_block = functools.partial(_walk_block, model, options)
+        walk_round = functools.partial(map_in_batches, walk_block, (STARTS_PER_BLOCK,))
     for k in range(n_rounds):
         round_rows = slice(1 + k * STEPS_PER_ROUND, 1 + (k + 1) * STEPS_PER_ROUND)
         unsettled_starts = take_rows(wheels, unsettled), history[unsettled, k * STEPS_PER_ROUND]
@@ -188,7 +183,7 @@ def measure_orbits(
     """Return all measures of one step from each of `states`, shape (n, m)."""
     n = len(states)
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
-    if model.model_name in ROUND_WALKERS:
+    if model.batch_kernel == "legs":
         columns, unilateral_model = (
             np.asarray(jax.vmap(model.parameter_values)(wheels)).T,
             cast(UnilateralWheel, model),

@@ -34,7 +34,7 @@ from vrw_jax.printing import (
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_models
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -68,8 +68,8 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
         return LadderWheel()
     if not isinstance(model, AbstractWheel):
         raise TypeError(
-            f"model is {format_value(model)}, but a model of the ladder is needed: give "
-            'vrw.ViscoelasticWheel(), vrw.RigidWheel(), vrw.UnilateralWheel() or "auto".'
+            f"model is {format_value(model)}, but a model of the wheel is needed: give "
+            f"{describe_models()}."
         )
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
         raise ValueError(

@@ -8,14 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.batches import step_batch
+from vrw_jax.contact import UnilateralWheel
 from vrw_jax.cycles import GAIT_BATCH_SIZES, make_finder, retry_from_walks
-from vrw_jax.models import RigidWheel
+from vrw_jax.models import RigidWheel, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, map_in_batches, take_rows, value_and_jacobian
 from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.wheel import Outcome, WheelParams
 
 NO_MODEL, RIGID_MODEL_INDEX, PAPER_MODEL_INDEX, UNILATERAL_MODEL_INDEX = 0, 1, 2, 3
-MODEL_NAMES = ("none", "rigid", "viscoelastic", "unilateral")
+MODEL_NAMES = (
+    "none",
+    *(entry.model_name for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)),
+)
 """Names of the models by index."""
 
 SECTION_STATE_NAME = "section_state"

@@ -37,7 +37,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import SELECTION_MARGINS
+from vrw_jax.selection import SELECTION_MARGINS, describe_models
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
 from vrw_jax.tuning.exploration import Exploration, explore_starts
 from vrw_jax.tuning.maximization import (
@@ -503,7 +503,7 @@ def make_tune_problem(
     if not finder.model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but what is tuned has compliant legs: give "
-            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+            f"{describe_models('tune')}."
         )
     finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     reader, label = _parse_objective(objective, finder)

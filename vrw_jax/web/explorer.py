@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
+from vrw_jax.selection import list_config_names
 from vrw_jax.validation import (
     check_choice,
     check_int,
@@ -18,7 +19,7 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require
 if TYPE_CHECKING:
     import xarray as xr
 
-PAGE_MODEL_NAMES = "viscoelastic", "rigid", "unilateral"
+PAGE_MODEL_NAMES = list_config_names("explore")
 """Names of the models that the page supports."""
 DEFAULT_HEIGHT_PIXELS = 900
 """Default height of the widget, in pixels."""
