@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.hybrid import ReturnMap, Termination
+from vrw_jax.hybrid import ReturnMap, Termination, find_program
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
 from vrw_jax.printing import format_numbers, format_quantity, format_text
 from vrw_jax.validation import (
@@ -150,11 +150,6 @@ def _solve_checked(
     if not isinstance(tolerance, jax.Array):
         check_positive("tolerance", tolerance)
 
-    def iterate(x: Array) -> Array:
-        for _ in range(period_n):
-            x = function(x)
-        return x
-
     start = lax.stop_gradient(start)
     output = jax.eval_shape(function, start)
     if getattr(output, "shape", None) != start.shape:
@@ -164,8 +159,23 @@ def _solve_checked(
             f"its like: "
             "take a map of a state to the next."
         )
-    converted_map, closed_over = jax.closure_convert(iterate, start)
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    static = (run_newton, function, period_n, iterations)
+    arguments = start, tolerance
+    is_cached = isinstance(function, ReturnMap)
+    program = find_program(_solve, static, *arguments) if is_cached else None
+    return (program or functools.partial(_solve, static))(*arguments)
+
+
+def _solve(static: tuple, start: Array, tolerance: Array) -> FixedPointResult:
+    run_newton, function, period_n, iterations = static
+
+    def iterate(x: Array) -> Array:
+        for _ in range(period_n):
+            x = function(x)
+        return x
+
+    converted_map, closed_over = jax.closure_convert(iterate, start)
     return run_newton(converted_map, iterations, start, tolerance, *closed_over)
 
 

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vrw_jax.hybrid.phase_integration import sample_phase
+from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, collect_modes
 from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
 from vrw_jax.validation import check_reals
@@ -36,6 +37,13 @@ def flow_jacobian_determinant(
     """
     options = StepOptions() if options is None else options
     modes, start = collect_modes(modes), check_reals("start", start)
+    product = call_compiled(_multiply_event_factors, modes, start, solution, options)
+    return refuse_reverse_mode("flow_jacobian_determinant", product)
+
+
+def _multiply_event_factors(
+    modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
+) -> Scalar:
     event_factors = [_event_factor(mode, guard, options) for mode in modes for guard in mode.guards]
     first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
     phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
@@ -56,8 +64,7 @@ def flow_jacobian_determinant(
         first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
-    product = lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
-    return refuse_reverse_mode("flow_jacobian_determinant", product)
+    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
 
 
 def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
+from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
 
 
@@ -60,8 +61,18 @@ def segment_maps(
             f"from 1 to "
             f"{start.size} and the other positive."
         )
+    static = (field, n_segments, n_tangents)
+    duration = jnp.asarray(duration, start.dtype)
+    segments = call_compiled(_integrate_segments, static, start, duration, options)
+    return refuse_reverse_mode("segment_maps", segments)
+
+
+def _integrate_segments(
+    static: tuple[VectorField, int, int], start: Array, duration: Array, options: StepOptions
+) -> FlowSegments:
+    field, n_segments, n_tangents = static
     dim, size = start.size, start.size * (1 + n_tangents)
-    length = jnp.asarray(duration, start.dtype) / n_segments
+    length = duration / n_segments
 
     def flow_with_tangents(z: Array) -> Array:
         y, tangents = z[:dim], z[dim:size].reshape(n_tangents, dim)
@@ -91,8 +102,7 @@ def segment_maps(
         return end_state[:dim], (end_state[:dim], jacobian, end_state[-2])
 
     _, (states, maps, divergences) = lax.scan(integrate_segment, start, None, length=n_segments)
-    segments = FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
-    return refuse_reverse_mode("segment_maps", segments)
+    return FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
 
 
 class ProductMultipliers(NamedTuple):

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
+from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition, refuse_reverse_mode
 from vrw_jax.printing import describe_ending
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
@@ -110,6 +111,8 @@ def simulate_hybrid(
     zero where its mode begins counts as zero; one that is zero at rest there fires only if it
     will not rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
     apply, reverse mode does not. One mode, or a mode's one guard, may be given without a tuple.
+    Outside of `jax.jit` equal modes are compiled once: functions with equal code that refer to
+    equal constants share a program.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
@@ -117,7 +120,9 @@ def simulate_hybrid(
     modes = collect_modes(modes)
     _check_arguments(modes, start, events, mode)
     options.check_tolerances(start.dtype)
-    return refuse_reverse_mode("simulate_hybrid", _simulate(modes, events, options, start, mode))
+    mode_index = jnp.asarray(mode, jnp.int32)
+    solution = call_compiled(_simulate, (modes, events), options, start, mode_index)
+    return refuse_reverse_mode("simulate_hybrid", solution)
 
 
 ERROR_CHECK_TIGHTENINGS = (0.1, 0.01)
@@ -144,12 +149,18 @@ def time_errors(
     options = StepOptions() if options is None else options
     modes = collect_modes(modes)
     start, solution = lax.stop_gradient((check_reals("start", start), solution))
+    return call_compiled(_estimate_time_errors, modes, start, solution, options)
+
+
+def _estimate_time_errors(
+    modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
+) -> Float[Array, " events"]:
     count = jnp.arange(len(solution.times))
 
     def time_change(factor: Array) -> Array:
-        looser_solution = _simulate(
-            modes, len(count), options.with_tightened_tolerances(factor), start, solution.modes[0]
-        )
+        looser_options = options.with_tightened_tolerances(factor)
+        static = (modes, len(count))
+        looser_solution = _simulate(static, looser_options, start, solution.modes[0])
         is_same_event = (looser_solution.guards == solution.guards) & (
             looser_solution.modes == solution.modes
         )
@@ -186,7 +197,7 @@ def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
         guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
         check_type("guards", guards, (list, tuple), "give Guards in a tuple")
         for guard in guards:
-            check_type("a guard", guard, Guard, "give Guard(value, reset, to)")
+            check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
         listed.append(mode._replace(guards=tuple(guards)))
     return tuple(listed)
 
@@ -291,8 +302,10 @@ def _added(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def _simulate(
-    modes: tuple[Mode, ...], events: int, options: StepOptions, start: Array, mode: int | Array
+    static: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
+    modes, events = static
+
     def make_mode_branch(mode_index: int) -> Callable:
         def run_mode(state: Array, time: Array) -> tuple:
             end, is_violated = _integrate_mode(modes[mode_index], state, time, options)
