@@ -16,14 +16,8 @@ from jaxtyping import Array
 
 from vrw_jax.models.batch_step import jacobian_columns
 from vrw_jax.numerics import BatchFunction
-from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
 
-_UNIT_POWERS = {
-    "kg": (0, 0, 1), "m": (1, 0, 0), "N/m": (0, -2, 1), "N s/m": (0, -1, 1), "rad": (0, 0, 0),
-    "m/s^2": (1, -2, 0), "rad/s": (0, -1, 0), "m/s": (1, -1, 0), "s": (0, 1, 0),
-}  # fmt: skip
-"""Powers of length, time and mass in the units of the wheel's parameters and of a step's
-outputs."""
 _STATE_UNITS = ("rad", "rad/s", "m/s")
 _INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE_UNITS, "rad")
 
@@ -52,7 +46,7 @@ class UnitScaling(NamedTuple):
 def _make_unit_scaling(unit_index: int) -> UnitScaling:
     """Return the powers of one unit: 0 is length, 1 is time, 2 is mass."""
     powers = (
-        tuple(_UNIT_POWERS[unit_name][unit_index] for unit_name in units)
+        tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in units)
         for units in (_INPUT_UNITS, (*_STATE_UNITS, "s", "s", "s"))
     )
     return UnitScaling(*powers)

@@ -16,6 +16,7 @@ from vrw_jax.wheel.params import (
     MAX_SI_VALUE,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
+    UNIT_POWERS,
     Symbols,
     WheelParams,
     compute_symbols,

@@ -74,6 +74,13 @@ PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
 }
 """Domain of every float parameter of `WheelParams`, in the order of its fields."""
 
+UNIT_POWERS = {
+    "kg": (0, 0, 1), "m": (1, 0, 0), "N/m": (0, -2, 1), "N s/m": (0, -1, 1), "rad": (0, 0, 0),
+    "m/s^2": (1, -2, 0), "rad/s": (0, -1, 0), "m/s": (1, -1, 0), "s": (0, 1, 0),
+}  # fmt: skip
+"""Powers of length, time and mass in the units of the wheel's parameters and of a step's
+outputs."""
+
 
 class Symbols(NamedTuple):
     """Symbols of the paper and the combinations shared by the formulas, for local unpacking."""
@@ -241,6 +248,49 @@ class WheelParams(AbstractPrintable):
             value = getattr(self, name)
             is_inside = is_inside & domain.contains(value) & jnp.isfinite(value)
         return is_inside
+
+    def scaled(
+        self, *, mass: RealInput = 1.0, length: RealInput = 1.0, time: RealInput = 1.0
+    ) -> "WheelParams":
+        """Return the similar wheel whose masses, lengths and times are larger by the given factors.
+
+        Similar wheels have the same gaits: a period grows by `time`, a speed by `length / time`, a
+        force by `mass * length / time**2`. Angles, fractions and multipliers stay. By Buckingham's
+        theorem the nine parameters form six groups without a unit. The same factors convert units:
+        `mass=1000, length=1000` expresses the wheel in grams and millimetres.
+
+        Args:
+            mass: factor of masses, positive.
+            length: factor of lengths, positive.
+            time: factor of times, positive; gravity grows by `length / time**2`.
+
+        Returns:
+            WheelParams: the wheel with every parameter times the factors of its unit.
+
+        Raises:
+            ValueError: if a factor is not positive, or a parameter leaves its domain.
+
+        Examples:
+            >>> small = vrw.WheelParams().scaled(mass=0.01, length=0.2, time=0.2**0.5)
+            >>> print(f"{small.locked_length:.2f} m, {small.gravity:.2f} m/s^2")
+            0.20 m, 9.81 m/s^2
+        """
+        factors = {"length": length, "time": time, "mass": mass}
+        for name, value in factors.items():
+            factor = check_reals(name, value)
+            if not isinstance(factor, jax.core.Tracer) and not np.all(factor > 0.0):
+                raise ValueError(
+                    f"{name} is {format_value(value)}, but a factor of scale is positive: give 2, "
+                    "say, for twice as much."
+                )
+        scaled_values = {}
+        for name, domain in PARAMETER_DOMAINS.items():
+            powers = UNIT_POWERS[domain.unit]
+            scale = math.prod(
+                factor**power for factor, power in zip(factors.values(), powers, strict=True)
+            )
+            scaled_values[name] = getattr(self, name) * scale
+        return WheelParams(**scaled_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
         """Return the symbols of the paper with the combinations shared by the formulas."""

@@ -1,0 +1,60 @@
+"""A scaled wheel has the same gait in other units of mass, length and time."""
+
+import jax
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+
+MASS, LENGTH, TIME = 0.01, 0.2, 0.5
+FACTORS = {"mass": MASS, "length": LENGTH, "time": TIME}
+REFERENCE_TOLERANCE = 1e-8
+"""Allowed relative difference, chosen because the mesh error of both gaits is below 1e-9."""
+
+
+@pytest.fixture(scope="module")
+def cycles():
+    params = vrw.WheelParams(damping=150.0)
+    return vrw.limit_cycle(params), vrw.limit_cycle(params.scaled(**FACTORS))
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("period", TIME),
+        ("speed", LENGTH / TIME),
+        ("dls_fraction", 1.0),
+        ("spectral_radius", 1.0),
+    ],
+)
+def test_a_measure_of_the_scaled_gait_follows_from_its_unit(cycles, name, factor):
+    expected = factor * float(getattr(cycles[0], name))
+    assert float(getattr(cycles[1], name)) == pytest.approx(expected, rel=REFERENCE_TOLERANCE)
+
+
+def test_scaling_back_returns_the_wheel():
+    params = vrw.WheelParams(slope=0.28, n_legs=9)
+    inverse = {name: 1.0 / factor for name, factor in FACTORS.items()}
+    result = params.scaled(**FACTORS).scaled(**inverse)
+    for value, expected in zip(jax.tree.leaves(result), jax.tree.leaves(params), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-15)
+    assert result.n_legs == 9
+
+
+def test_a_scaled_wheel_keeps_gravity_if_time_grows_by_the_root_of_length():
+    small = vrw.WheelParams().scaled(length=0.2, time=0.2**0.5)
+    assert float(small.gravity) == pytest.approx(9.81, rel=1e-15)
+    assert float(small.stiffness) == pytest.approx(500.0 / 0.2, rel=1e-15)
+    assert float(small.damping) == pytest.approx(200.0 / 0.2**0.5, rel=1e-15)
+
+
+def test_the_factors_can_be_traced_and_batched():
+    gravity = lambda time: vrw.WheelParams().scaled(time=time).gravity
+    assert float(jax.grad(gravity)(1.0)) == pytest.approx(-2.0 * 9.81)
+    assert vrw.WheelParams().scaled(time=np.array([1.0, 2.0])).gravity.shape == (2,)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), np.array([1.0, -2.0])])
+def test_a_factor_that_is_not_positive_is_refused(value):
+    with pytest.raises(ValueError, match=r"length is .* but a factor of scale is positive"):
+        vrw.WheelParams().scaled(length=value)
