@@ -16,7 +16,7 @@ from vrw_jax.contact import embed_section_states, step_batch_with_jacobian
 from vrw_jax.continuation.arclength import ArclengthOptions
 from vrw_jax.continuation.floquet import bifurcation_margins, floquet_multipliers, jury_margins
 from vrw_jax.cycles import unilateral_finder as on_ground
-from vrw_jax.selection.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
+from vrw_jax.selection.ladder import ModelCode
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)
@@ -123,8 +123,8 @@ def test_a_scan_gives_each_sample_its_simplest_valid_model():
     measures = ("dls_fraction", "period", "slip")
     scan = vrw.scan(design, measures, model="auto")
     assert scan.rung.values.tolist() == [
-        [UNILATERAL_MODEL, VISCOELASTIC_MODEL],
-        [UNILATERAL_MODEL, UNILATERAL_MODEL],
+        [ModelCode.UNILATERAL, ModelCode.VISCOELASTIC],
+        [ModelCode.UNILATERAL, ModelCode.UNILATERAL],
     ]
     paper = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
     np.testing.assert_allclose(scan.period[0, 1], paper.period, atol=1e-9)

@@ -10,8 +10,7 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax.selection.ladder import (
     SELECTION_MARGINS,
-    UNILATERAL_MODEL,
-    VISCOELASTIC_MODEL,
+    ModelCode,
     describe_reason,
 )
 
@@ -20,21 +19,21 @@ START = (0.1, 1.6, -0.1)
 
 def test_the_papers_model_is_chosen_at_sufficient_friction():
     choice = vrw.choose_model(vrw.WheelParams(), START, friction=50.0)
-    assert int(choice.model_code) == VISCOELASTIC_MODEL
+    assert int(choice.model_code) == ModelCode.VISCOELASTIC
     assert isinstance(choice.model, vrw.ViscoelasticWheel)
     assert "margins hold" in choice.why
 
 
 def test_the_unilateral_model_is_chosen_with_a_reason_at_low_friction():
     choice = vrw.choose_model(vrw.WheelParams(), START, friction=0.7)
-    assert int(choice.model_code) == UNILATERAL_MODEL
+    assert int(choice.model_code) == ModelCode.UNILATERAL
     assert isinstance(choice.model, vrw.UnilateralWheel)
     assert "slide" in choice.why
 
 
 def test_a_step_outside_the_papers_sequence_uses_the_unilateral_model():
     choice = vrw.choose_model(vrw.WheelParams(), (0.1, 2.5, -0.1), friction=1e3)
-    assert int(choice.model_code) == UNILATERAL_MODEL
+    assert int(choice.model_code) == ModelCode.UNILATERAL
     assert int(choice.reason_code) == -vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
 
 
@@ -58,10 +57,10 @@ def ladder_steps():
 def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
     *_, step = ladder_steps
     assert step.choice.model_code.tolist() == [
-        VISCOELASTIC_MODEL,
-        UNILATERAL_MODEL,
-        UNILATERAL_MODEL,
-        VISCOELASTIC_MODEL,
+        ModelCode.VISCOELASTIC,
+        ModelCode.UNILATERAL,
+        ModelCode.UNILATERAL,
+        ModelCode.VISCOELASTIC,
     ]
     rows = [describe_reason(int(reason)) for reason in step.choice.reason_code]
     assert ["margins hold" in text for text in rows] == [True, False, False, True]
@@ -75,7 +74,7 @@ def test_a_step_of_the_ladder_equals_that_of_the_chosen_model(ladder_steps):
     n = vrw.WheelParams().n_legs
     for i, rung in enumerate(step.choice.model_code.tolist()):
         params = vrw.WheelParams(damping=damping[i])
-        if rung == VISCOELASTIC_MODEL:
+        if rung == ModelCode.VISCOELASTIC:
             step_result = vrw.step(params, START)
             x = step.section_state[i, jnp.asarray([0, 1, 4 + n])]
             lost_values = step_result.energy.landing + step_result.energy.stopper
@@ -103,8 +102,8 @@ def test_a_walk_returns_to_the_papers_model_when_its_margins_hold_again():
     # A start too fast for the paper's sequence, on ground that holds every foot.
     walk = vrw.walk(vrw.WheelParams(), FAST_START, 12, model=vrw.LadderWheel(friction=math.inf))
     assert int(walk.outcome) == vrw.Outcome.STEPPED
-    assert int(walk.steps.model_code[0]) == UNILATERAL_MODEL
+    assert int(walk.steps.model_code[0]) == ModelCode.UNILATERAL
     assert int(walk.steps.reason_code[0]) == -vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
-    assert int(walk.steps.model_code[-1]) == VISCOELASTIC_MODEL
+    assert int(walk.steps.model_code[-1]) == ModelCode.VISCOELASTIC
     paper = vrw.limit_cycle(vrw.WheelParams())
     np.testing.assert_allclose(walk.steps.section_state[-1, :2], paper.section_state[:2], atol=1e-4)

@@ -12,7 +12,7 @@ import xarray as xr
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.selection.ladder import UNILATERAL_MODEL, VISCOELASTIC_MODEL
+from vrw_jax.selection.ladder import ModelCode
 
 pytestmark = pytest.mark.slow
 
@@ -140,12 +140,12 @@ def test_machine_code_samples_the_motion_of_the_definition() -> None:
 
 
 def test_the_trajectory_of_the_ladder_gives_the_model_of_each_step() -> None:
-    for friction, rung in ((50.0, VISCOELASTIC_MODEL), (0.7, UNILATERAL_MODEL)):
+    for friction, rung in ((50.0, ModelCode.VISCOELASTIC), (0.7, ModelCode.UNILATERAL)):
         ladder = vrw.LadderWheel(friction=friction)
         walk = vrw.simulate(PARAMS, START, 1, model=ladder, n_samples=3)
         assert np.all(walk.rung == rung)
         resting = np.isin(walk.contact.values, (0, 1)).all()
-        assert resting == (rung == VISCOELASTIC_MODEL)
+        assert resting == (rung == ModelCode.VISCOELASTIC)
 
 
 def test_a_failing_step_ends_the_trajectory_with_its_outcome() -> None:

@@ -33,7 +33,7 @@ from vrw_jax.scans.collocation_engine import (
     stack_parameters,
 )
 from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
-from vrw_jax.selection import UNILATERAL_MODEL, VISCOELASTIC_MODEL, find_selection_reason
+from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import RIGID_MODEL_INDEX, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
@@ -155,7 +155,7 @@ class LadderEngine:
             | {name: column for name, column in columns.items() if name != FRICTION_NAME}
         )
         reason = self.find_reasons(paper_results, friction)
-        rung = np.where(reason == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(np.int8)
+        rung = np.where(reason == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL).astype(np.int8)
         names = (*self._measures, "outcome", "spectral_radius")
         results = {
             name: sum((paper_results[part] for part in PAPER_MEASURE_SUMS[name]), start=np.zeros(n))
@@ -163,7 +163,7 @@ class LadderEngine:
             else paper_results[name]
             for name in names
         }
-        unilateral_samples = np.flatnonzero(rung == UNILATERAL_MODEL)
+        unilateral_samples = np.flatnonzero(rung == ModelCode.UNILATERAL)
         if unilateral_samples.size:
             unilateral_results = self._unilateral_engine(
                 {name: column[unilateral_samples] for name, column in columns.items()}

@@ -43,7 +43,7 @@ from vrw_jax.scans.integrity import (
     store_lock,
 )
 from vrw_jax.scans.measure_catalog import canonicalize_name
-from vrw_jax.selection import VISCOELASTIC_MODEL
+from vrw_jax.selection import ModelCode
 from vrw_jax.validation import check_type
 
 if TYPE_CHECKING:
@@ -388,7 +388,7 @@ def _split_legacy_stability_margin(dataset: xr.Dataset) -> xr.Dataset:
     dataset = dataset.assign(spectral_margin=(1.0 - radius).assign_attrs(plain_attrs))
     if kind == "UnilateralWheel":
         return dataset.drop_vars("stability_margin")
-    paper_margin = legacy_margin.where(dataset["rung"] == VISCOELASTIC_MODEL).assign_attrs(
+    paper_margin = legacy_margin.where(dataset["rung"] == ModelCode.VISCOELASTIC).assign_attrs(
         smooth_attrs
     )
     return dataset.assign(stability_margin=paper_margin)

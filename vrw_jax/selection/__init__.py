@@ -3,11 +3,10 @@
 from vrw_jax.selection.ladder import (
     SELECTION_ATTRS,
     SELECTION_MARGINS,
-    UNILATERAL_MODEL,
-    VISCOELASTIC_MODEL,
     LadderStep,
     LadderWheel,
     ModelChoice,
+    ModelCode,
     find_selection_reason,
     refuse_ladder,
 )

@@ -1,5 +1,4 @@
-"""The ladder: a wheel that takes each step by the lowest model whose assumptions hold over the
-step.
+"""The ladder: a wheel that takes each step by the simplest model whose assumptions hold.
 
 The viscoelastic model takes the step and measures its margins. If one is violated, the unilateral
 model takes the step again. Under `vmap` the choice is made per batch element, and an element for
@@ -8,6 +7,7 @@ chosen, because its assumption of rigid legs fails for every finite stiffness.
 """
 
 import dataclasses
+import enum
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -43,8 +43,14 @@ from vrw_jax.numerics import RealInput, Scalar, StepOptions
 from vrw_jax.printing import AbstractPrintable, TextRow
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
 
-RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL = 0, 1, 2
-"""Codes of the models; 0 is the rigid one."""
+
+class ModelCode(enum.IntEnum):
+    """Code of the model that takes a step. Stores hold these numbers."""
+
+    RIGID = 0
+    VISCOELASTIC = 1
+    UNILATERAL = 2
+
 
 SELECTION_MARGINS: dict[str, str] = {
     name: MARGIN_MEASURES[name].violation
@@ -69,7 +75,7 @@ REASON_START_NOT_EMBEDDABLE = 1 + len(SELECTION_MARGINS)
 SELECTION_ATTRS: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
-        "flag_values": [RIGID_MODEL, VISCOELASTIC_MODEL, UNILATERAL_MODEL],
+        "flag_values": [int(code) for code in ModelCode],
         "flag_meanings": " ".join(
             entry.__name__ for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
         ),
@@ -81,7 +87,7 @@ SELECTION_ATTRS: dict[str, dict[str, object]] = {
         f"of {', '.join(SELECTION_MARGINS)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of the variables `model_selection` in data sets."""
+"""Attributes of the variables of `model_selection` in datasets."""
 
 
 class ModelChoice(AbstractPrintable):
@@ -92,8 +98,8 @@ class ModelChoice(AbstractPrintable):
     Leg 1 is loaded or off its stopper at the start. If the viscoelastic step does not reach a
     touchdown, it is minus the outcome.
 
-    - `model_code`: VISCOELASTIC_MODEL or UNILATERAL_MODEL;
-    - `margins`: of `SELECTION_MARGINS`, negative where violated;
+    - `model_code`: a `ModelCode`, VISCOELASTIC or UNILATERAL;
+    - `margins`: of `SELECTION_MARGINS`, negative if violated;
     - `friction`: coefficient of the ground.
 
     Examples:
@@ -131,8 +137,8 @@ class ModelChoice(AbstractPrintable):
 
     @property
     def model(self) -> AbstractWheel:
-        """The chosen model itself, for one wheel."""
-        if int(self.model_code) == VISCOELASTIC_MODEL:
+        """Chosen model, for one wheel."""
+        if int(self.model_code) == ModelCode.VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
@@ -172,7 +178,7 @@ def find_selection_reason(
 
 
 class LadderStep(AbstractContactStep):
-    """One step by the lowest valid model, in the same form for both. Batched under vmap.
+    """One step by the simplest valid model, in the same form for both. Batched under vmap.
 
     - `choice`: the chosen model, and the reason;
     - `section_state`: just before the next landing; zeros if there was none;
@@ -210,8 +216,7 @@ class LadderStep(AbstractContactStep):
 
 
 class LadderWheel(AbstractWheel):
-    """The viscoelastic model where it is valid, and the unilateral model with this `friction`
-    elsewhere.
+    """The viscoelastic model if it is valid, otherwise the unilateral model with `friction`.
 
     Section states are those of `UnilateralWheel`; three-number states of the paper are accepted.
 
@@ -242,7 +247,7 @@ class LadderWheel(AbstractWheel):
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
-        """The upper model."""
+        """Model of the steps for which the viscoelastic model does not hold."""
         return UnilateralWheel(friction=self.friction)
 
     @property
@@ -250,7 +255,7 @@ class LadderWheel(AbstractWheel):
         return self.unilateral_model
 
     def split_ground(self, params: WheelParams, n_steps: int) -> None:
-        """Uneven ground is not for the ladder: its batches of slopes are refused as others are."""
+        """Return None, because the ladder does not support slopes that change."""
         return None
 
     def default_start(self, params: WheelParams) -> FullState:
@@ -271,10 +276,9 @@ class LadderWheel(AbstractWheel):
         """Return the chosen model, and the step of the viscoelastic model."""
         paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         is_embeddable = _is_embeddable(x, params.n_legs)
+        paper_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
         result = paper_model.take_step(
-            params,
-            jnp.where(is_embeddable, _paper_section_state(x, params.n_legs), jnp.nan),
-            options,
+            params, jnp.where(is_embeddable, paper_section_state, jnp.nan), options
         )
         reason_code, margins = find_selection_reason(
             result.measures(), friction - paper_model.friction
@@ -282,14 +286,14 @@ class LadderWheel(AbstractWheel):
         reason_code = jnp.where(is_embeddable, reason_code, REASON_START_NOT_EMBEDDABLE).astype(
             jnp.int32
         )
-        model_code = jnp.where(reason_code == 0, VISCOELASTIC_MODEL, UNILATERAL_MODEL).astype(
-            jnp.int32
-        )
+        model_code = jnp.where(
+            reason_code == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
+        ).astype(jnp.int32)
         return ModelChoice(model_code, reason_code, margins, friction), result
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
         choice, paper_result = self.choose_model(params, x, options)
-        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        uses_paper_model = choice.model_code == ModelCode.VISCOELASTIC
         contact_result = self.unilateral_model.advance(
             params, jnp.where(uses_paper_model, jnp.nan, x), options
         )
@@ -310,7 +314,7 @@ class LadderWheel(AbstractWheel):
 
     def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
         choice, paper_result = self.choose_model(params, x, options)
-        uses_paper_model = choice.model_code == VISCOELASTIC_MODEL
+        uses_paper_model = choice.model_code == ModelCode.VISCOELASTIC
         contact_result: UnilateralStep = self.unilateral_model.take_step(
             params, jnp.where(uses_paper_model, jnp.nan, x), options
         )
@@ -342,19 +346,15 @@ class LadderWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        """Return the motion in the form of the upper model: without slip it equals the paper's
-        motion.
+        """Return the motion in the form of the unilateral model.
+
+        If the viscoelastic model is chosen, no foot slips, and the motion is that of this model.
         """
         choice, _ = self.choose_model(params, x, options)
-        friction = jnp.where(choice.model_code == VISCOELASTIC_MODEL, jnp.inf, self.friction)
+        friction = jnp.where(choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction)
         wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
         trajectory = wheel.sample_step(params, x, options, n_samples)
         return dataclasses.replace(trajectory, model_selection=choice.model_selection())
-
-
-def _paper_section_state(x: FullState, n: int) -> Float[Array, "3"]:
-    """Return (theta-, dtheta-, dL1-) of a full section state."""
-    return jnp.stack([x[0], x[1], x[4 + n]])
 
 
 def _is_embeddable(x: FullState, n: int) -> Bool[Array, ""]:
