@@ -30,7 +30,7 @@ from vrw_jax.cycles.limit_cycle_result import (
     transfer_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES, WITH_DERIVATIVES
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES, DIFFERENTIABLE_STEP_NAMES
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
 from vrw_jax.simulation import validate_arguments
@@ -55,7 +55,7 @@ class CollocationFinder(AbstractGaitFinder):
     options_type: ClassVar[type] = CycleOptions
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(CYCLE_MEASURE_FUNCTIONS)
     readable_measures: ClassVar[tuple[str, ...]] = tuple(
-        dict.fromkeys((*cycle_measures, *WITH_DERIVATIVES, *MARGIN_MEASURES))
+        dict.fromkeys((*cycle_measures, *DIFFERENTIABLE_STEP_NAMES, *MARGIN_MEASURES))
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         n for n in readable_measures if not MEASURES[n].dimension

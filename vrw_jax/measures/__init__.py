@@ -13,7 +13,7 @@ from vrw_jax.measures.table import (
     TRAJECTORY_MEASURES,
     UNILATERAL_DIFFERENTIABLE_NAMES,
     UNILATERAL_STEP_MEASURES,
-    WITH_DERIVATIVES,
+    DIFFERENTIABLE_STEP_NAMES,
     describe_violation,
     flag_attrs,
     get_measure,

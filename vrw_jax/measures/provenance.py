@@ -13,9 +13,7 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 def provenance(
     params: WheelParams, model: object, options: StepOptions
 ) -> dict[str, str | float | int]:
-    """Return the provenance of a result: versions, device, number format,
-    tolerances, parameters.
-    """
+    """Return the origin of a result: versions, device, number format, tolerances, parameters."""
     names = ("vrw-jax", "jax", "diffrax", "numpy")
     values: dict[str, str | float | int] = {
         f"parameter_{name}": float(getattr(params, name))
@@ -25,7 +23,7 @@ def provenance(
     return values | {
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
-        "versions": ", ".join(f"{name} {_version(name)}" for name in names)
+        "versions": ", ".join(f"{name} {_installed_version(name)}" for name in names)
         + f", python {platform.python_version()}",
         "device": jax.devices()[0].device_kind,
         "dtype": str(params.damping.dtype),
@@ -35,8 +33,9 @@ def provenance(
     }
 
 
-@functools.cache  # reading the metadata takes longer than the steps of a walk
-def _version(name: str) -> str:
+@functools.cache  # Reading the metadata takes longer than the steps of a walk.
+def _installed_version(name: str) -> str:
+    """Return the version of an installed library."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:

@@ -13,18 +13,21 @@ import numpy as np
 
 from vrw_jax.printing import format_mathtext
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import PAPER_PHASES as OF_STEP
-from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
+from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A named quantity; `unit` is "1" for a pure number, `equation` is the paper's, "" if there is
-    none.
+    """A named quantity.
 
-    `breaks` is a clause: what happens where it is negative, "" where nothing does. `is_shared`: the
-    steps of every model have it. `is_code`: a whole number without derivatives. `is_ratio`: the
-    mean and not the sum of several steps counts.
+    - `unit`: "1" for a pure number;
+    - `equation`: number of the paper's equation, "" if there is none;
+    - `dimension`: "leg" if there is one value per leg: for margins of each locked leg 3..n, for
+      `CONTACT_MEASURES` of each leg; otherwise "";
+    - `violation`: clause on what happens if the value is negative, "" if nothing does;
+    - `is_shared`: whether the steps of every model have it;
+    - `is_code`: whether it is a whole number without derivatives;
+    - `is_ratio`: whether several steps are summarized by the mean, not by the sum.
     """
 
     name: str
@@ -33,9 +36,7 @@ class Measure:
     long_name: str
     description: str
     equation: str = ""
-    dimension: str = (
-        ""  # "leg": one value for each of the locked legs 3..n, of `CONTACT_MEASURES` for each leg
-    )
+    dimension: str = ""
     violation: str = ""
     is_shared: bool = False
     is_code: bool = False
@@ -43,23 +44,23 @@ class Measure:
 
     @property
     def mathtext(self) -> str:
-        """Symbol as mathtext, without dollar signs."""
+        """Return the symbol as mathtext, without dollar signs."""
         return format_mathtext(self.symbol)
 
     @property
     def label(self) -> str:
-        """Name and symbol."""
+        """Return the name with the symbol."""
         has_symbol = self.symbol in self.long_name
         return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
 
     @property
     def display_unit(self) -> str:
-        """Unit for a reader, "" for a pure number."""
+        """Return the unit for a reader, "" for a pure number."""
         return "" if self.unit == "1" else self.unit
 
     @property
     def attrs(self) -> dict[str, str]:
-        """Attributes of a labeled variable that holds this quantity."""
+        """Return the attributes of a labeled variable that holds this quantity."""
         attrs = {
             "units": self.unit,
             "long_name": self.long_name,
@@ -74,6 +75,7 @@ class Measure:
 
 
 def _make_table(*measures: Measure) -> dict[str, Measure]:
+    """Return the measures by name."""
     table = {measure.name: measure for measure in measures}
     if len(table) != len(measures):
         raise ValueError("Two measures share one name: give each its own.")
@@ -200,15 +202,17 @@ STOPPER_MARGIN_MEASURES = _make_table(
             "Negative where a stopper that only pushes would let an impact throw a leg off.",
             violation="an impact throws a leg off its stopper"),
 )
-"""Margins of a step with unilateral contact whose stoppers hold legs in the air, negative where
+"""Margins of a step with unilateral contact and stoppers that hold legs in the air, negative if
 violated."""
 
 SHARED_STEP_MEASURE_NAMES = tuple(name for name,
     measure in STEP_MEASURES.items() if measure.is_shared)
-"""Measures of `STEP` that every rung tells."""
+"""Names of the `STEP_MEASURES` that the steps of every model have."""
 
-WITH_DERIVATIVES = tuple(name for name, measure in STEP_MEASURES.items() if not measure.is_code)
-"""Measures of `STEP` that have derivatives along a branch of gaits."""
+DIFFERENTIABLE_STEP_NAMES = tuple(
+    name for name, measure in STEP_MEASURES.items() if not measure.is_code
+)
+"""Names of the `STEP_MEASURES` that have derivatives along a branch of gaits."""
 
 UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
     name
@@ -216,7 +220,7 @@ UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
     if (measure.is_shared or name in UNILATERAL_STEP_MEASURES) and not measure.is_code
         and name != "friction"
 )
-"""Measures of a step with unilateral contact that have derivatives."""
+"""Names of the measures of a step with unilateral contact that have derivatives."""
 
 LIMIT_CYCLE_MEASURES = _make_table(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
@@ -303,28 +307,26 @@ MEASURES: dict[str, Measure] = (
 )
 """All quantities by name."""
 
-PHASE_NAMES = tuple(phase.name for phase in OF_STEP)
+PHASE_NAMES = tuple(phase.name for phase in PAPER_PHASES)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
 
 def flag_attrs(names: Iterable[str]) -> dict[str, object]:
-    """Return CF attributes of an integer variable whose values 0, 1, ... have names."""
+    """Return the CF attributes of an integer variable whose values 0, 1, ... have names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
 
 
 def get_measure(name: str) -> Measure:
-    """Return the measure that a number belongs to.
+    """Return the measure with this name.
 
-    The name may end in its leg, as "[5]", and begin with the minus of an upper bound.
+    The name may end with a leg, as "[5]", and begin with the minus of an upper bound.
     """
     return MEASURES[name.removeprefix("-").partition("[")[0]]
 
 
 def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[str, xr.Variable]:
-    """Return labeled measures over one dimension; those of the locked legs have the dimension `leg`
-    too.
-    """
+    """Return labeled measures over one dimension, and over `leg` for those of the locked legs."""
     dims_of = lambda name: (
         (dimension, MEASURES[name].dimension) if MEASURES[name].dimension else dimension
     )
@@ -338,7 +340,7 @@ def locked_leg_coordinate(n_legs: int) -> xr.Variable:
 
 
 def describe_violation(name: str) -> str:
-    """Return the event at which a margin or indicator is zero; `name` may end in its leg, "[5]"."""
+    """Return the event at which a margin or indicator is zero; `name` may end with a leg, "[5]"."""
     base, _, leg = name.partition("[")
     if base in STEP_MEASURES and not MEASURES[base].violation:
         return f"{MEASURES[base].long_name} is zero"
@@ -349,9 +351,7 @@ def describe_violation(name: str) -> str:
 
 
 def measure_attrs(name: str) -> dict[str, object]:
-    """Return the attributes of the variable `name`; phase, contact and outcome include their flag
-    names.
-    """
+    """Return the attributes of the variable `name`, with flag names of codes."""
     attrs: dict[str, object] = dict(MEASURES[name].attrs)
     if name == "phase":
         attrs |= flag_attrs(PHASE_NAMES)
