@@ -172,7 +172,7 @@ def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
     run = lambda: compile_exported(double, (X,), "versions", jax.devices()[0])(X)
     run(), run()
     assert len(traces) == 1
-    monkeypatch.setattr(store, "_versions", lambda: ("diffrax 0.0",))
+    monkeypatch.setattr(store, "_library_versions", lambda: ("diffrax 0.0",))
     run()
     assert len(traces) == 2
 
@@ -232,7 +232,7 @@ def test_a_refused_folder_is_not_jaxs_either(tmp_path):
     before = jax.config.jax_compilation_cache_dir
     tmp_path.chmod(0o777)
     try:
-        with pytest.raises(PermissionError, match="what lies there is executed: run `chmod 700`"):
+        with pytest.raises(PermissionError, match="its files are executed: run `chmod 700`"):
             vrw.start_jax(tmp_path)
         assert jax.config.jax_compilation_cache_dir is None
     finally:

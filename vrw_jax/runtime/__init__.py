@@ -1,4 +1,4 @@
-"""Process-wide runtime: number format, lazily imported libraries, disk cache, compiled programs."""
+"""Start of a process, lazily imported libraries, disk cache, compiled programs."""
 
 from vrw_jax.runtime import disk_cache
 from vrw_jax.runtime.cached_programs import (

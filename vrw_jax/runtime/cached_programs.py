@@ -43,11 +43,10 @@ def compile_exported(
 
 
 def cached_trace(function: Callable, settings: object) -> Callable:
-    """Return `function` without tracing it if its trace is saved; it is called while a program is
-    traced.
+    """Return `function`, called through its saved trace if there is one.
 
-    It is for functions that are neither mapped nor differentiated from outside. As with
-    `compile_exported`, first and later runs use the exported trace.
+    The result is called while a program is traced. `function` must not be mapped or differentiated
+    from outside. As with `compile_exported`, first and later runs use the exported trace.
     """
 
     def call_cached(*arguments: Any) -> Any:
@@ -66,7 +65,10 @@ def cached_lane_program(
     settings: Any,
     max_unrolled: int = simd.MAX_UNROLLED,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """`simd.lane_program` of this library's functions, kept here; `settings` as for `compiled`."""
+    """Return `simd.compile_lane_program` of a function of this library, with a record on disk.
+
+    `settings` is as for `compile_exported`.
+    """
     key = (settings, store.describe_process())
     return simd.compile_lane_program(
         function, scalar_dtypes, n_lanes_in, dtype, key, store, max_unrolled
@@ -79,7 +81,7 @@ def cached_lane_function(
     settings: object,
     max_unrolled: int = simd.MAX_UNROLLED,
 ) -> Callable:
-    """`simd.lane_function` of this library's functions, likewise."""
+    """Return `simd.compile_lane_function` of a function of this library, with a record on disk."""
     return simd.compile_lane_function(
         function, shape_function, (settings, store.describe_process()), store, max_unrolled
     )
@@ -89,7 +91,7 @@ def _export_trace(function: Callable, arguments: tuple, settings: object) -> exp
     """Return the exported trace of `function` for arguments like these, with flat arguments."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
-    # A trace calls the machine code of one processor: others may share the folder.
+    # A trace calls the machine code of one processor, but several may share the folder.
     platform = (jax.default_backend(), simd.describe_processor() if simd.is_available() else None)
     key_parts = (settings, str(structure), shapes, platform, store.describe_process())
     name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
@@ -99,14 +101,13 @@ def _export_trace(function: Callable, arguments: tuple, settings: object) -> exp
         try:
             if simd.ensure_loaded(names.decode().split(), store):
                 return export.deserialize(bytearray(trace))
-        except Exception:  # whatever a foreign library raises for what is no trace
+        except Exception:  # JAX documents no type of the error for content that is no trace.
             store.warn_unusable(f"{name} is no trace")
     flat_function = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
-    token = _is_exporting.set(True)  # cached traces called within are part of this trace
+    token = _is_exporting.set(True)  # Cached traces that are called inside become part of it.
     try:
-        code_names = sorted(
-            _machine_code_names(flat_function.trace(*shapes).jaxpr)
-        )  # traced once: the export below finds it in JAX's cache
+        # The export below finds this trace in JAX's cache.
+        code_names = sorted(_machine_code_names(flat_function.trace(*shapes).jaxpr))
         allowed_checks = [export.DisabledSafetyCheck.custom_call(name) for name in code_names]
         exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(*shapes)
     finally:

@@ -1,8 +1,8 @@
-"""What is computed from code alone, kept on disk beside JAX's compiled code.
+"""Records of traces and machine code on disk, beside JAX's compiled code.
 
-A record is one file. It begins with a digest of its name, which covers all that the content depends
-on, and of the content. Its content is executed, so that records are used only from a folder that
-nobody else can write, unless the user trusts those who can.
+A record is one file. It begins with a digest of its name and its content. The name covers
+everything that the content depends on. The content is executed, so records are used only from a
+folder that nobody else can write, unless the user trusts those who can.
 """
 
 import contextlib
@@ -21,14 +21,13 @@ from typing import Any
 import jax
 
 TRUST_SHARED_VARIABLE = "VRW_TRUST_SHARED_CACHE"
-"""The environment variable that allows a cache which others can write, in child processes too."""
-DIGEST_BYTES = 32
-"""Length of the digest before a record's content: that of SHA-256."""
-TRACED_WITH = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optax", "llvmlite")
+"""Environment variable that allows a cache which others can write, in child processes too."""
+
+TRACE_LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optax", "llvmlite")
 """Libraries whose version a trace depends on."""
 
-SUFFIX = ".record"
-"""End of a record's file name."""
+RECORD_SUFFIX = ".record"
+"""Suffix of a record's file name."""
 
 _warned: set[str] = set()
 """Kinds of warnings that this process has given."""
@@ -36,8 +35,9 @@ _warned: set[str] = set()
 
 @functools.cache
 def source_digest() -> str:
-    """Return a digest of the library's source and tableaus: a change of either may
-    change digits.
+    """Return a digest of the library's source and tableaus.
+
+    A change of either may change digits.
     """
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
@@ -48,20 +48,21 @@ def source_digest() -> str:
 
 
 @functools.cache
-def _versions() -> tuple[str, ...]:
-    told = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
-    for name in TRACED_WITH:
+def _library_versions() -> tuple[str, ...]:
+    """Return the versions of Python and of the installed `TRACE_LIBRARIES`."""
+    versions = [f"python {sys.version_info[0]}.{sys.version_info[1]}"]
+    for name in TRACE_LIBRARIES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            told.append(f"{name} {importlib.metadata.version(name)}")
-    return tuple(told)
+            versions.append(f"{name} {importlib.metadata.version(name)}")
+    return tuple(versions)
 
 
 def describe_process() -> tuple[object, ...]:
-    """Return what every trace depends on: the library's source, versions, number format."""
+    """Return everything that every trace depends on: source, versions, number format."""
     config: Any = jax.config
     return (
         source_digest(),
-        _versions(),
+        _library_versions(),
         jax.dtypes.canonicalize_dtype(float).name,
         config.jax_default_matmul_precision,
         config.jax_numpy_dtype_promotion,
@@ -69,27 +70,27 @@ def describe_process() -> tuple[object, ...]:
 
 
 def cache_folder() -> Any:
-    """JAX's compilation cache; None where there is none, or none that can be trusted."""
-    place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not place or "://" in str(place):  # a bucket, which JAX alone can read
+    """Return the folder of JAX's compilation cache, or None if none is set or it is not trusted."""
+    folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if not folder or "://" in str(folder):  # Only JAX can read a bucket.
         return None
-    refused = refuse_folder(Path(place))
-    if refused:
-        _warn_once("folder", f"{refused}; until then no machine code or trace is kept or used.")
+    refusal = describe_untrusted_folder(Path(folder))
+    if refusal:
+        _warn_once("folder", f"{refusal}; until then no machine code or trace is kept or used.")
         return None
-    return place
+    return folder
 
 
-def refuse_folder(place: Path) -> str:
-    """Return why code kept in that folder is not executed, and what to do; empty if it is."""
+def describe_untrusted_folder(folder: Path) -> str:
+    """Return why code in `folder` is not executed, with a remedy, or "" if it is executed."""
     try:
-        reason = _distrust(place.stat())
+        reason = _describe_distrust(folder.stat())
     except OSError:
-        return ""  # it is not there yet, or can't be read: then nothing is executed either
+        return ""  # It does not exist or cannot be read, so that nothing is executed either.
     if not reason:
         return ""
     return (
-        f"the cache {place} {reason}, but what lies there is executed: run `chmod 700` on a folder "
+        f"the cache {folder} {reason}, but its files are executed: run `chmod 700` on a folder "
         "of your own, give another one, or, if you trust all who can write there, say so by "
         f"start_jax(..., trust_shared=True) or {TRUST_SHARED_VARIABLE}=1"
     )
@@ -100,29 +101,31 @@ def trusts_shared() -> bool:
     return os.environ.get(TRUST_SHARED_VARIABLE, "") not in ("", "0")
 
 
-def make_folder(place: Path) -> None:
-    """Make a folder for code, with its parents: the user's alone, unless caches are shared."""
-    for missing in reversed([place, *place.parents]):
-        if not missing.exists():
-            missing.mkdir(mode=0o777 if trusts_shared() else 0o700, exist_ok=True)
+def make_folder(folder: Path) -> None:
+    """Create a folder for code and its parents, for the user alone unless caches are shared."""
+    for missing_folder in reversed([folder, *folder.parents]):
+        if not missing_folder.exists():
+            missing_folder.mkdir(mode=0o777 if trusts_shared() else 0o700, exist_ok=True)
 
 
 def load_bytes(name: str) -> bytes | None:
-    """Return what was kept under that name beside JAX's compiled code; None if nothing usable."""
-    path = cache_folder() and Path(cache_folder()) / f"{name}{SUFFIX}"
-    if not path or not re.fullmatch(r"\w+", name):  # a name comes from a record too
+    """Return the content of the record with this name, or None if there is no usable one."""
+    path = cache_folder() and Path(cache_folder()) / f"{name}{RECORD_SUFFIX}"
+    if not path or not re.fullmatch(r"\w+", name):  # Some names are read from a record.
         return None
     try:
-        with open(path, "rb", opener=_open_without_waiting) as file:
+        with open(path, "rb", opener=_open_without_blocking) as file:
             status = os.fstat(file.fileno())
-            reason = "is no file" if not stat.S_ISREG(status.st_mode) else _distrust(status)
+            is_file = stat.S_ISREG(status.st_mode)
+            reason = _describe_distrust(status) if is_file else "is no file"
             file_content = b"" if reason else file.read()
     except FileNotFoundError:
         return None
     except OSError as error:
         reason, file_content = f"can't be read ({error.strerror})", b""
-    digest, content = file_content[:DIGEST_BYTES], file_content[DIGEST_BYTES:]
-    if not reason and _digest(name, content) != digest:
+    n_digest = hashlib.sha256().digest_size
+    digest, content = file_content[:n_digest], file_content[n_digest:]
+    if not reason and _record_digest(name, content) != digest:
         reason = "is damaged"
     if reason:
         warn_unusable(f"{path} {reason}")
@@ -130,26 +133,29 @@ def load_bytes(name: str) -> bytes | None:
     return content
 
 
-def warn_unusable(what: str) -> None:
-    """Warn, once in a process, that something of the cache is not used."""
+def warn_unusable(description: str) -> None:
+    """Warn, once per process, that a record of the cache is not used."""
     _warn_once(
-        "record", f"the cached code {what}: it is compiled again, as is any other such file."
+        "record", f"the cached code {description}: it is compiled again, as is any other such file."
     )
 
 
 def save_bytes(name: str, content: bytes) -> None:
-    """Written beside its place, synced and renamed; a cache that can't be written is no error."""
+    """Write a record to a temporary file, sync it and rename it.
+
+    Nothing is raised if the cache cannot be written.
+    """
     if not cache_folder():
         return
-    path, temporary_path = Path(cache_folder()) / f"{name}{SUFFIX}", None
+    path, temporary_path = Path(cache_folder()) / f"{name}{RECORD_SUFFIX}", None
     try:
         make_folder(path.parent)
         handle, temporary_path = tempfile.mkstemp(dir=path.parent, prefix="unfinished_")
         with os.fdopen(handle, "wb") as file:
-            file.write(_digest(name, content) + content)
+            file.write(_record_digest(name, content) + content)
             file.flush()
             os.fsync(file.fileno())
-        if trusts_shared():  # else it stays the user's alone
+        if trusts_shared():  # Otherwise only the user can read it.
             os.chmod(temporary_path, 0o644)
         os.replace(temporary_path, path)
     except OSError:
@@ -157,12 +163,13 @@ def save_bytes(name: str, content: bytes) -> None:
             Path(temporary_path).unlink(missing_ok=True)
 
 
-def _digest(name: str, content: bytes) -> bytes:
+def _record_digest(name: str, content: bytes) -> bytes:
+    """Return the digest of a record's name and content."""
     return hashlib.sha256(name.encode() + b"\n" + content).digest()
 
 
-def _distrust(status: os.stat_result) -> str:
-    """Return why somebody else may have written this; empty if nobody may or all are trusted."""
+def _describe_distrust(status: os.stat_result) -> str:
+    """Return why another user may have written this, or "" if nobody may or all are trusted."""
     if os.name != "posix" or trusts_shared():
         return ""
     if status.st_uid != os.geteuid():
@@ -172,12 +179,13 @@ def _distrust(status: os.stat_result) -> str:
     return ""
 
 
-def _open_without_waiting(path: str, flags: int) -> int:
-    """Open a file as `open` does; a pipe in its place doesn't block."""
+def _open_without_blocking(path: str, flags: int) -> int:
+    """Open a file as `open` does, without blocking on a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _warn_once(kind: str, sentence: str) -> None:
+    """Warn with `sentence` unless this process has given a warning of this kind."""
     if kind not in _warned:
         _warned.add(kind)
         warnings.warn(sentence, stacklevel=3)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 
 class _LazyLibrary:
+    """Library that is imported on the first access to an attribute."""
+
     def __init__(self, name: str) -> None:
         self._name = name
 
@@ -13,11 +15,11 @@ class _LazyLibrary:
 
 
 def lazy_import(name: str) -> Any:
-    """Return that library, imported on the first access to an attribute."""
+    """Return the library `name`, imported on the first access to an attribute."""
     return _LazyLibrary(name)
 
 
 if TYPE_CHECKING:
     import xarray as xarray
 else:
-    xarray = lazy_import("xarray")  # the container of all labeled results
+    xarray = lazy_import("xarray")  # All labeled results are its datasets.
