@@ -1,4 +1,4 @@
-"""How results print themselves."""
+"""Text and tables of results."""
 
 from vrw_jax.printing.text import (
     AbstractPrintable,

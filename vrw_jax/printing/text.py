@@ -16,22 +16,22 @@ TextRow = tuple[str, str]
 
 
 def is_concrete(tree: Any) -> bool:
-    """Return whether all numbers of a module are set and concrete, which is False inside `jit`."""
+    """Return whether all numbers of a module are set and concrete; False inside `jit`."""
     is_known = lambda leaf: eqx.is_array_like(leaf) and not isinstance(leaf, int | jax.core.Tracer)
     is_complete = not any(value is None for value in vars(tree).values())
     return is_complete and all(map(is_known, jax.tree.leaves(tree)))
 
 
 class AbstractPrintable(eqx.Module):
-    """Base class of results that print themselves as text, and as a table in a notebook."""
+    """Base class of results that print as text, and as a table in a notebook."""
 
     @abc.abstractmethod
     def summary_rows(self) -> list[TextRow]:
-        """Return names and texts, one pair per line."""
+        """Return the names and texts to print, one pair per line."""
 
     @property
     def title(self) -> str:
-        """Heading of the printed result."""
+        """Return the heading of the printed result."""
         return type(self).__name__
 
     def __repr__(self) -> str:
@@ -82,7 +82,7 @@ def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> str:
 
 
 def format_text(title: str, rows: Iterable[TextRow]) -> str:
-    """Return a title and indented rows."""
+    """Return a title and indented rows as text."""
     return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])
 
 
@@ -118,13 +118,12 @@ _SYMBOL_PATTERN = re.compile(
 
 
 def format_mathtext(symbol: str) -> str:
-    r"""Return a symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "T_DLS" as T_\mathrm{DLS}, "L1" as
-    L_1.
-    """
+    r"""Return a symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "L1" as L_1."""
     return _SYMBOL_PATTERN.sub(_format_token, unicodedata.normalize("NFD", symbol))
 
 
 def _format_token(match: re.Match[str]) -> str:
+    """Return the mathtext of one match of `_SYMBOL_PATTERN`."""
     token_kind = match.lastgroup or ""
     text = match[token_kind]
     is_roman = token_kind == "word" or re.search("[A-Za-z]{3}", text)

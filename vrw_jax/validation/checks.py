@@ -16,24 +16,24 @@ import numpy as np
 from jax._src import xla_bridge
 from jaxtyping import Array
 
-MAX_WHOLE = 2**63 - 1
-"""Largest whole number, chosen because arrays count by numbers of 64 bits."""
+MAX_INTEGER = np.iinfo(np.int64).max
+"""Largest accepted integer, chosen because arrays use 64-bit indices."""
 
 _state = {"is_forked": False}
-"""Whether this process was forked from one in which JAX already computed."""
+"""Whether this process is a fork of a process in which JAX had made an array."""
 
 
 def _note_fork() -> None:
-    """In a child made by fork: remember whether JAX's threads were left behind."""
+    """Record, in a child made by fork, whether JAX's threads are missing."""
     _state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
+if hasattr(os, "register_at_fork"):  # Windows has no fork.
     os.register_at_fork(after_in_child=_note_fork)
 
 
 def refuse_fork() -> None:
-    """Refuse to compute in a forked child, which lacks JAX's threads and would wait for them."""
+    """Raise a RuntimeError in a forked child, which would wait for JAX's missing threads."""
     if _state["is_forked"]:
         raise RuntimeError(
             "this process was forked after JAX had made an array, and JAX's threads are not copied,"
@@ -49,7 +49,7 @@ def suggest_name(name: object, allowed_names: Iterable[str]) -> str:
 
 
 def check_known_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
-    """Refuse a name that is none of those `allowed`: "'dampng' is no parameter ..."."""
+    """Raise a ValueError unless a name is one of those allowed: "'dampng' is no parameter ..."."""
     if not isinstance(name, str) or name not in allowed_names:
         allowed_text = ", ".join(allowed_names)
         raise ValueError(
@@ -64,7 +64,7 @@ def format_value(value: object) -> str:
         return f"an array of shape {np.shape(value)}"
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # whatever a foreign object raises, or an integer of thousands of digits
+    except Exception:  # A foreign object may raise anything, an integer be too long to print.
         return f"a {type(value).__name__}"
     if len(text) <= 60:
         return text
@@ -72,25 +72,25 @@ def format_value(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is one real number; True and False are none."""
+    """Return whether a value is one real number, which True and False are not."""
     if isinstance(value, int) and not isinstance(value, bool):
-        return True  # of any length
+        return True
     dtype_kind = (
         np.asarray(value).dtype.kind if isinstance(value, float | int | np.generic) else "O"
     )
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value) == 0:
-        dtype_kind = getattr(value.dtype, "kind", "O")  # random keys have a type of JAX's own
+        dtype_kind = getattr(value.dtype, "kind", "O")  # The dtype of random keys has no kind.
     return dtype_kind in "fiu"
 
 
 def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> int:
-    """A whole number of at least `least`; `why` says why so many."""
+    """Return an integer of at least `min_value`; `reason` is a clause that explains this limit."""
     refuse_fork()
     is_number = _is_number(value) and not isinstance(value, jax.core.Tracer)
     is_whole = is_number and (isinstance(value, int) or np.asarray(value).dtype.kind in "iu")
-    if is_whole and int(value) > MAX_WHOLE:
+    if is_whole and int(value) > MAX_INTEGER:
         raise ValueError(
-            f"{name} is {format_value(value)}, but it must be at most {MAX_WHOLE:,}: give a "
+            f"{name} is {format_value(value)}, but it must be at most {MAX_INTEGER:,}: give a "
             f"smaller one."
         )
     if not is_whole or int(value) < min_value:
@@ -103,7 +103,7 @@ def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> in
 
 
 def check_real(name: str, value: Any) -> float:
-    """One finite number."""
+    """Return one finite number as a float."""
     refuse_fork()
     if not _is_number(value) or isinstance(value, jax.core.Tracer):
         raise TypeError(
@@ -111,7 +111,7 @@ def check_real(name: str, value: Any) -> float:
         )
     try:
         number = float(value)
-    except OverflowError:  # an integer of hundreds of digits
+    except OverflowError:  # An integer of hundreds of digits exceeds the largest float.
         number = math.inf
     if not math.isfinite(number):
         raise ValueError(f"{name} is {format_value(value)}, but it must be finite: give a number.")
@@ -119,7 +119,7 @@ def check_real(name: str, value: Any) -> float:
 
 
 def check_positive(name: str, value: Any) -> float:
-    """Return one number above zero."""
+    """Return one positive number as a float."""
     if not check_real(name, value) > 0.0:
         raise ValueError(
             f"{name} is {float(value):g}, but it must be positive: give a number above 0."
@@ -128,7 +128,7 @@ def check_positive(name: str, value: Any) -> float:
 
 
 def check_range(name: str, bounds: Any) -> tuple[float, float]:
-    """Return two numbers, the lower first."""
+    """Return a lower and an upper bound as floats."""
     try:
         low, high = bounds
     except (TypeError, ValueError):
@@ -148,14 +148,17 @@ def check_range(name: str, bounds: Any) -> tuple[float, float]:
 
 
 def check_reals(name: str, value: Any, advice: str = "give a number, or an array of them") -> Array:
-    """Real numbers of any shape as a strongly typed array; Python's take JAX's default type."""
+    """Return real numbers of any shape as a strongly typed array.
+
+    Python's numbers get JAX's default type.
+    """
     refuse_fork()
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
-    except Exception:  # whatever a foreign object raises
-        _check_device()  # the first array of a process finds out what it may run on
+    except Exception:  # A foreign object may raise anything.
+        _check_device()  # The first array of a process may fail because there is no device.
         array = None
     if array is None or not (
         jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
@@ -169,7 +172,7 @@ def check_reals(name: str, value: Any, advice: str = "give a number, or an array
 def check_numpy_reals(
     name: str, value: Any, advice: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """`reals` where numbers are known, as numpy holds them: JAX need not see what is sound."""
+    """Return known real numbers as a NumPy array; a valid array is returned as it is."""
     refuse_fork()
     if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
         return value
@@ -180,7 +183,7 @@ def _check_device() -> None:
     """Raise an OSError if JAX finds no device."""
     try:
         jax.devices()
-    except (RuntimeError, AssertionError) as error:  # a plugin without its device asserts
+    except (RuntimeError, AssertionError) as error:  # A plugin asserts if its device is missing.
         requested = os.environ.get("JAX_PLATFORMS")
         raise OSError(
             f"JAX_PLATFORMS is {requested!r}, but JAX finds no device of that kind: unset it, "
@@ -190,7 +193,7 @@ def _check_device() -> None:
 
 
 def check_bool(name: str, value: Any) -> bool:
-    """True or False."""
+    """Return a Python bool."""
     refuse_fork()
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} is {format_value(value)}, but it is a choice: give True or False.")
@@ -198,7 +201,7 @@ def check_bool(name: str, value: Any) -> bool:
 
 
 def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
-    """One of several words."""
+    """Return one of several words."""
     refuse_fork()
     if not isinstance(value, str):
         raise TypeError(
@@ -213,11 +216,11 @@ def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
 
 
 def check_names(name: str, value: Any, such_as: str = '"dls_fraction"') -> tuple[str, ...]:
-    """Several names; one alone may be given as it is."""
+    """Return several names as a tuple; a single name may be given as a string."""
     refuse_fork()
     try:
         values = (value,) if isinstance(value, str) else tuple(value)
-    except Exception:  # no collection, an array without axes, an unknown number
+    except Exception:  # The value is no collection, an array without axes, or a tracer.
         values = (None,)
     if not all(isinstance(name, str) for name in values):
         raise TypeError(f"{name} is {format_value(value)}, but it holds names: write [{such_as}].")
@@ -225,7 +228,7 @@ def check_names(name: str, value: Any, such_as: str = '"dls_fraction"') -> tuple
 
 
 def check_type(name: str, value: Any, expected_type: type | tuple[type, ...], advice: str) -> None:
-    """Refuse what is not of this kind."""
+    """Raise a TypeError unless a value has the expected type."""
     refuse_fork()
     if not isinstance(value, expected_type):
         type_name = (
@@ -246,12 +249,12 @@ def check_callable(name: str, value: Any, description: str) -> None:
 
 
 def is_traced(*trees: Any) -> bool:
-    """Return whether some number is a tracer, as inside `jit`, `vmap` or `grad`."""
+    """Return whether any leaf is a tracer, as inside `jit`, `vmap` or `grad`."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def check_not_traced(function: str, alternative: str, *trees: Any) -> None:
-    """Refuse to run inside `jit`, `vmap` or `grad`, for what runs on the host."""
+    """Raise a TypeError inside `jit`, `vmap` or `grad`, for a function that runs on the host."""
     refuse_fork()
     if is_traced(*trees):
         raise TypeError(
