@@ -30,7 +30,7 @@ from vrw_jax.cycles.limit_cycle_result import (
     transfer_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES, DIFFERENTIABLE_STEP_NAMES
+from vrw_jax.measures import DIFFERENTIABLE_STEP_NAMES, MARGIN_MEASURES, MEASURES
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
 from vrw_jax.simulation import validate_arguments

@@ -25,7 +25,7 @@ from vrw_jax.cycles.finder import (
     value_and_tangents,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import SHARED_STEP_MEASURE_NAMES, DIFFERENTIABLE_STEP_NAMES
+from vrw_jax.measures import DIFFERENTIABLE_STEP_NAMES, SHARED_STEP_MEASURE_NAMES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
 from vrw_jax.printing import TextRow, format_numbers
@@ -214,7 +214,10 @@ class ReturnMapFinder(AbstractReturnMapFinder):
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         dict.fromkeys(
-            (*cycle_measures, *(n for n in SHARED_STEP_MEASURE_NAMES if n in DIFFERENTIABLE_STEP_NAMES))
+            (
+                *cycle_measures,
+                *(n for n in SHARED_STEP_MEASURE_NAMES if n in DIFFERENTIABLE_STEP_NAMES),
+            )
         )
     )
     default_measures: ClassVar[tuple[str, ...]] = tuple(

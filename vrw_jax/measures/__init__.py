@@ -3,6 +3,7 @@
 from vrw_jax.measures.provenance import provenance
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
+    DIFFERENTIABLE_STEP_NAMES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     MEASURES,
@@ -13,7 +14,6 @@ from vrw_jax.measures.table import (
     TRAJECTORY_MEASURES,
     UNILATERAL_DIFFERENTIABLE_NAMES,
     UNILATERAL_STEP_MEASURES,
-    DIFFERENTIABLE_STEP_NAMES,
     describe_violation,
     flag_attrs,
     get_measure,
