@@ -68,12 +68,14 @@ def test_a_style_ends_with_its_figure():
 
 def test_special_points_in_confusable_colors_share_no_dash():
     names = {
-        color: [name for name in style.BORDER_NAMES_BY_COLOR[color] if name]
-        for color in style.BORDER_NAMES_BY_COLOR
+        color: [name for name in style.SPECIAL_POINT_NAMES_BY_COLOR[color] if name]
+        for color in style.SPECIAL_POINT_NAMES_BY_COLOR
     }
-    dashes = lambda color: {style.select_border_style(name)[1] for name in names[color]}
+    dashes = lambda color: {style.select_special_point_style(name)[1] for name in names[color]}
     assert not dashes(style.GREEN) & dashes(style.PINK)
     looks = [
-        style.select_border_style(name) for own_values in names.values() for name in own_values
+        style.select_special_point_style(name)
+        for own_values in names.values()
+        for name in own_values
     ]
     assert len(set(looks)) == len(looks)

@@ -29,10 +29,14 @@ from vrw_jax.simulation import PRE_TOUCHDOWN_NAMES
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
-BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE = PINK, (0, (1, 1.2))
+BRANCH_END_COLOR = PINK
+"""Color of the end of a branch, chosen because no curve has it."""
+
+SPECIAL_POINT_LINE_STYLE = (0, (1, 1.2))
+"""Dotted line of a special point, chosen because no curve has it."""
+
 SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": GREEN}
-"""Colors of special points by kind; black for a change of stability, `BRANCH_END_COLOR` for the end
-of a branch. Neither the colors nor the dots are those of a curve."""
+"""Colors of special points by kind; those of other kinds, which change the stability, are black."""
 
 COMMON_PANELS = (
     ("DLS fraction", {"dls_fraction": LEG_1_COLOR}),
@@ -108,27 +112,24 @@ def branch_figure(branch: Branch) -> Figure:
         axes.set_ylabel(label)
     panels[0, 1].axhline(1.0, color=DARK_GRAY, linewidth=0.5)
     panels[0, 1].set_ylim(0.0, None)
+    force_axes, clearance_axes = panels[1]
     if has_indicators:
-        _finish_indicator_panels(panels[1], 1e3 * data.clearance_sls1.values)
+        for axes in (force_axes, clearance_axes):
+            axes.axhline(0.0, color=DARK_GRAY, linewidth=0.5)
+        for name, color in PAPER_PANELS[2][1].items():
+            force_axes.plot([], [], color=color, label=f"${MEASURES[name].mathtext}$")
+        force_axes.legend(loc="center left")
+        clearance = 1e3 * data.clearance_sls1.values
+        clearance_axes.set_yscale("symlog", linthresh=0.1)
+        clearance_axes.set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
     for axes in panels[1]:
         axes.set_xlabel(format_axis_label(branch.parameter))
     _add_legend(figure, special_points, branch.parameter)
     return figure
 
 
-def _finish_indicator_panels(panels: np.ndarray, clearance: np.ndarray) -> None:
-    """Draw zero lines, legend and scale of the panels of the paper's model; clearance in mm."""
-    for axes in panels:
-        axes.axhline(0.0, color=DARK_GRAY, linewidth=0.5)
-    for name, color in PAPER_PANELS[2][1].items():
-        panels[0].plot([], [], color=color, label=f"${MEASURES[name].mathtext}$")
-    panels[0].legend(loc="center left")
-    panels[1].set_yscale("symlog", linthresh=0.1)
-    panels[1].set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
-
-
 def _break_at_jumps(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values, for a clearance with a gap where it jumps because a dip vanishes."""
+    """Return the values; those of a clearance have a gap where it jumps because a dip vanishes."""
     if name.startswith("clearance"):
         values = values.copy()
         values[1:][values[:-1] * values[1:] < 0.0] = np.nan
@@ -229,7 +230,12 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
             draw_outcome_cells(
                 axes, result[x].values, result[y].values, result.outcome.values, codes
             )
-        _mark_orbits(axes, result, x, y)
+        if {x, y} <= set(PRE_TOUCHDOWN_NAMES):
+            states = result.orbit_state.values.reshape(-1, len(PRE_TOUCHDOWN_NAMES))
+            shown_columns = [PRE_TOUCHDOWN_NAMES.index(x), PRE_TOUCHDOWN_NAMES.index(y)]
+            axes.plot(
+                *states[:, shown_columns].T, "+", color=YELLOW, markersize=7.0, markeredgewidth=1.6
+            )
         axes.set_title(title)
         axes.set_xlabel(format_axis_label(x, "{symbol}"))
     panels[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
@@ -240,12 +246,3 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         handles=make_outcome_patches(codes), loc="outside lower center", ncols=4, fontsize=7.5
     )
     return figure
-
-
-def _mark_orbits(axes: Axes, result: xr.Dataset, x: str, y: str) -> None:
-    """Draw crosses at the section states of the gaits if the plane is one of section states."""
-    if not {x, y} <= set(PRE_TOUCHDOWN_NAMES):
-        return
-    columns = [PRE_TOUCHDOWN_NAMES.index(x), PRE_TOUCHDOWN_NAMES.index(y)]
-    orbit_states = result.orbit_state.values.reshape(-1, len(PRE_TOUCHDOWN_NAMES))[:, columns]
-    axes.plot(*orbit_states.T, "+", color=YELLOW, markersize=7.0, markeredgewidth=1.6)

@@ -1,4 +1,4 @@
-"""Figures of scans: DLS fraction, speed and outcome over parameters, with borders of gaits."""
+"""Figures of scans: DLS fraction, speed and outcome over parameters, with zeros of margins."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -27,8 +27,8 @@ from vrw_jax.figures.style import (
     format_value_label,
     make_outcome_patches,
     require_variables,
-    select_border_style,
     select_outcome_style,
+    select_special_point_style,
     typeset_symbols,
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, describe_violation
@@ -51,8 +51,14 @@ DRAWN_MARGINS = (
 )  # fmt: skip
 """Margins whose zero lines are drawn."""
 
-MAX_COLUMNS, MAX_PAIRED_PARAMETERS, MAX_DRAWN_SAMPLES = 4, 6, 20_000
-"""Largest numbers of columns, of parameters in pairs, and of drawn samples."""
+MAX_COLUMNS = 4
+"""Largest number of columns of panels, chosen because more leave no space for labels."""
+
+MAX_PAIRED_PARAMETERS = 6
+"""Largest number of parameters shown in pairs, chosen because more leave no space for labels."""
+
+MAX_DRAWN_SAMPLES = 20_000
+"""Largest number of samples drawn in pairs, chosen because more cover each other."""
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
@@ -94,9 +100,9 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 
 @figure_style()
 def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None) -> Figure:
-    """Return a figure over (x, y), with one column for each value of the parameter `across`.
+    """Return a figure over (x, y), with one column per value of `column_parameter`.
 
-    It shows DLS fraction, speed and outcome. Other axes are cut at their middle value, which is in
+    It shows DLS fraction, speed and outcome. Other parameters have their middle value, which is in
     the title. Gray cells have no gait.
     """
     cut_indices = {n: scan.sizes[n] // 2 for n in SWEEPABLE_PARAMETERS if n in scan.dims}
@@ -183,8 +189,8 @@ def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """Return a figure of samples over each pair of parameters.
 
     It shows the DLS fraction below the diagonal and the outcome above it. The diagonal shows the
-    share of samples with a stable cycle. Of a large design only the first `MAX_DRAWN_SAMPLES`
-    samples are drawn, which are as evenly spread as all.
+    share of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn; they
+    are as evenly spread as all.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     value = next(iter(_shown_measures(scan)), None)
@@ -221,7 +227,7 @@ def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 def _draw_values(
     axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, size: float
 ) -> PathCollection:
-    """Draw samples in the colors of a measure, and in gray if they have no gait."""
+    """Draw samples in the colors of a measure, or in gray if they have no gait."""
     dot_style: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
     has_gait, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
     low, high = _find_color_limits([values], [_outcome_codes(scan).values == Outcome.STEPPED])
@@ -306,7 +312,7 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 
 @figure_style()
 def draw_curves(scan: xr.Dataset, x: str) -> Figure:
-    """Return a figure of DLS fraction and speed along one parameter; gray without a gait."""
+    """Return a figure of DLS fraction and speed along one parameter; gray cells have no gait."""
     scan = scan.isel({n: 0 for n in SWEEPABLE_PARAMETERS if n in scan.dims and n != x}).sortby(x)
     rows = _shown_measures(scan) or ["fore_foot_force"]
     figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 1.6 * len(rows) + 0.6))
@@ -330,9 +336,9 @@ def _shown_measures(scan: xr.Dataset) -> list[str]:
 def _find_color_limits(
     values: Sequence[np.ndarray], is_stable: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the color range of a row of panels: the range of stable gaits, if there are any.
+    """Return the color range of a row of panels: the range of stable gaits if there are any.
 
-    A few distant unstable gaits would otherwise leave all others in one color.
+    A few distant unstable gaits would otherwise give all others the same color.
     """
     finite_values = [value[np.isfinite(value)] for value in values]
     stable_values = [v[s & np.isfinite(v)] for v, s in zip(values, is_stable, strict=True)]
@@ -377,7 +383,7 @@ def _draw_cells(
         vmax=limits[1],
     )
     mesh.set_rasterized(True)
-    return mesh  # type: ignore[return-value]  # a color bar accepts it
+    return mesh  # type: ignore[return-value]  # A color bar accepts it.
 
 
 def _find_cell_edges(positions: np.ndarray) -> np.ndarray:
@@ -393,7 +399,7 @@ def _find_cell_edges(positions: np.ndarray) -> np.ndarray:
 
 
 def _outcome_codes(scan: xr.Dataset) -> xr.DataArray:
-    """Return the outcomes, with a code of their own for unstable cycles if these are known."""
+    """Return the outcomes, with `UNSTABLE_CODE` for unstable cycles if multipliers are known."""
     codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
         return codes
@@ -410,12 +416,12 @@ def _draw_margin_zeros(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str
         if MARGIN_MEASURES[name].dimension:
             margin = margin.min("leg")
         if name == "clearance_sls1" and "takeoff_acceleration" in scan:
-            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # avoids steps in the line
+            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # The line gets no steps.
         values = margin.transpose(y, x).values
         finite_values = values[np.isfinite(values)]
         if not len(finite_values) or finite_values.min() >= 0.0 or finite_values.max() <= 0.0:
             continue
-        color, line = select_border_style(name)
+        color, line = select_special_point_style(name)
         axes.contour(
             scan[x].values, scan[y].values, np.ma.masked_invalid(values), levels=[0.0],
             colors=[color], linestyles=[line], linewidths=1.4,
@@ -473,10 +479,10 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     names = sorted({curve.name for curve in curves})
     labels = {name: typeset_symbols(describe_violation(name)) for name in names}
     for curve in curves:
-        color, dash = select_border_style(curve.name)
+        color, dash = select_special_point_style(curve.name)
         is_stable = curve.dataset.spectral_radius.values < 1.0
         for is_drawn, width in ((is_stable, 1.2), (~is_stable, 0.5)):
-            # The next piece contributes one point; a curve of several pieces has one legend entry.
+            # Each piece includes the first point of the next; the curve has one legend entry.
             is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
             points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
             label = labels.pop(curve.name, None) if is_drawn.any() else None

@@ -1,4 +1,4 @@
-"""Style of all figures: journal widths, colors for every eye, vector output, labels with units.
+"""Style of all figures: journal widths, distinguishable colors, vector output, labels with units.
 
 Figures are created inside `figure_style()` and written by `save`. No global setting of
 matplotlib changes, and no window opens.
@@ -24,16 +24,24 @@ from vrw_jax.printing import format_mathtext
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
-BLUE, ORANGE, GREEN, PINK, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
-AMBER, YELLOW = "#E69F00", "#F0E442"
-"""Colors of Okabe and Ito."""
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+PINK = "#CC79A7"
+SKY = "#56B4E9"
+AMBER = "#E69F00"
+YELLOW = "#F0E442"
+"""The last of the colors of Okabe and Ito, which color-blind readers can distinguish."""
 
-LEG_1_COLOR, LEG_2_COLOR, DARK_GRAY, LIGHT_GRAY = BLUE, ORANGE, "#555555", "#E9E9E9"
-"""Colors of the two legs, and two grays."""
+LEG_1_COLOR = BLUE
+LEG_2_COLOR = ORANGE
+DARK_GRAY = "#555555"
+LIGHT_GRAY = "#E9E9E9"
+"""Color of areas without a gait, and of double support."""
 
 MATPLOTLIB_STYLE: dict[Any, Any] = {
     "font.family": "serif",
-    "font.serif": ["STIXGeneral"],  # included in matplotlib
+    "font.serif": ["STIXGeneral"],
     "mathtext.fontset": "stix",
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -54,12 +62,15 @@ MATPLOTLIB_STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, PINK, SKY]),
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
-    "svg.hashsalt": "vrw_jax",  # makes the same figure the same file
+    "svg.hashsalt": "vrw_jax",  # The same figure gives the same file.
 }
-"""Settings of matplotlib: a serif font as in the journal, without fonts of the system."""
+"""Settings of matplotlib, with a serif font as in the journal that matplotlib includes."""
 
-COLUMN_WIDTH_INCHES, PAGE_WIDTH_INCHES = 3.4, 6.9
-"""Widths of one column and of the page, in inches."""
+COLUMN_WIDTH_INCHES = 3.4
+"""Width of a figure in one column, chosen as the column width of the journal."""
+
+PAGE_WIDTH_INCHES = 6.9
+"""Width of a figure over the page, chosen as the text width of the journal."""
 
 OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
     Outcome.STEPPED: ("stable limit cycle", BLUE),
@@ -81,9 +92,11 @@ OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
 }
 """Label and color of each outcome."""
-LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
-"""Line styles of special points, of which `BORDER_NAMES_BY_COLOR` gives the index."""
-BORDER_NAMES_BY_COLOR = {
+
+SPECIAL_POINT_LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+"""Line styles of curves of special points; `SPECIAL_POINT_NAMES_BY_COLOR` gives the index."""
+
+SPECIAL_POINT_NAMES_BY_COLOR = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
     BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
     GREEN: ("clearance_sls1", "clearance_sls2", "", "", "", "takeoff_acceleration"),
@@ -96,11 +109,13 @@ BORDER_NAMES_BY_COLOR = {
     ),
 }  # fmt: skip
 """Names of special points by color; the index of a name gives its line style, the same in every
-figure. Green and pink, which some eyes cannot distinguish, share no line style."""
+figure. Green and pink, which color-blind readers may confuse, share no line style."""
+
 NOT_COMPUTED_STYLE = ("not computed", "#FFFFFF")
 """Label and color of a sample that is not computed."""
+
 UNSTABLE_CODE = 100
-"""Code of a cycle whose spectral radius is 1 or more, in addition to the codes of `Outcome`."""
+"""Code of a cycle whose spectral radius is 1 or more, chosen above all codes of `Outcome`."""
 
 
 @contextmanager
@@ -162,7 +177,7 @@ def require_variables(name: str, data: Any, needed_names: Sequence[str], advice:
 def require_variables_of_all(
     name: str, datasets: Any, needed_names: Sequence[str], advice: str
 ) -> None:
-    """Raise unless `several` is a nonempty list of datasets that hold the needed variables."""
+    """Raise unless `datasets` is a nonempty list of datasets that hold the needed variables."""
     check_type(name, datasets, (list, tuple), f"{advice}, several in a list")
     if not datasets:
         raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
@@ -181,7 +196,10 @@ def _format_unit(name: str) -> str:
 
 
 def format_axis_label(name: str, form: str = "{name} {symbol}") -> str:
-    """Return the label of a quantity, formatted by `form`, with its unit; keep an unknown name."""
+    """Return the label of a quantity with its unit, formatted by `form`.
+
+    An unknown name is returned as it is.
+    """
     if name not in MEASURES:
         return name
     measure = MEASURES[name]
@@ -213,13 +231,14 @@ def draw_marks(
     axes.plot(x, y, marker, color=color, markerfacecolor=fill, **marker_style)
 
 
-def select_border_style(name: str) -> tuple[str, Any]:
+def select_special_point_style(name: str) -> tuple[str, Any]:
     """Return color and line style of a special point; those of locked legs differ by leg."""
-    for color, names in BORDER_NAMES_BY_COLOR.items():
+    for color, names in SPECIAL_POINT_NAMES_BY_COLOR.items():
         if name in names:
-            return color, LINE_STYLES[names.index(name)]
+            return color, SPECIAL_POINT_LINE_STYLES[names.index(name)]
     leg = name.partition("[")[2]
-    return SKY, LINE_STYLES[(int(leg[:-1]) - 3 if leg else len(name)) % len(LINE_STYLES)]
+    style_index = int(leg[:-1]) - 3 if leg else len(name)
+    return SKY, SPECIAL_POINT_LINE_STYLES[style_index % len(SPECIAL_POINT_LINE_STYLES)]
 
 
 def select_outcome_style(code: int) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Figures of tuning: the path, and the slack of every constraint at its start and end."""
+"""Figure of a tuning run: its path, and the slack of each constraint at its start and end."""
 
 import numpy as np
 import xarray as xr
@@ -20,9 +20,6 @@ from vrw_jax.figures.style import (
 from vrw_jax.measures import MEASURES
 from vrw_jax.tuning import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneResult
 from vrw_jax.validation import check_type
-
-ROW_HEIGHT_INCHES = 0.19
-"""Height of the row of a constraint, in inches."""
 
 
 @figure_style()
@@ -46,7 +43,8 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path
     n = path.sizes["constraint"]
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, max(3.2, ROW_HEIGHT_INCHES * n + 1.0)))
+    height_inches = max(3.2, 0.19 * n + 1.0)  # One row of text per constraint.
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, height_inches))
     panels = figure.subplot_mosaic(
         [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
     )

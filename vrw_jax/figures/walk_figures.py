@@ -50,7 +50,7 @@ def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
 
 
 def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
-    """Return time and variables with a gap at each landing, where the labels of the legs change."""
+    """Return time and variables with a gap at each landing, at which the legs are relabeled."""
     cuts = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
 
@@ -289,8 +289,8 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
             `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
             `parameter_slope` is the slope in rad.
-        every: parameter values that are multiples of it have symbols, and so have both
-            ends.
+        every: parameter values that are multiples of it have symbols, as have the first and the
+            last.
 
     Returns:
         Figure: the impulse and the two forces over the parameter.
@@ -304,7 +304,10 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> figure = vrw.plot.indicators(gaits)
     """
     require_variables(
-        "gaits", gaits, ("settled", "lambda_I4"), "give gaits over one parameter, as its page tells"
+        "gaits",
+        gaits,
+        ("settled", "lambda_I4"),
+        "give gaits over one parameter, as in the example of vrw.plot.indicators",
     )
     vary = str(gaits.settled.dims[0])
     valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
@@ -332,7 +335,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         axes.set_xlabel(format_axis_label(vary, "{symbol}"))
         axes.set_ylabel(axis_text)
         axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
-    slope = gaits.attrs["parameter_slope"]  # the slope in the caption of the paper is a misprint
+    slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
     panels[0].text(0.02, 0.05, format_value_label("slope", slope), transform=panels[0].transAxes)
     return figure
 
