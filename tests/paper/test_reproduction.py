@@ -89,7 +89,7 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     monkeypatch.setattr(reproduce, "draw_figures", lambda evidence, folder: [])
     monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
-    assert result.exit_code == cli.FACT_FAILED_EXIT_CODE
+    assert result.exit_code == cli.ExitCode.CHECK_FAILED
     table = facts.compute_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
     assert "26 that the paper publishes, 28 by independent code" in " ".join(result.output.split())

@@ -1,7 +1,7 @@
 """The command line: walk a wheel, reproduce the paper, scan parameters.
 
-Slow imports are made inside commands, so that help appears at once. A user's mistake is reported in
-one sentence on stderr, with exit code 2.
+Slow imports are inside commands, so that help appears at once. A user's mistake is reported in one
+sentence on stderr, with exit code 2.
 """
 
 import gc
@@ -19,7 +19,7 @@ import typer
 from vrw_jax.cli import console as printing
 from vrw_jax.cli import scanning
 from vrw_jax.cli.console import (
-    INTERRUPTED_EXIT_CODE,
+    ExitCode,
     print_error,
     report_errors,
     show_warnings_as_sentences,
@@ -30,11 +30,8 @@ from vrw_jax.cli.console import (
 if TYPE_CHECKING:
     from vrw_jax.cli.config import Config
 
-FACT_FAILED_EXIT_CODE, NOT_CONVERGED_EXIT_CODE = 1, 1
-"""Exit codes of a failed fact and of a run that did not converge."""
-
-MAX_GIVEN = 10**9
-"""Largest whole number on a command line, chosen because a scan takes no more samples."""
+MAX_OPTION_INTEGER = 10**9
+"""Largest integer of an option, chosen because a scan takes no more samples."""
 
 FolderOption = Annotated[
     Path | None,
@@ -58,26 +55,26 @@ def main() -> None:
     # Traces consist of many small, long-lived objects. With Python's default thresholds the garbage
     # collector takes a tenth of a cold start.
     gc.set_threshold(200_000, 20, 20)
-    signal.signal(signal.SIGINT, _stop)
+    signal.signal(signal.SIGINT, _interrupt_command)
     show_warnings_as_sentences()
-    with printing.whole_output():
+    with printing.report_output_errors():
         app()
 
 
-def _stop(_signal: int, _frame: object) -> None:
+def _interrupt_command(_signal: int, _frame: object) -> None:
     """Handle the first Ctrl-C: end the command in order, and let a second one end it at once."""
-    signal.signal(signal.SIGINT, _stop_at_once)
+    signal.signal(signal.SIGINT, _end_process)
     raise KeyboardInterrupt
 
 
-def _stop_at_once(_signal: int, _frame: object) -> None:
+def _end_process(_signal: int, _frame: object) -> None:
     """Handle the second Ctrl-C: end the process at once."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
-    os._exit(INTERRUPTED_EXIT_CODE)
+    os._exit(ExitCode.INTERRUPTED)
 
 
 def _print_version(is_wanted: bool) -> None:
-    """Print the version and exit, if wanted."""
+    """Print the version and exit if `--version` is given."""
     if is_wanted:
         try:
             number = importlib.metadata.version("vrw-jax")
@@ -132,7 +129,9 @@ def gait(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter; may be repeated."),
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, max=MAX_GIVEN, help="Steps to walk.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=MAX_OPTION_INTEGER, help="Steps to walk.")
+    ] = None,
 ) -> None:
     """Walk a wheel and print its gait: durations, speed, indicators and margins.
 
@@ -209,7 +208,8 @@ def init(
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
     with report_errors():
-        source = _find_example_configs()
+        package = Path(__file__).parents[1]  # An installed package includes the configs.
+        source = next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
         texts = {path.name: path.read_text(encoding="utf-8") for path in source.glob("*.toml")}
         existing = [folder / name for name in sorted(texts) if (folder / name).exists()]
         for path in existing:
@@ -223,12 +223,6 @@ def init(
         printing.print_written_paths(missing)
         if not missing:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
-
-
-def _find_example_configs() -> Path:
-    """Return the folder of the example configs, inside an installed package or beside it."""
-    package = Path(__file__).parents[1]
-    return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
 
 
 def _require_writable(folder: Path) -> None:
@@ -277,7 +271,7 @@ def reproduce(
     with report_errors():
         printing.print_facts(facts, folder)
     if not all(fact.holds for fact in facts):
-        raise typer.Exit(FACT_FAILED_EXIT_CODE)
+        raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
 @app.command()
@@ -295,7 +289,9 @@ def scan(
     ] = False,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, max=MAX_GIVEN, help="Most samples that are written at a time."),
+        typer.Option(
+            min=1, max=MAX_OPTION_INTEGER, help="Most samples that are written at a time."
+        ),
     ] = None,
     dask: Annotated[
         str | None,
@@ -416,7 +412,7 @@ def tune(
         printing.print_written_paths(write_tuning(result, folder, picture))
     if not result.converged:
         print_error(f"this is no optimum ({result.status.name}): what was reached is written.")
-        raise typer.Exit(NOT_CONVERGED_EXIT_CODE)
+        raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
 @app.command("continue")
@@ -465,7 +461,7 @@ def continue_(
                 f"there is no gait to start from ({branch.outcome.name}: "
                 f"{branch.outcome.meaning[:-1]}): give a wheel that walks, such as that of Table 1."
             )
-            raise typer.Exit(NOT_CONVERGED_EXIT_CODE)
+            raise typer.Exit(ExitCode.CHECK_FAILED)
         stdout_console.print(str(branch), highlight=False, markup=False)
         printing.print_written_paths(write_branch(branch, folder, picture))
 
@@ -482,7 +478,7 @@ def _load_config(path: Path | None) -> "Config":
 
 
 def _require_compiler() -> None:
-    """Refuse to compute uncompiled, which takes hours."""
+    """Raise a ValueError if compilation is disabled, because commands would take hours."""
     import jax
 
     if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
@@ -492,7 +488,7 @@ def _require_compiler() -> None:
 
 
 def _require_pictures(picture: bool) -> None:
-    """Refuse, before anything is computed, a backend that matplotlib doesn't know."""
+    """Raise a ValueError, before anything is computed, if matplotlib lacks the backend."""
     if not picture:
         return
     try:

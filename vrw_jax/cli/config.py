@@ -27,10 +27,12 @@ DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
 TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 _AXIS_KEYS = ("from", "to", "count")
-MAX_COUNT = 2**53
-"""Largest whole number of a config, chosen because floats hold all up to it."""
-MAX_LEGS = 1_000
-"""Most legs of a config, chosen because results hold a number for each leg of each sample."""
+
+MAX_CONFIG_INTEGER = 2**53
+"""Largest integer of a config, chosen because floats represent all integers up to it."""
+
+MAX_CONFIG_LEGS = 1_000
+"""Largest number of legs, chosen because results have a number for each leg of each sample."""
 
 RENAMED_KEYS = {
     "[model]": {"rung": "name"},
@@ -159,7 +161,7 @@ def load_config(path: str | Path) -> Config:
 
 
 def parse_config(text: str, file_name: str = "config") -> Config:
-    """Parse and check the text of a config; `name` begins every message about an error."""
+    """Parse and check the text of a config; `file_name` begins every message about an error."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -245,7 +247,7 @@ def parse_assignment(text: str) -> tuple[str, float | int]:
     try:
         number = int(value) if name == "n_legs" else float(value)
     except ValueError:
-        number = value  # type: ignore[assignment]  # the check below reports the error
+        number = value  # type: ignore[assignment]  # The check below reports the error.
     return name, _parse_wheel({name: number})[name]
 
 
@@ -256,8 +258,8 @@ def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
     for name, value in table.items():
         if name == "n_legs":
             values[name] = _parse_int(value, name, 5)
-            if values[name] > MAX_LEGS:
-                raise _make_error(name, value, f"at most {MAX_LEGS:,}")
+            if values[name] > MAX_CONFIG_LEGS:
+                raise _make_error(name, value, f"at most {MAX_CONFIG_LEGS:,}")
         else:
             values[name] = _parse_parameter(name, value)
     return values
@@ -288,7 +290,7 @@ def _parse_options(table: Mapping[str, object]) -> dict[str, float | int | str |
 def _parse_like_defaults(
     table: Mapping[str, object], defaults: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
-    """Return settings of the types of their defaults: flags, names, whole or positive numbers."""
+    """Return settings with the types of their defaults; numbers must be positive."""
     values: dict[str, float | int | str | bool] = {}
     for key, value in table.items():
         default = defaults[key]
@@ -303,7 +305,7 @@ def _parse_like_defaults(
         elif isinstance(default, int):
             values[key] = _parse_int(value, key, 1)
         elif key == FRICTION_NAME and value == math.inf:
-            values[key] = math.inf  # feet do not slip
+            values[key] = math.inf  # Feet do not slip.
         else:
             values[key] = _parse_number(value, key, must_be_positive=True)
     return values
@@ -479,9 +481,10 @@ def _parse_parameter(name: str, value: object) -> float:
 
 
 def _parse_number(value: object, name: str, must_be_positive: bool = False) -> float:
+    """Return a value as a finite float; raise if it is not one."""
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+        with contextlib.suppress(OverflowError):  # An integer of hundreds of digits is too large.
             number = float(value)
     if not math.isfinite(number):
         raise _make_error(name, value, "a finite number")
@@ -494,8 +497,8 @@ def _parse_int(value: object, name: str, minimum: int) -> int:
     """Return a value as a whole number of at least `minimum`; raise if it is not one."""
     if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
         raise _make_error(name, value, f"a whole number of at least {minimum}")
-    if value > MAX_COUNT:
-        raise _make_error(name, value, f"at most {MAX_COUNT:,}")
+    if value > MAX_CONFIG_INTEGER:
+        raise _make_error(name, value, f"at most {MAX_CONFIG_INTEGER:,}")
     return value
 
 
@@ -520,12 +523,10 @@ def _refuse_renamed_keys(table: Mapping[str, object], location: str) -> None:
 
 
 def _make_error(name: str, value: object, requirement: str) -> ValueError:
-    """Return the error about a value that does not satisfy a requirement."""
-    return ValueError(f"{name} is {_format_value(value)}, but it must be {requirement}.")
-
-
-def _format_value(value: object) -> str:
-    """Return a value as it is written in TOML."""
+    """Return the error about a value, written as in TOML, that does not satisfy a requirement."""
+    text = format_value(value)
     if isinstance(value, bool):
-        return str(value).lower()
-    return format_value(value).replace("'", '"') if isinstance(value, str) else format_value(value)
+        text = text.lower()
+    elif isinstance(value, str):
+        text = text.replace("'", '"')
+    return ValueError(f"{name} is {text}, but it must be {requirement}.")

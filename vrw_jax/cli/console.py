@@ -1,6 +1,7 @@
 """Output of commands: tables, progress, and one sentence for a user's mistake."""
 
 import contextlib
+import enum
 import os
 import sys
 import warnings
@@ -24,11 +25,17 @@ if TYPE_CHECKING:
     from vrw_jax.scans import ScanProgress
     from vrw_jax.wheel import WheelParams
 
-USER_ERROR_EXIT_CODE, INTERRUPTED_EXIT_CODE = 2, 130
-"""Exit codes of a user's mistake and of a Ctrl-C."""
 
-stdout_console, stderr_console = Console(), Console(stderr=True)
-"""Consoles of stdout and stderr."""
+class ExitCode(enum.IntEnum):
+    """Exit code of the command line, besides 0 for success."""
+
+    CHECK_FAILED = 1  # A fact does not hold, a run has no result, or a store is damaged.
+    USER_ERROR = 2
+    INTERRUPTED = 130
+
+
+stdout_console = Console()
+stderr_console = Console(stderr=True)
 
 
 @contextlib.contextmanager
@@ -38,40 +45,40 @@ def report_errors(interruption_message: str = "stopped; nothing was written.") -
         yield
     except KeyboardInterrupt:
         print_error(interruption_message)
-        raise typer.Exit(INTERRUPTED_EXIT_CODE) from None
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
     except MemoryError as error:
         print_error(
             "this asks for more memory than there is: give smaller designs, or fewer at once."
         )
-        raise typer.Exit(USER_ERROR_EXIT_CODE) from error
+        raise typer.Exit(ExitCode.USER_ERROR) from error
     except (ValueError, OSError) as error:
         print_error(str(error) if isinstance(error, ValueError) else _format_system_error(error))
-        raise typer.Exit(USER_ERROR_EXIT_CODE) from error
+        raise typer.Exit(ExitCode.USER_ERROR) from error
 
 
 @contextlib.contextmanager
-def whole_output() -> Iterator[None]:
-    """Around a command: if standard output can't take its last lines, one sentence, exit code 2."""
+def report_output_errors() -> Iterator[None]:
+    """Report in one sentence, with exit code 2, that standard output cannot be written."""
     code: Any = 0
     try:
         yield
     except SystemExit as end:
         code = end.code
     except OSError as error:
-        _give_up_output(error)
+        _abandon_output(error)
     try:
         sys.stdout.flush()
     except OSError as error:
-        _give_up_output(error)
+        _abandon_output(error)
     raise SystemExit(code)
 
 
-def _give_up_output(error: OSError) -> None:
-    """Say why the output ends; what is left of it would fail again when Python ends."""
+def _abandon_output(error: OSError) -> None:
+    """Discard the remaining output, which Python would write at its end, and exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(error, BrokenPipeError):  # whoever closed it knows
+    if not isinstance(error, BrokenPipeError):  # The reader closed the pipe on purpose.
         print_error(f"standard output can't be written: {_format_system_error(error)}")
-    raise SystemExit(USER_ERROR_EXIT_CODE)
+    raise SystemExit(ExitCode.USER_ERROR)
 
 
 def print_error(sentence: str) -> None:
@@ -80,10 +87,10 @@ def print_error(sentence: str) -> None:
 
 
 def show_warnings_as_sentences() -> None:
-    """Print what the library warns of like any other sentence, without the place in its code."""
-    usual = warnings.showwarning
+    """Print the library's warnings as sentences, without their location in the code."""
+    default_showwarning = warnings.showwarning
 
-    def show(
+    def show_warning(
         message: Warning | str,
         category: type[Warning],
         filename: str,
@@ -94,13 +101,13 @@ def show_warnings_as_sentences() -> None:
         if category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1]):
             print_error(str(message))
         else:
-            usual(message, category, filename, lineno, file, line)
+            default_showwarning(message, category, filename, lineno, file, line)
 
-    warnings.showwarning = show
+    warnings.showwarning = show_warning
 
 
 def _format_system_error(error: OSError) -> str:
-    """Return the sentence about an error of the system."""
+    """Return the sentence about an error of the operating system."""
     location = f"{error.filename}: " if error.filename else ""
     return f"{location}{str(error.strerror or error).rstrip('.')}."
 
@@ -117,7 +124,7 @@ def print_table(
     headings: Sequence[str] = (),
     right_aligned: Sequence[str] = (),
 ) -> None:
-    """Print a table; columns in `right` are right-aligned, and without headings names are bold.
+    """Print a table; without headings the first column is bold.
 
     Texts are printed literally, except that a column with the heading "" may contain color markup.
     """
@@ -147,7 +154,7 @@ def print_facts(facts: "list[Fact]", folder: Path) -> None:
 
 
 def make_progress_bar(task: str) -> "Bar":
-    """Return a progress bar on stderr; that of a scan counts samples and shows a note."""
+    """Return a progress bar on stderr; the bar of a scan counts samples and shows a note."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
@@ -161,7 +168,7 @@ def make_progress_bar(task: str) -> "Bar":
 
 
 def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"], None]:
-    """Return the callback that shows rate, share without a gait and time left.
+    """Return the callback that shows rate, share without a gait and remaining time.
 
     The rate is measured from the second chunk on, because the first one includes compilation.
     """

@@ -1,4 +1,4 @@
-"""Scans of the command line: planned from a config, verified and computed."""
+"""Scans of the command line: plan from a config, verification and computation."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING
 import typer
 
 from vrw_jax.cli import console as printing
-from vrw_jax.cli.console import print_error, report_errors, stdout_console
+from vrw_jax.cli.console import ExitCode, print_error, report_errors, stdout_console
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from vrw_jax.cli.config import Config
     from vrw_jax.scans import ScanPlan
-
-DAMAGED_EXIT_CODE = 1
-"""Exit code if a store is damaged."""
 
 
 def plan_config_scan(
@@ -52,7 +49,7 @@ def verify_store(plan: "ScanPlan", store: Path) -> None:
             f"{zarr_store.damage_description}: run the same without --verify, which computes "
             "these again."
         )
-        raise typer.Exit(DAMAGED_EXIT_CODE)
+        raise typer.Exit(ExitCode.CHECK_FAILED)
     n, missing = plan.layout.n_chunks, len(zarr_store.find_missing_chunks())
     state_text = (
         f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
