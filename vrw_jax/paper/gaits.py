@@ -2,7 +2,7 @@
 
 No equation is solved for a fixed point. Every gait here is the limit of a walk, so it is stable and
 checks the Newton search independently. The model continues formally if the ground would have to
-pull on Leg 1, as it does for scuffing. Gaits can therefore be followed past the c at which λ2⁺
+pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the c at which λ2⁺
 vanishes; other gaits are unaffected.
 """
 
@@ -30,15 +30,26 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation import step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
-N_WALK_STEPS = 30
-"""Number of steps per walk, chosen because the slowest gait, c = 70, converges to round-off."""
 
-SETTLED_TOLERANCE = 1e-8
-"""Largest change of the section state per step in a settled gait, chosen as ten times the error of
-a step at the default options."""
+@dataclasses.dataclass(frozen=True)
+class SettlingOptions:
+    """When a walk counts as settled in a gait.
 
-N_SETTLED_STEPS = 5
-"""Number of steps below the tolerance, because a longer period may repeat once by chance."""
+    - `n_steps`: number of steps of a walk, chosen because the slowest gait, c = 70, converges to
+      round-off in as many;
+    - `max_change`: largest change of the section state per step in a settled gait, chosen as ten
+      times the error of a step at the default options;
+    - `n_settled_steps`: number of last steps that must change less, chosen because a longer period
+      may repeat once by chance.
+    """
+
+    n_steps: int = 30
+    max_change: float = 1e-8
+    n_settled_steps: int = 5
+
+
+SETTLING_OPTIONS = SettlingOptions()
+"""Options of all walks of the reproduction."""
 
 
 def make_paper_model() -> ViscoelasticWheel:
@@ -52,22 +63,25 @@ def replace_parameter(params: WheelParams, name: str, value: float) -> WheelPara
     return dataclasses.replace(params, **change)
 
 
-def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
+def walk_into_gait(
+    params: WheelParams, x: SectionState, options: SettlingOptions = SETTLING_OPTIONS
+) -> xr.Dataset:
     """Return the section states of a walk and their change per step.
 
-    `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). The walk
-    is `settled` in a period-1 gait if each of the last five changes is below `SETTLED_TOLERANCE`.
+    `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). `settled`
+    is whether the walk reached a period-1 gait: each of the last changes is small enough.
     """
-    gait_walk = walk(params, x, N_WALK_STEPS, model=make_paper_model())
+    gait_walk = walk(params, x, options.n_steps, model=make_paper_model())
     n_stepped = int(gait_walk.n_stepped)
     states = np.concatenate([gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]])
     change = np.full(n_stepped + 1, np.nan)
     change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
     outcome = Outcome(int(gait_walk.outcome))
+    n_settled_steps = options.n_settled_steps
     last_change = (
-        float(change[-N_SETTLED_STEPS:].max()) if n_stepped >= N_SETTLED_STEPS else math.inf
+        float(change[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
     )
-    is_settled = outcome == Outcome.STEPPED and last_change < SETTLED_TOLERANCE
+    is_settled = outcome == Outcome.STEPPED and last_change < options.max_change
     return xr.Dataset(
         {
             "section_state": (("step", "component"), states),
@@ -87,10 +101,10 @@ def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
 def walk_along_parameter(
     params: WheelParams, name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
-    """Yield the walks at each of `values` of the parameter `name`, each from the previous gait.
+    """Yield the walk at each of `values` of the parameter `name`, as `walk_into_gait` returns it.
 
-    The start is extrapolated from the last two settled gaits. A walk that fails or does not settle
-    is not used for it. See `walk_into_gait` for the datasets.
+    The start is extrapolated from the last two settled gaits. Walks that fail or do not settle are
+    not used for it.
     """
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
@@ -151,7 +165,7 @@ def _extrapolate_start(
 def _make_dataset(
     params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
-    """Return the labelled dataset of columns over the parameter `name`."""
+    """Return the labeled dataset of columns over the parameter `name`."""
     data = make_variables({key: columns[key] for key in STEP_MEASURES | MARGIN_MEASURES}, name)
     change_attrs = {"units": "1", "long_name": "largest change of the last five steps"}
     data |= {

@@ -49,7 +49,7 @@ def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
 def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     """Return one step of the gait at each of `dampings`, 1 to 219 N s/m, for figures 8 and 9.
 
-    Walks lead there from Table 1 with changes of at most 10 N s/m.
+    The damping is changed from that of Table 1 by at most 10 N s/m per walk.
     """
     start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     table_1, gaits = WheelParams(), []
@@ -70,7 +70,7 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
 
 
 def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
-    """Return the gaits at every integer c from 1 to 219, and the walks up to 224, for figure 10."""
+    """Return the gaits at each integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
     start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     lower_gaits = measure_gaits_along(params, "damping", range(200, 0, -1), start, on_progress)

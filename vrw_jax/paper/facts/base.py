@@ -37,7 +37,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Labelled results from which all facts are computed."""
+    """Labeled results from which all facts are computed."""
 
     params: WheelParams  # of Table 1
     settling_walk: xr.Dataset  # `gaits.walk_into_gait` from the start for Table 1
@@ -46,9 +46,8 @@ class Evidence:
     damping_branch: xr.Dataset  # `gaits.measure_gaits_along` damping 1, 2, ..., 224 at slope 0.30
     slope_branch: xr.Dataset  # `gaits.measure_gaits_along` slope down to 0.10 at c = 100
     gentle_slope_branch: xr.Dataset  # `gaits.measure_gaits_along` damping up to 220 at slope 0.10
-    gentle_slope_low_damping_branch: (
-        xr.Dataset
-    )  # `gaits.measure_gaits_along` damping down to 4 at slope 0.10
+    # `gaits.measure_gaits_along` damping down to 4 at slope 0.10
+    gentle_slope_low_damping_branch: xr.Dataset
     fast_start_walk: xr.Dataset  # `gaits.walk_into_gait` from a start with 2 rad/s at Table 1
 
     @property
@@ -59,12 +58,15 @@ class Evidence:
 
 REFERENCE_CODE_LABEL = "independent code"
 """Source of a number that the paper does not print."""
+
 LAST_DIGIT_REASON = "half a unit of the last digit published"
 """Reason for the usual tolerance."""
+
 SIGN_REASON = "a sign: no tolerance"
 """Reason for a comparison without a tolerance."""
+
 STEP_ERROR_TOLERANCE = 1e-9
-"""Tolerance of numbers that differ by the error of a step, in SI units."""
+"""Tolerance of a number in SI units, chosen as the error of a step at the default options."""
 
 NumbersByName = Mapping[str, Any]
 """Numbers of a group of claims by name, computed from the evidence."""

@@ -18,7 +18,7 @@ from vrw_jax.paper.facts.base import (
     select_first_step,
     split_by_phase,
 )
-from vrw_jax.paper.gaits import SETTLED_TOLERANCE
+from vrw_jax.paper.gaits import SETTLING_OPTIONS
 from vrw_jax.wheel import Outcome
 
 
@@ -90,7 +90,8 @@ TYPICAL_GAIT_CLAIMS = ClaimGroup(
     "Typical gait, Table 1, slope 0.30 rad", _compute_typical_gait_numbers, (
     Claim("the gait is stable and of period 1", "§4, Fig. 6", "stable, period 1",
           "changes shrink by {shrink:.3f} a step, to {change:.0e}",
-          lambda n: n.settled, f"settled: below {SETTLED_TOLERANCE:g}, ten times a step's error"),
+          lambda n: n.settled,
+          f"settled: below {SETTLING_OPTIONS.max_change:g}, ten times a step's error"),
     Claim("angle just after landing", REFERENCE_CODE_LABEL, "θ⁺ = −0.68267 rad",
           "{theta:.5f} rad", agrees_within(theta=(-0.68267, 5e-6))),
     Claim("angular rate just after landing", REFERENCE_CODE_LABEL, "1.04920 rad/s",
@@ -197,7 +198,7 @@ def _compute_indicator_numbers(e: Evidence) -> NumbersByName:
 INDICATOR_CLAIMS = ClaimGroup("DLS indicators over c, slope 0.30 rad", _compute_indicator_numbers, (
     Claim("a period-1 gait stands at every whole c up to 219", "§5.2, Fig. 10",
           "1 … 219 (from 5 on with λ2⁺ ≥ 0)", "{n_settled} of {n} settled",
-          lambda n: n.n_settled == n.n, f"change per step below {SETTLED_TOLERANCE:g}"),
+          lambda n: n.n_settled == n.n, f"change per step below {SETTLING_OPTIONS.max_change:g}"),
     Claim("λ4⁺ falls monotonically with c", "§5.2, Fig. 10(b)", "monotone",
           "{rear[0]:.1f} … {rear[1]:.2f} N", lambda n: n.rear_falls, SIGN_REASON),
     Claim("λ4⁺ is gone at c = 220", "§5.2, Fig. 10(b)", "0 at 220",

@@ -113,8 +113,8 @@ def compute_landing_foot_velocity(
 def differentiate_landing_foot_position(
     params: WheelParams, section_state: np.ndarray
 ) -> np.ndarray:
-    """Return the same by central differences of the foot's position, accurate to 1e-11 m/s."""
-    h = 1e-6  # s; the error is proportional to its square
+    """Return the velocity of the landing foot by central differences, accurate to 1e-11 m/s."""
+    h = 1e-6  # In s; the error is proportional to its square.
     theta, dtheta, dL1 = (float(v) for v in section_state)
     s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
 

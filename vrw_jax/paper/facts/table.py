@@ -37,11 +37,6 @@ def compute_facts(evidence: Evidence) -> list[Fact]:
     return [fact for group in CLAIM_GROUPS for fact in group.make_facts(evidence)]
 
 
-def _format_cell(text: str) -> str:
-    """Return text with minus signs in place of hyphens before numbers."""
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", text)
-
-
 def summarize_facts(facts: Sequence[Fact]) -> str:
     """Return a sentence on how many facts hold and where their numbers come from."""
     n, n_by_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
@@ -80,7 +75,8 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
                 verdict,
                 fact.tolerance_reason,
             )
-            rows.append([_format_cell(text) for text in cells])
+            # Minus signs replace the hyphens before numbers.
+            rows.append([re.sub(r"(?<![\w.])-(?=\d)", "−", text) for text in cells])
         header = ("fact", "where", "published", "found", "", "tolerance")
         lines += ["", f"## {title}", "", *format_markdown_table(header, rows)]
     return "\n".join(lines) + "\n"
