@@ -212,7 +212,7 @@ def test_an_installed_wheel_brings_the_example_configs() -> None:
     built = parsed["tool"]["hatch"]["build"]["targets"]["wheel"]
     package = Path(cli.__file__).parents[1].name
     assert built["force-include"]["configs"] == f"{package}/configs"
-    assert cli._find_example_configs().name == "configs"
+    assert cli.find_example_configs().name == "configs"
 
 
 def test_verify_reports_whether_a_store_is_complete_and_intact(

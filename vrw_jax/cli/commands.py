@@ -208,8 +208,7 @@ def init(
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
     with report_errors():
-        package = Path(__file__).parents[1]  # An installed package includes the configs.
-        source = next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
+        source = find_example_configs()
         texts = {path.name: path.read_text(encoding="utf-8") for path in source.glob("*.toml")}
         existing = [folder / name for name in sorted(texts) if (folder / name).exists()]
         for path in existing:
@@ -223,6 +222,12 @@ def init(
         printing.print_written_paths(missing)
         if not missing:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
+
+
+def find_example_configs() -> Path:
+    """Return the folder of the example configs, inside an installed package or beside it."""
+    package = Path(__file__).parents[1]
+    return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
 
 
 def _require_writable(folder: Path) -> None:

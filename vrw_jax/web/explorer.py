@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 PAGE_MODEL_NAMES = list_config_names("explore")
 """Names of the models that the page supports."""
-DEFAULT_HEIGHT_PIXELS = 900
-"""Default height of the widget, in pixels."""
 
 WIDGET_JAVASCRIPT = """
 function render({ model, el }) {
@@ -30,32 +28,33 @@ function render({ model, el }) {
   frame.title = "A wheel that walks on springs";
   frame.style.cssText = `width: 100%; height: ${model.get("height")}px; border: 0`;
   frame.srcdoc = model.get("page");
-  let told = "", ready = false; // what it says before it is ready is its own beginning
-  const send = () => {
+  // The page sends its default values before it is ready; these are ignored.
+  let valuesOfPage = "", ready = false;
+  const sendValues = () => {
     const values = model.get("values");
-    const news = { vrw: "set", values };
-    if (JSON.stringify(values) !== told) frame.contentWindow.postMessage(news, "*");
+    if (JSON.stringify(values) !== valuesOfPage)
+      frame.contentWindow.postMessage({ vrw: "set", values }, "*");
   };
-  const show = () =>
+  const sendMap = () =>
     frame.contentWindow.postMessage({ vrw: "map", given: model.get("map") }, "*");
-  const hear = ({ source, data }) => {
+  const receive = ({ source, data }) => {
     if (source !== frame.contentWindow || !data) return;
     if (data.vrw === "ready") {
       ready = true;
-      show();
-      send();
+      sendMap();
+      sendValues();
     } else if (data.vrw === "values" && ready) {
-      told = JSON.stringify(data.values);
+      valuesOfPage = JSON.stringify(data.values);
       model.set("values", data.values);
-      model.set("measures", data.told);
+      model.set("measures", data.measures);
       model.save_changes();
     }
   };
-  window.addEventListener("message", hear);
-  model.on("change:values", send);
-  model.on("change:map", show);
+  window.addEventListener("message", receive);
+  model.on("change:values", sendValues);
+  model.on("change:map", sendMap);
   el.appendChild(frame);
-  return () => window.removeEventListener("message", hear);
+  return () => window.removeEventListener("message", receive);
 }
 export default { render };
 """
@@ -89,7 +88,7 @@ def explore(
     friction: float = 1.0,
     model_name: str = "viscoelastic",
     dataset: "xr.Dataset | None" = None,
-    height: int = DEFAULT_HEIGHT_PIXELS,
+    height: int = 900,
 ) -> Any:
     """Return an interactive widget of the wheel for Jupyter, JupyterLab, VS Code and marimo.
 
@@ -156,7 +155,7 @@ def _make_widget_class() -> type:
         values = traitlets.Dict().tag(sync=True)
         measures = traitlets.Dict().tag(sync=True)
         map = traitlets.Dict().tag(sync=True)
-        height = traitlets.Int(DEFAULT_HEIGHT_PIXELS).tag(sync=True)
+        height = traitlets.Int().tag(sync=True)
 
         @property
         def params(self) -> WheelParams:
@@ -199,7 +198,10 @@ def _page_values(params: WheelParams, friction: float, model_name: str) -> dict[
 
 
 def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
-    """Return a scan over two parameters in the format of the page's map, with None for NaN."""
+    """Return a scan over two parameters in the format of the page's map.
+
+    Values that are not finite become None. Of the values of several legs the smallest is kept.
+    """
     import xarray
 
     check_type("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
@@ -218,15 +220,13 @@ def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
     for name, column in plane.data_vars.items():
         other_dims = [dim for dim in column.dims if dim not in axes]
         if column.dtype.kind == "f" and set(axes) <= set(column.dims):
-            measures[str(name)] = _to_nested_lists(column.min(other_dims).transpose(*axes[::-1]))
+            worst_values = column.min(other_dims).transpose(*axes[::-1]).values
+            measures[str(name)] = [
+                [float(value) if math.isfinite(value) else None for value in row]
+                for row in worst_values.tolist()
+            ]
     return {
         "axes": [{"name": name, "values": plane[name].values.tolist()} for name in axes],
         "measures": measures,
         "outcome": plane["outcome"].transpose(*axes[::-1]).values.tolist(),
     }
-
-
-def _to_nested_lists(values: Any) -> list[list[float | None]]:
-    """Return the values as nested lists, with None in place of a value that is not finite."""
-    finite_or_none = lambda x: float(x) if math.isfinite(x) else None
-    return [[finite_or_none(x) for x in row] for row in values.values.tolist()]

@@ -577,7 +577,7 @@ async function update(changes = {}) {
   document.querySelector("[data-told=legs]").textContent = { 6: "six", 8: "eight", 10: "ten" }[legs];
   $("took").textContent = `${state.took.toFixed(1)} ms`;
   later();
-  tellParent({ vrw: "values", values: { ...values }, told: spoken(state.result) });
+  tellParent({ vrw: "values", values: { ...values }, measures: spoken(state.result) });
 }
 
 // In a notebook the page is a widget's, which hears what is shown.
