@@ -11,7 +11,7 @@ import vrw_jax as vrw
 from vrw_jax.cycles import make_finder
 from vrw_jax.cycles.margin_defaults import MARGIN_NAMES, default_margins
 from vrw_jax.measures.table import MARGIN_MEASURES
-from vrw_jax.tuning.maximization import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneStatus
+from vrw_jax.tuning.maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
 from vrw_jax.tuning.objective import max_breach, parse_margins, scale_slacks, signed_bound
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
 from vrw_jax.tuning.tune_result import TuneResult
@@ -71,7 +71,7 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
     # A constraint counts as kept within ACTIVE widths; the gait found afresh differs by 1e-9.
     assert (
         max_breach(retained.slack, scale_slacks(retained.slack, retained.slack_jacobian))
-        <= 1.01 * ACTIVE_BOUND_TOLERANCE
+        <= 1.01 * MAXIMIZATION_OPTIONS.active_bound_tolerance
     )
 
 

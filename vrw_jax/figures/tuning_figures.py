@@ -18,7 +18,7 @@ from vrw_jax.figures.style import (
     typeset_symbols,
 )
 from vrw_jax.measures import MEASURES
-from vrw_jax.tuning import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneResult
+from vrw_jax.tuning import MAXIMIZATION_OPTIONS, TrialKind, TuneResult
 from vrw_jax.validation import check_type
 
 
@@ -59,12 +59,13 @@ def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
     """Draw the objective over the evaluated gaits."""
     number, value = path.evaluation.values, path.objective.values
     is_gait_lost = np.isin(path.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
+    keeps_constraints = path.breach.values <= MAXIMIZATION_OPTIONS.active_bound_tolerance
     axes.plot(number[~is_gait_lost], value[~is_gait_lost], color=DARK_GRAY, linewidth=0.7, zorder=1)
     for is_feasible, fill, text in (
         (True, BLUE, "keeps the constraints"),
         (False, "white", "breaks one"),
     ):
-        is_drawn = ~is_gait_lost & ((path.breach.values <= ACTIVE_BOUND_TOLERANCE) == is_feasible)
+        is_drawn = ~is_gait_lost & (keeps_constraints == is_feasible)
         draw_marks(
             axes, number[is_drawn], value[is_drawn], "o", BLUE, fill, markersize=4.0, label=text
         )

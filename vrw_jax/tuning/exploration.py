@@ -1,11 +1,12 @@
-"""Exploration of many starts at once: an augmented Lagrangian, maximized by optax's Adam in one
-batch.
+"""Exploration of many starts: an augmented Lagrangian, maximized by optax's Adam in one batch.
 
 First-order steps bring every start near a local optimum; one of them is then selected for the
-maximization. A start whose trial lost its gait returns and takes half the step from then on.
+maximization. If a trial loses its gait, its start stays in place and takes half the step size from
+then on.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -20,9 +21,27 @@ from vrw_jax.wheel import Outcome
 
 optax = lazy_import("optax")
 
-LEARNING_RATE, PENALTY_WEIGHT = 0.06, 4.0
-"""Adam's first step in widths of the bounds, and the penalty on a breach of one width, in
-objectives."""
+
+@dataclass(frozen=True)
+class ExplorationOptions:
+    """Numbers of the exploration.
+
+    - `n_steps`: number of first-order steps;
+    - `learning_rate`: Adam's first step, in widths of the bounds;
+    - `gradient_decay`, `square_decay`: decay rates of Adam's averages of the gradient and of its
+      square;
+    - `penalty_weight`: penalty on a breach of one width of the bounds, in units of the objective.
+    """
+
+    n_steps: int = 25
+    learning_rate: float = 0.06
+    gradient_decay: float = 0.7
+    square_decay: float = 0.9
+    penalty_weight: float = 4.0
+
+
+EXPLORATION_OPTIONS = ExplorationOptions()
+"""Options of `vrw.tune`."""
 
 EvaluateBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
 """Function that returns gaits at u, one row per start, searched for from neighbors' gaits."""
@@ -35,14 +54,14 @@ class Exploration(NamedTuple):
     normalized_parameters: np.ndarray
     objective: np.ndarray  # NaN if no gait was found
     max_breach: np.ndarray  # in widths of the bounds
+    merit: np.ndarray  # objective minus the penalty on the breach
     n_lost: np.ndarray  # number of trials that lost the gait or its branch
     n_evaluations: int  # number of evaluated gaits
 
     @property
     def best_index(self) -> int:
-        """Return the index of the start to continue from: the highest objective minus penalties."""
-        merit = self.objective - PENALTY_WEIGHT * np.abs(self.objective) * self.max_breach
-        return int(np.nanargmax(merit))
+        """Return the index of the start to continue from, which has the highest merit."""
+        return int(np.nanargmax(self.merit))
 
 
 def explore_starts(
@@ -52,9 +71,9 @@ def explore_starts(
     free_indices: list[int],
     widths: np.ndarray,
     min_constraint_values: np.ndarray,
-    n_steps: int,
+    options: ExplorationOptions = EXPLORATION_OPTIONS,
 ) -> Exploration:
-    """Take `n_steps` first-order steps of every start.
+    """Take first-order steps from every start, and return where they end.
 
     `parameter_change` converts changes of u to changes of the parameters. Jacobians of a gait are
     with respect to all parameters; `free_indices` select the free ones.
@@ -69,20 +88,17 @@ def explore_starts(
     scales = np.median(scales, axis=0) if is_active.any() else np.ones(min_constraint_values.size)
     objective_scale = _objective_gradient(trial_evaluation, free_indices, widths)[is_active]
     objective_scale = np.median(np.linalg.norm(objective_scale, axis=1)) if is_active.any() else 1.0
-    learning_rates = np.full((n_starts, 1), LEARNING_RATE)
-    optimizer = optax.scale_by_adam(b1=0.7, b2=0.9)
+    learning_rates = np.full((n_starts, 1), options.learning_rate)
+    optimizer = optax.scale_by_adam(b1=options.gradient_decay, b2=options.square_decay)
     optimizer_state = optimizer.init(jnp.asarray(starts))
     multipliers = np.zeros((n_starts, min_constraint_values.size))
-    normalized_parameters, evaluation, n_lost = (
-        starts.copy(),
-        trial_evaluation,
-        np.zeros(n_starts, int),
-    )
-    for step_index in range(n_steps):
+    normalized_parameters, evaluation = starts.copy(), trial_evaluation
+    n_lost = np.zeros(n_starts, int)
+    for step_index in range(options.n_steps):
         slacks, slack_jacobian = _slack_and_jacobian(
             evaluation, free_indices, widths, min_constraint_values
         )
-        weights = np.maximum(0.0, multipliers - PENALTY_WEIGHT * slacks / scales)
+        weights = np.maximum(0.0, multipliers - options.penalty_weight * slacks / scales)
         multipliers = np.where(is_active[:, None], weights, multipliers)
         penalty_gradient = np.einsum("lc,lcf->lf", weights / scales, slack_jacobian)
         ascent_direction = (
@@ -91,7 +107,7 @@ def explore_starts(
         )
         ascent_direction = np.where(is_active[:, None], ascent_direction, 0.0)
         update, optimizer_state = optimizer.update(jnp.asarray(ascent_direction), optimizer_state)
-        step_sizes = learning_rates * 0.5 * (1.0 + np.cos(np.pi * step_index / n_steps))
+        step_sizes = learning_rates * 0.5 * (1.0 + np.cos(np.pi * step_index / options.n_steps))
         trial_parameters = np.clip(
             normalized_parameters + step_sizes * np.asarray(update), 0.0, 1.0
         )
@@ -111,14 +127,17 @@ def explore_starts(
         normalized_parameters = np.where(
             is_accepted[:, None], trial_parameters, normalized_parameters
         )
-        evaluation = jax.tree.map(
-            lambda new, old, h=is_accepted: _select(h, new, old), trial_evaluation, evaluation
+        select_accepted = lambda new, old, accepted=is_accepted: jnp.where(
+            accepted.reshape(-1, *(1,) * (jnp.ndim(new) - 1)), new, old
         )
+        evaluation = jax.tree.map(select_accepted, trial_evaluation, evaluation)
     slacks, _ = _slack_and_jacobian(evaluation, free_indices, widths, min_constraint_values)
     objective = np.where(is_active, np.asarray(evaluation.values)[:, 0], np.nan)
-    n_evaluations = n_starts * (n_steps + 1)
+    breach = max_breach(slacks, scales)
+    merit = objective - options.penalty_weight * np.abs(objective) * breach
+    n_evaluations = n_starts * (options.n_steps + 1)
     return Exploration(
-        starts, normalized_parameters, objective, max_breach(slacks, scales), n_lost, n_evaluations
+        starts, normalized_parameters, objective, breach, merit, n_lost, n_evaluations
     )
 
 
@@ -127,19 +146,16 @@ def has_gait(evaluation: GaitEvaluation) -> np.ndarray:
     return evaluation.gait.outcome == Outcome.STEPPED
 
 
-def _is_finite(gait: GaitEvaluation, free: list[int]) -> np.ndarray:
-    """Return for each lane whether all values and their derivatives by `free` are finite."""
-    slopes = np.asarray(gait.jacobian)[:, free]
-    return np.isfinite(gait.values).all(-1) & np.isfinite(slopes).all((-1, -2))
-
-
-def _select(is_accepted: np.ndarray, new_leaf: jax.Array, old_leaf: jax.Array) -> jax.Array:
-    return jnp.where(is_accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf)
+def _is_finite(evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
+    """Return for each start whether values and derivatives by the free parameters are finite."""
+    jacobian = np.asarray(evaluation.jacobian)[:, free_indices]
+    return np.isfinite(evaluation.values).all(-1) & np.isfinite(jacobian).all((-1, -2))
 
 
 def _objective_gradient(
     evaluation: GaitEvaluation, free_indices: list[int], widths: np.ndarray
 ) -> np.ndarray:
+    """Return the gradient of the objective with respect to u, (start, free)."""
     return np.asarray(evaluation.jacobian)[:, free_indices, 0] * widths
 
 
@@ -149,8 +165,7 @@ def _slack_and_jacobian(
     widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slack, and its derivatives with respect to u: (start, constraint) and (start,
-    constraint, free)."""
+    """Return slacks (start, constraint), and derivatives by u (start, constraint, free)."""
     jacobian = np.swapaxes(np.asarray(evaluation.jacobian)[:, free_indices, 1:], 1, 2) * widths
     return np.asarray(evaluation.values)[:, 1:] - min_constraint_values, jacobian
 
@@ -158,6 +173,7 @@ def _slack_and_jacobian(
 def _stays_on_branch(
     previous: GaitEvaluation, trial: GaitEvaluation, parameter_changes: np.ndarray
 ) -> np.ndarray:
+    """Return for each start whether the trial's gait is on the branch of the previous gait."""
     previous_points, trial_points = previous.gait.branch_point, trial.gait.branch_point
     pairs = (
         (*take_rows((previous_points, trial_points), i), row)

@@ -1,5 +1,4 @@
-"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks where the branch is
-lost.
+"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks at lost gaits.
 
 SLSQP is sequential quadratic programming with exact gradients. It does not handle trial wheels
 without a gait, or with a gait of another branch. After such a trial the maximization continues from
@@ -9,6 +8,7 @@ widths of their bounds, so that every free one is between 0 and 1.
 
 import enum
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -62,31 +62,33 @@ class EvaluatedTrial(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether objective, constraints and their derivatives are finite numbers."""
+        """Return whether objective, constraints and their derivatives are finite numbers."""
         parts = (self.objective, self.gradient, self.slack, self.slack_jacobian)
         return all(bool(np.isfinite(part).all()) for part in parts)
 
     @property
     def is_usable(self) -> bool:
-        """Whether the climb may go on from here."""
+        """Return whether the maximization may continue from this trial."""
         return self.is_found and self.is_finite
 
     def describe_nonfinite(
-        self, label: str, constraints: tuple[str, ...], least: np.ndarray
+        self, label: str, constraints: tuple[str, ...], min_constraint_values: np.ndarray
     ) -> str:
-        """Return which number is not finite: the objective's, else a constraint's."""
-        values = self.objective, *map(float, self.slack + least)
-        slopes = self.gradient, *self.slack_jacobian
-        for name, value, slope in zip((label, *constraints), values, slopes, strict=True):
+        """Return which number is not finite: the objective, or else the first such constraint."""
+        values = self.objective, *map(float, self.slack + min_constraint_values)
+        gradients = self.gradient, *self.slack_jacobian
+        for name, value, gradient in zip((label, *constraints), values, gradients, strict=True):
             measure = name.removeprefix(UPPER_BOUND_PREFIX)
             if not np.isfinite(value):
                 return f"{measure} is {signed_bound(name, value):g}"
-            if not np.isfinite(slope).all():
+            if not np.isfinite(gradient).all():
                 return f"{measure} has a derivative that is not finite"
         raise ValueError("Every number of this trial is finite: describe another.")
 
 
-class ClimbResult(NamedTuple):
+class MaximizationResult(NamedTuple):
+    """Best trial, status, and all trials in order with their kinds."""
+
     best: EvaluatedTrial
     status: TuneStatus
     trials: list[EvaluatedTrial]
@@ -94,37 +96,53 @@ class ClimbResult(NamedTuple):
 
 
 class _LostBranchError(Exception):
+    """Raised if a trial has no usable gait."""
+
     def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
 
 
 class _BudgetSpentError(Exception):
-    pass
+    """Raised if the allowed number of gaits is evaluated."""
 
 
 class _OptimumReachedError(Exception):
+    """Raised if a trial satisfies the first-order condition and the constraints."""
+
     def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
 
 
-FULL_RADIUS, MIN_RADIUS = 1.0, 1e-7
-"""Half the side of a box that contains all bounds, and of a box at which the end of a branch counts
-as reached."""
+@dataclass(frozen=True)
+class MaximizationOptions:
+    """Numbers of the maximization; lengths are in widths of the bounds.
 
-COARSE_OBJECTIVE_TOLERANCE, FINE_OBJECTIVE_TOLERANCE = 1e-3, 1e-10
-"""Relative change of the objective at which SLSQP stops. The first value is for a smaller box,
-whose optimum is only a point to continue from. The second is for the whole box, and the gaits are
-not more accurate than that."""
+    - `full_radius`: half the side of the largest box, chosen because it contains all bounds from
+      any center;
+    - `min_radius`: half the side of the box at which the end of a branch counts as reached;
+    - `coarse_objective_tolerance`: relative change of the objective at which SLSQP stops in a
+      smaller box, chosen because the optimum in it is only a point to continue from;
+    - `fine_objective_tolerance`: the same in the whole box, chosen because gaits are not more
+      accurate;
+    - `active_bound_tolerance`: slack at which a constraint counts as active.
+    """
 
-ACTIVE_BOUND_TOLERANCE = 1e-6
-"""Slack of an active constraint, in widths of the bounds."""
+    full_radius: float = 1.0
+    min_radius: float = 1e-7
+    coarse_objective_tolerance: float = 1e-3
+    fine_objective_tolerance: float = 1e-10
+    active_bound_tolerance: float = 1e-6
+
+
+MAXIMIZATION_OPTIONS = MaximizationOptions()
+"""Options of `vrw.tune`."""
 
 EvaluateTrial = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
 """Function that returns the gait at u, searched for from a neighbor's gait."""
 
 
 class _TrialRecord:
-    """All trials in order; each point is evaluated once."""
+    """Trials in order; each point is evaluated once."""
 
     def __init__(
         self, evaluate: EvaluateTrial, start: EvaluatedTrial, max_evaluations: int
@@ -134,6 +152,7 @@ class _TrialRecord:
         self._indices = {start.normalized_parameters.tobytes(): 0}
 
     def evaluate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        """Return the trial at u, from the record if it was evaluated; raise if it is unusable."""
         trial_index = self._indices.get(normalized_parameters.tobytes())
         if trial_index is None:
             if len(self.trials) >= self._max_evaluations:
@@ -153,6 +172,7 @@ class _TrialRecord:
         return trial
 
     def evaluate_iterate(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        """Return the trial at u, and record it as an iterate."""
         trial = self.evaluate_once(normalized_parameters)
         trial_index = self._indices[normalized_parameters.tobytes()]
         if trial_index:
@@ -160,6 +180,7 @@ class _TrialRecord:
         return trial
 
     def _nearest_gait(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
+        """Return the usable trial nearest to u."""
         gaits = [trial for trial in self.trials if trial.is_usable]
         return min(
             gaits,
@@ -170,10 +191,15 @@ class _TrialRecord:
 
 
 def maximize_objective(
-    evaluate: EvaluateTrial, start: EvaluatedTrial, *, tolerance: float, max_evaluations: int
-) -> ClimbResult:
+    evaluate: EvaluateTrial,
+    start: EvaluatedTrial,
+    *,
+    tolerance: float,
+    max_evaluations: int,
+    options: MaximizationOptions = MAXIMIZATION_OPTIONS,
+) -> MaximizationResult:
     """Maximize the objective locally from `start`, with every slack at least zero."""
-    from scipy.optimize import minimize  # imported here because it is slow
+    from scipy.optimize import minimize  # This import is slow.
 
     record = _TrialRecord(evaluate, start, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start.gradient)), 1e-12)
@@ -181,25 +207,23 @@ def maximize_objective(
 
     def stop_at_optimum(trial: EvaluatedTrial) -> EvaluatedTrial:
         if (
-            max_breach(trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE
-            and compute_optimality(trial).residual <= tolerance
+            max_breach(trial.slack, scales) <= options.active_bound_tolerance
+            and compute_optimality(trial, options).residual <= tolerance
         ):
             raise _OptimumReachedError(trial)
         return trial
 
-    center, radius, max_radius = start, FULL_RADIUS, FULL_RADIUS
+    center, radius, max_radius = start, options.full_radius, options.full_radius
     status, n_known_trials = TuneStatus.CONVERGED, 0
     while True:
-        # A round without a new evaluation would only be repeated, so the next box is smaller.
+        # The next box is smaller if this one had no new evaluation, because it would be repeated.
         max_radius = max_radius if len(record.trials) > n_known_trials else 0.5 * max_radius
         n_known_trials, radius = len(record.trials), min(radius, max_radius)
-        if radius < MIN_RADIUS:
+        if radius < options.min_radius:
             status = TuneStatus.BRANCH_ENDED
             break
-        lower, upper = (
-            np.maximum(center.normalized_parameters - radius, 0.0),
-            np.minimum(center.normalized_parameters + radius, 1.0),
-        )
+        lower = np.maximum(center.normalized_parameters - radius, 0.0)
+        upper = np.minimum(center.normalized_parameters + radius, 1.0)
         iterates = [center]
         try:
             result = minimize(
@@ -214,9 +238,9 @@ def maximize_objective(
                 },
                 method="SLSQP",
                 options={
-                    "ftol": FINE_OBJECTIVE_TOLERANCE
+                    "ftol": options.fine_objective_tolerance
                     if radius >= max_radius
-                    else COARSE_OBJECTIVE_TOLERANCE,
+                    else options.coarse_objective_tolerance,
                     "maxiter": 100,
                 },
                 callback=lambda u, visited=iterates: visited.append(
@@ -236,32 +260,36 @@ def maximize_objective(
         except _BudgetSpentError:
             status = TuneStatus.MAX_EVALUATIONS_REACHED
             break
-        is_at_wall = (end_trial.normalized_parameters <= lower + 1e-9) & (lower > 0.0)
-        is_at_wall |= (end_trial.normalized_parameters >= upper - 1e-9) & (upper < 1.0)
+        is_at_box_side = (end_trial.normalized_parameters <= lower + 1e-9) & (lower > 0.0)
+        is_at_box_side |= (end_trial.normalized_parameters >= upper - 1e-9) & (upper < 1.0)
         center = end_trial
-        if radius >= FULL_RADIUS:
+        if radius >= options.full_radius:
             break
-        radius = min(2.0 * radius, FULL_RADIUS) if is_at_wall.any() else FULL_RADIUS
-    best_trial = center if status == TuneStatus.CONVERGED else _best_trial(record, scales, center)
-    if (
-        status == TuneStatus.CONVERGED
-        and max_breach(best_trial.slack, scales) > 10.0 * ACTIVE_BOUND_TOLERANCE
-    ):
-        best_trial, status = _best_trial(record, scales, center), TuneStatus.NO_FEASIBLE_GAIT
-    return ClimbResult(best_trial, status, record.trials, record.kinds)
+        radius = (
+            min(2.0 * radius, options.full_radius) if is_at_box_side.any() else options.full_radius
+        )
+    best_trial = center
+    if status != TuneStatus.CONVERGED:
+        best_trial = _best_trial(record, scales, center, options)
+    elif max_breach(center.slack, scales) > 10.0 * options.active_bound_tolerance:
+        best_trial = _best_trial(record, scales, center, options)
+        status = TuneStatus.NO_FEASIBLE_GAIT
+    return MaximizationResult(best_trial, status, record.trials, record.kinds)
 
 
 def _best_trial(
-    record: _TrialRecord, scales: np.ndarray, last_trial: EvaluatedTrial
+    record: _TrialRecord,
+    scales: np.ndarray,
+    last_trial: EvaluatedTrial,
+    options: MaximizationOptions,
 ) -> EvaluatedTrial:
-    """The best gait that keeps all constraints; else the one that comes nearest to it."""
+    """Return the best gait that satisfies all constraints, or else the one with least breach."""
     gaits = [trial for trial in record.trials if trial.is_usable]
-    feasible = [
-        trial for trial in gaits if max_breach(trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE
-    ]
+    is_feasible = lambda trial: max_breach(trial.slack, scales) <= options.active_bound_tolerance
+    feasible = [trial for trial in gaits if is_feasible(trial)]
     if not feasible:
         return min(gaits, key=lambda trial: max_breach(trial.slack, scales))
-    if max_breach(last_trial.slack, scales) <= ACTIVE_BOUND_TOLERANCE:
+    if is_feasible(last_trial):
         feasible.append(last_trial)
     return max(feasible, key=lambda trial: trial.objective)
 
@@ -270,25 +298,22 @@ class OptimalityConditions(NamedTuple):
     """Multipliers of the constraints and bounds that hold a gait in place."""
 
     prices: np.ndarray  # gain of the objective per unit of a relaxed margin
-    lower_bound_prices: (
-        np.ndarray
-    )  # loss of the objective per width of a relaxed lower bound, < 0: gain
+    lower_bound_prices: np.ndarray  # loss of the objective per width of a relaxed lower bound
     upper_bound_prices: np.ndarray
     residual: float  # of the first-order condition, relative to the objective's gradient
 
 
-def compute_optimality(trial: EvaluatedTrial) -> OptimalityConditions:
-    """Return the first-order (Karush-Kuhn-Tucker) condition at a gait, by non-negative least
-    squares."""
-    from scipy.optimize import nnls  # slow to import
+def compute_optimality(
+    trial: EvaluatedTrial, options: MaximizationOptions = MAXIMIZATION_OPTIONS
+) -> OptimalityConditions:
+    """Solve the Karush-Kuhn-Tucker conditions at a gait by non-negative least squares."""
+    from scipy.optimize import nnls  # This import is slow.
 
-    n_free = trial.normalized_parameters.size
+    n_free, tolerance = trial.normalized_parameters.size, options.active_bound_tolerance
     scales = scale_slacks(trial.slack, trial.slack_jacobian)
-    active_indices = np.flatnonzero(np.abs(trial.slack) <= 10.0 * ACTIVE_BOUND_TOLERANCE * scales)
-    lower_indices, upper_indices = (
-        np.flatnonzero(trial.normalized_parameters <= ACTIVE_BOUND_TOLERANCE),
-        np.flatnonzero(trial.normalized_parameters >= 1.0 - ACTIVE_BOUND_TOLERANCE),
-    )
+    active_indices = np.flatnonzero(np.abs(trial.slack) <= 10.0 * tolerance * scales)
+    lower_indices = np.flatnonzero(trial.normalized_parameters <= tolerance)
+    upper_indices = np.flatnonzero(trial.normalized_parameters >= 1.0 - tolerance)
     identity = np.eye(n_free)
     columns = np.concatenate(
         [
@@ -298,18 +323,13 @@ def compute_optimality(trial: EvaluatedTrial) -> OptimalityConditions:
         ]
     ).T
     gradient_norm = max(float(np.linalg.norm(trial.gradient)), 1e-300)
-    prices, lower_prices, upper_prices = (
-        np.zeros(trial.slack.size),
-        np.zeros(n_free),
-        np.zeros(n_free),
-    )
+    prices = np.zeros(trial.slack.size)
+    lower_prices, upper_prices = np.zeros(n_free), np.zeros(n_free)
     if not columns.shape[1]:
         return OptimalityConditions(prices, lower_prices, upper_prices, 1.0)
     weights, residual = nnls(columns, -trial.gradient)
     lower_start, upper_start = len(active_indices), len(active_indices) + len(lower_indices)
     prices[active_indices] = weights[:lower_start] / scales[active_indices]
-    lower_prices[lower_indices], upper_prices[upper_indices] = (
-        weights[lower_start:upper_start],
-        weights[upper_start:],
-    )
+    lower_prices[lower_indices] = weights[lower_start:upper_start]
+    upper_prices[upper_indices] = weights[upper_start:]
     return OptimalityConditions(prices, lower_prices, upper_prices, float(residual) / gradient_norm)

@@ -67,13 +67,14 @@ class ObjectiveAndConstraints:
         return jnp.concatenate([jnp.ravel(objective_value), *constraint_values])
 
     def _evaluate_constraint(self, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        """Return a measure, or its negative if its name has the prefix of an upper bound."""
         measure = name.removeprefix(UPPER_BOUND_PREFIX)
         value = jnp.ravel(self.read(measure, cycle, step))
         return value if measure == name else -value
 
 
 class GaitEvaluation(NamedTuple):
-    """Gait with its objective and constraints. A batch has its axis before all others."""
+    """Gait with its objective and constraints. The axis of a batch is the first one."""
 
     gait: Gait
     values: Array  # (1 + n_constraints,): the objective, then the constraints
@@ -83,19 +84,22 @@ class GaitEvaluation(NamedTuple):
 def parse_margins(
     params: WheelParams, constraints: MarginSpec | None, finder: AbstractGaitFinder
 ) -> dict[str, float]:
-    """Return least values by name of the measure, or by `UPPER_BOUND_PREFIX` and name for its
-    negative."""
+    """Return the smallest allowed value of each constrained measure by name.
+
+    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`, and the smallest value is
+    that of its negative.
+    """
     if constraints is None:
         defaults = default_margins(params)
         return {name: lower for name, lower in defaults.items() if finder.supports_cold_start}
     margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
         for name, lower in constraints.items():
-            margins |= _margins_of_one(name, lower)
+            margins |= _parse_margin(name, lower)
     else:
         margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
-        # It has a nonzero derivative where the clearance has none.
+        # It has a nonzero derivative if the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
     for name in margins:
         check_known_name(
@@ -106,37 +110,40 @@ def parse_margins(
     return margins
 
 
-def _margins_of_one(
-    name: str, least: float | tuple[float | None, float | None]
-) -> dict[str, float]:
-    """Return the least values of one measure and of its negative; None in a pair is no bound."""
-    if not isinstance(least, tuple):
-        return {name: check_real(f"the margin of {name}", least)}
-    if len(least) != 2 or None not in least:
-        low, high = check_range(f"the range of {name}", least)
+def _parse_margin(name: str, bound: float | tuple[float | None, float | None]) -> dict[str, float]:
+    """Return the smallest allowed values of one measure and of its negative.
+
+    `bound` is a lower bound, or a pair of bounds of which one may be None.
+    """
+    if not isinstance(bound, tuple):
+        return {name: check_real(f"the margin of {name}", bound)}
+    if len(bound) != 2 or None not in bound:
+        low, high = check_range(f"the range of {name}", bound)
         return {UPPER_BOUND_PREFIX + name: -high, name: low}
-    if least == (None, None):
+    if bound == (None, None):
         raise ValueError(
             f"the range of {name} is (None, None), which bounds nothing: give a lower or an upper "
             "bound, as in (None, 0.6), or leave the constraint out."
         )
-    low_end, high_end = least
+    low_end, high_end = bound
     if low_end is None:
         return {UPPER_BOUND_PREFIX + name: -check_real(f"the upper end of {name}", high_end)}
     return {name: check_real(f"the lower end of {name}", low_end)}
 
 
 def signed_bound(name: str, lower: float) -> float:
+    """Return a bound with the sign of its measure, without that of the upper-bound prefix."""
     return float(-lower if name.startswith(UPPER_BOUND_PREFIX) else lower)
 
 
 def scale_slacks(slack: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
-    """Return the change of slack over one width of the bounds, which makes constraints
-    comparable."""
+    """Return the scale of each slack: its change over one width of the bounds."""
     return np.maximum(np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
 
 
 def max_breach(slack: np.ndarray, scales: np.ndarray) -> Any:
-    """Return the largest breach of a constraint in widths of the bounds: 0 if none, NaN if the gait
-    is lost."""
+    """Return the largest breach of a constraint in widths of the bounds, 0 if there is none.
+
+    It is NaN if the gait is lost.
+    """
     return np.max(-slack / scales, axis=-1, initial=0.0)

@@ -41,8 +41,8 @@ from vrw_jax.selection import SELECTION_MARGINS, describe_models
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
 from vrw_jax.tuning.exploration import Exploration, explore_starts
 from vrw_jax.tuning.maximization import (
-    ClimbResult,
     EvaluatedTrial,
+    MaximizationResult,
     TrialKind,
     compute_optimality,
     maximize_objective,
@@ -77,7 +77,22 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, Outcome, WheelPara
 ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
 
 
-START_DISPLACEMENT, N_VALIDATION_STEPS, N_EXPLORATION_STEPS = 1e-5, 10, 25
+@dataclasses.dataclass(frozen=True)
+class ValidationOptions:
+    """Numbers of the walk that validates a tuned wheel.
+
+    - `n_steps`: number of steps;
+    - `start_displacement`: displacement of the start from the limit cycle, relative;
+    - `value_tolerance`: accepted violation of a constraint, as a share of its value. It and the
+      next are chosen because the optimum satisfies a constraint within 1e-6 of its change over the
+      bounds, and the start is displaced: each is some thousandths of a take-off margin;
+    - `margin_tolerance`: the same, as a share of the constraint's default margin.
+    """
+
+    n_steps: int = 10
+    start_displacement: float = 1e-5
+    value_tolerance: float = 1e-3
+    margin_tolerance: float = 1e-2
 
 
 def tune(
@@ -95,14 +110,13 @@ def tune(
     n_starts: int = 1,
     seed: int = 0,
 ) -> TuneResult:
-    """Return the wheel near `params` whose gait maximizes the objective and satisfies its
-    constraints.
+    """Return the wheel near `params` whose gait maximizes an objective under constraints.
 
     The default constraints are all margins that gaits of this model can keep (`default_margins`);
     {} is none. A constraint counts as satisfied within 1e-6 of its change over the bounds. The
     method is local: it ends at an optimum of the branch of `params`. With `n_starts` above 1 it
-    begins with `params` and random wheels within the bounds. They take N_EXPLORATION_STEPS
-    first-order steps side by side, and the best is maximized.
+    begins with `params` and random wheels within the bounds. They take 25 first-order steps in one
+    batch, and the maximization continues from the best.
 
     With unilateral contact (`UnilateralWheel`) the objective is a measure of a step or a weighted
     sum of several. A walk from the start finds the first gait. Constraints, none by default, are on
@@ -114,23 +128,23 @@ def tune(
         params: the start, one wheel.
         objective: maximized quantity: a measure's name, weights of several, or a function of a
             LimitCycle (and, if it takes two arguments, of the StepResult from it).
-        free: names of the parameters that may move.
-        bounds: lower and upper, of each free parameter.
-        constraints: least values of measures by name, or pairs of least and most, of which one may
-            be None: (None, 0.6); names alone mean zero.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
-        options: of the steps.
-        cycle_options: of the gaits.
-        tolerance: on the first-order condition, relative to the objective's gradient.
-        max_evaluations: largest number of gaits.
-        n_starts: number of starts, the best of which is maximized.
-        seed: of the random starts.
+        free: names of the parameters that may change.
+        bounds: lower and upper bound of each free parameter.
+        constraints: lower bounds of measures by name, or pairs of lower and upper bounds, of which
+            one may be None: (None, 0.6). Names without bounds have the lower bound zero.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: options of the steps.
+        cycle_options: options of the gaits.
+        tolerance: tolerance of the first-order condition, relative to the objective's gradient.
+        max_evaluations: largest number of evaluated gaits.
+        n_starts: number of starts; the maximization continues from the best.
+        seed: seed of the random starts.
 
     Returns:
         A `TuneResult`, whose `status` is CONVERGED at an optimum.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
@@ -138,11 +152,9 @@ def tune(
         >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
         CONVERGED 0.534 ['damping']
     """
-    check_not_traced("vrw.tune", "climb by your own loop over vrw.limit_cycle", params)
-    max_evaluations, n_starts = (
-        check_int("max_evaluations", max_evaluations),
-        check_int("n_starts", n_starts),
-    )
+    check_not_traced("vrw.tune", "maximize by your own loop over vrw.limit_cycle", params)
+    max_evaluations = check_int("max_evaluations", max_evaluations)
+    n_starts = check_int("n_starts", n_starts)
     tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
     start_seconds = time.perf_counter()
     problem = make_tune_problem(
@@ -163,10 +175,10 @@ def tune(
         else exploration.normalized_parameters[exploration.best_index]
     )
     compiled_seconds = time.perf_counter()
-    climb_result = maximize_objective(
+    maximization = maximize_objective(
         problem.evaluate_trial, start_trial, tolerance=tolerance, max_evaluations=max_evaluations
     )
-    return problem.make_result(climb_result, start_seconds, compiled_seconds, exploration)
+    return problem.make_result(maximization, start_seconds, compiled_seconds, exploration)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,18 +193,21 @@ class TuneProblem:
     objective_label: str
     objective_and_constraints: ObjectiveAndConstraints
     finder: AbstractGaitFinder
+    validation_options: ValidationOptions = ValidationOptions()
 
     @property
     def widths(self) -> np.ndarray:
+        """Return the widths of the bounds."""
         return self.upper - self.lower
 
     @property
     def free_indices(self) -> list[int]:
+        """Return the indices of the free parameters among all parameters."""
         return [PARAMETER_NAMES.index(name) for name in self.free]
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return one name for each constrained number: margins of the locked legs have six."""
+        """Return one name per constrained number; a margin of the locked legs has one per leg."""
         names: list[str] = []
         for name in self.margins:
             if get_measure(name).dimension:
@@ -213,17 +228,19 @@ class TuneProblem:
         return values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
+        """Return the wheel at u."""
         return self.finder.model.from_values(
             jnp.asarray(self.denormalize(normalized_parameters)), self.params.n_legs
         )[1]
 
     @property
     def normalized_start(self) -> np.ndarray:
+        """Return u of the start."""
         values = np.array([float(getattr(self.params, name)) for name in self.free])
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
     def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
-        """Return the gait at `u`, where the climb begins; refuse one that can't be climbed from."""
+        """Return the trial at `u`; raise a ValueError unless it is usable as a start."""
         trial = self.evaluate_trial(u, None)
         if not trial.is_found:
             raise ValueError(
@@ -231,10 +248,12 @@ class TuneProblem:
                 "): start from a wheel that walks, such as WheelParams()."
             )
         if not trial.is_finite:
+            description = trial.describe_nonfinite(
+                self.objective_label, self.constraint_names, self.min_constraint_values
+            )
             raise ValueError(
-                f"{trial.describe_nonfinite(self.objective_label, self.constraint_names, self.min_constraint_values)} at "  # noqa: E501
-                "the start, but a climb needs finite numbers: start from another wheel, or give an "
-                "objective and constraints that are finite there."
+                f"{description} at the start, but a maximization needs finite numbers: start from "
+                "another wheel, or give an objective and constraints that are finite there."
             )
         return trial
 
@@ -287,7 +306,7 @@ class TuneProblem:
         )
 
     def explore_starts(self, n_starts: int, seed: int) -> Exploration:
-        """Take first-order steps from many starts side by side: this wheel, and random ones."""
+        """Take first-order steps from this wheel and random ones in one batch."""
         random_starts = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
         exploration = explore_starts(
             self._evaluate_batch,
@@ -296,7 +315,6 @@ class TuneProblem:
             self.free_indices,
             self.widths,
             self.min_constraint_values,
-            N_EXPLORATION_STEPS,
         )
         if not np.isfinite(exploration.objective).any():
             raise ValueError(
@@ -308,6 +326,7 @@ class TuneProblem:
     def _evaluate_batch(
         self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
     ) -> GaitEvaluation:
+        """Return the gaits at the rows of u, searched for from neighbors if they are given."""
         parameters = jnp.asarray([self.denormalize(row) for row in normalized_parameters])
         guesses = self.finder.initial_guesses(parameters)
         guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
@@ -315,19 +334,20 @@ class TuneProblem:
         return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
 
     def _parameter_change(self, difference: np.ndarray) -> np.ndarray:
-        """Return changes of all parameters from changes of u, row by row."""
+        """Return the changes of all parameters, one row per change of u."""
         parameter_change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
         parameter_change[:, self.free_indices] = difference * self.widths
         return parameter_change
 
     def make_result(
         self,
-        climb_result: ClimbResult,
+        maximization: MaximizationResult,
         start_seconds: float,
         compiled_seconds: float,
         exploration: Exploration | None = None,
     ) -> TuneResult:
-        best_trial = climb_result.best
+        """Return the result of a maximization, with active constraints and a validation walk."""
+        best_trial = maximization.best
         assert best_trial.evaluation is not None
         gait = best_trial.evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
@@ -366,21 +386,21 @@ class TuneProblem:
         ]
         return TuneResult(
             params=params,
-            status=climb_result.status,
+            status=maximization.status,
             objective=self.objective_label,
             value=best_trial.objective,
-            start_value=climb_result.trials[0].objective,
+            start_value=maximization.trials[0].objective,
             cycle=gait.cycle,
             step=gait.step,
             active=tuple(active),
             kkt_residual=conditions.residual,
             violated_margins=tuple(name for name in violated if name not in self.margins),
             validation=validation,
-            path=self._make_path(climb_result),
-            n_evaluations=len(climb_result.trials)
+            path=self._make_path(maximization),
+            n_evaluations=len(maximization.trials)
             + (0 if exploration is None else exploration.n_evaluations),
             n_backtracks=sum(
-                kind in (TrialKind.LOST, TrialKind.NOT_FINITE) for kind in climb_result.kinds
+                kind in (TrialKind.LOST, TrialKind.NOT_FINITE) for kind in maximization.kinds
             ),
             seconds=end_seconds - start_seconds,
             compile_seconds=compiled_seconds - start_seconds,
@@ -388,16 +408,13 @@ class TuneProblem:
         )
 
     def _validate_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
-        cycle_state = np.array(gait.cycle.section_state)
-        # The state is scaled down, not up: no leg may be beyond its stopper.
-        section_state, is_feasible, outcome, n_walked = (
-            cycle_state * (1.0 - START_DISPLACEMENT),
-            True,
-            Outcome.STEPPED,
-            0,
-        )
-        default_least = default_margins(params)
-        for _ in range(N_VALIDATION_STEPS):
+        """Return the result of a walk from a state near that of the gait."""
+        cycle_state, options = np.array(gait.cycle.section_state), self.validation_options
+        # The state is scaled down, not up, because no leg may be beyond its stopper.
+        section_state = cycle_state * (1.0 - options.start_displacement)
+        is_feasible, outcome, n_walked = True, Outcome.STEPPED, 0
+        margins_by_default = default_margins(params)
+        for _ in range(options.n_steps):
             step_result = self.finder.take_step(params, jnp.asarray(section_state))
             outcome = Outcome(int(step_result.outcome))
             if outcome != Outcome.STEPPED:
@@ -407,30 +424,29 @@ class TuneProblem:
             for name, lower in self.margins.items():
                 if (measure := name.removeprefix(UPPER_BOUND_PREFIX)) in measures:
                     value = measures[measure] if measure == name else -measures[measure]
-                    # The optimum satisfies it within 1e-6 of its change over the bounds, and the
-                    # start is displaced: each is some thousandths of a take-off margin.
-                    tolerance = 1e-3 * np.max(np.abs(value)) + 1e-2 * abs(
-                        default_least.get(name, 0.0)
-                    )
+                    default_margin = abs(margins_by_default.get(name, 0.0))
+                    tolerance = options.value_tolerance * np.max(np.abs(value))
+                    tolerance += options.margin_tolerance * default_margin
                     is_feasible &= bool(np.all(value >= lower - tolerance - 1e-9))
         distance = float(np.max(np.abs(section_state - cycle_state)))
         return WalkValidation(
             n_walked, outcome, distance, is_feasible and outcome == Outcome.STEPPED
         )
 
-    def _make_path(self, climb_result: ClimbResult) -> xr.Dataset:
+    def _make_path(self, maximization: MaximizationResult) -> xr.Dataset:
+        """Return the dataset of all trials in order."""
         dimension = "evaluation"
         normalized_parameters = np.array(
-            [trial.normalized_parameters for trial in climb_result.trials]
+            [trial.normalized_parameters for trial in maximization.trials]
         )
         values = self.lower + normalized_parameters * self.widths
         lower = self.min_constraint_values
-        constraints = np.array([trial.slack + lower for trial in climb_result.trials])
-        start = climb_result.trials[0]
+        constraints = np.array([trial.slack + lower for trial in maximization.trials])
+        start = maximization.trials[0]
         scales = scale_slacks(start.slack, start.slack_jacobian)
         outcomes = [
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
-            for trial in climb_result.trials
+            for trial in maximization.trials
         ]
         data: dict[str, Any] = {
             name: (dimension, values[:, i], measure_attrs(name)) for i, name in enumerate(self.free)
@@ -438,7 +454,7 @@ class TuneProblem:
         data |= {
             "objective": (
                 dimension,
-                [t.objective for t in climb_result.trials],
+                [t.objective for t in maximization.trials],
                 {"long_name": self.objective_label},
             ),
             "constraint_value": (
@@ -448,16 +464,16 @@ class TuneProblem:
             "margin": ("constraint", lower, {"long_name": "least value allowed"}),
             "breach": (
                 dimension,
-                np.array([max_breach(trial.slack, scales) for trial in climb_result.trials]),
+                np.array([max_breach(trial.slack, scales) for trial in maximization.trials]),
                 {"long_name": "largest breach of a constraint, in widths of the bounds"},
             ),
             "kind": (
                 dimension,
-                np.array(climb_result.kinds, int),
+                np.array(maximization.kinds, int),
                 flag_attrs(kind.name for kind in TrialKind),
             ),
             "outcome": (dimension, np.array(outcomes, int), measure_attrs("outcome")),
-            "on_branch": (dimension, np.array([t.is_on_branch for t in climb_result.trials])),
+            "on_branch": (dimension, np.array([t.is_on_branch for t in maximization.trials])),
         }
         units = [get_measure(name).unit for name in self.constraint_names]
         labels = {
@@ -467,10 +483,10 @@ class TuneProblem:
         }
         attrs = {
             "title": f"Path of tuning {self.objective_label} over {', '.join(self.free)}",
-            "free": " ".join(self.free),  # as text: netCDF has no lists of names
+            "free": " ".join(self.free),  # It is text because netCDF has no lists of names.
             "lower": [float(v) for v in self.lower],
             "upper": [float(v) for v in self.upper],
-            "ending": climb_result.status.name,
+            "ending": maximization.status.name,
         }
         origin = provenance(self.params, self.finder.model, self.finder.step_options)
         return xr.Dataset(data, labels, attrs | origin)
@@ -489,7 +505,8 @@ def make_tune_problem(
 ) -> TuneProblem:
     """Return the validated problem that `tune` solves, for single gaits or another method.
 
-    Raises: TypeError, ValueError: an invalid argument, described in one sentence.
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
     """
     check_single_wheel(params, "tune one after the other")
     names, lower, upper = _check_bounds(params, free, bounds)
@@ -517,7 +534,7 @@ def make_tune_problem(
     objective_and_constraints = ObjectiveAndConstraints(
         reader, type(finder).read_measure, tuple(margins)
     )
-    if callable(objective):  # checked before compilation
+    if callable(objective):  # Its errors are raised here, before compilation.
         cycle = jax.eval_shape(finder.find_cycle, params)
         x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
         step = jax.eval_shape(finder.model.take_step, params, x, finder.step_options)
@@ -530,6 +547,7 @@ def make_tune_problem(
 def _parse_objective(
     objective: ObjectiveSpec, finder: AbstractGaitFinder
 ) -> tuple[MeasureFunction, str]:
+    """Return the function of an objective, and its label."""
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
             f"objective is {format_value(objective)}, but it is a measure's name, weights of "
@@ -568,6 +586,7 @@ def _parse_objective(
 def _check_bounds(
     params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Return the names of the free parameters, their lower and their upper bounds."""
     names = check_names("free", free)
     check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
     if len(set(names)) < len(names):

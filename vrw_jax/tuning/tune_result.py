@@ -12,13 +12,13 @@ from vrw_jax.tuning.exploration import Exploration
 from vrw_jax.tuning.maximization import TuneStatus
 from vrw_jax.wheel import Outcome, WheelParams
 
-HELD_BY_NOTHING = {
+NO_ACTIVE_CONSTRAINT_TEXTS = {
     TuneStatus.CONVERGED: "nothing: a maximum inside all bounds and constraints",
     TuneStatus.BRANCH_ENDED: "the end of the branch, no constraint and no bound",
-    TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the climb has not ended",
+    TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the maximization has not ended",
     TuneStatus.NO_FEASIBLE_GAIT: "nothing: a constraint is broken here",
 }
-"""What holds a gait without an active constraint or bound, by the ending of its climb."""
+"""Texts for a gait without an active constraint or bound, by the status of the maximization."""
 
 
 class ActiveConstraint(NamedTuple):
@@ -122,7 +122,7 @@ class TuneResult:
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
             "wheel": ", ".join(parameter_texts),
             "ending": f"{self.status.name}: {self.status.meaning}",
-            "held by": ", ".join(active_texts) or HELD_BY_NOTHING[self.status],
+            "held by": ", ".join(active_texts) or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
             "not asked for, and broken": ", ".join(self.violated_margins) or "none",
             "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
             f"{self.validation.distance:.1e} from the cycle at last; {feasibility}",
