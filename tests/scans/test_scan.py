@@ -130,7 +130,7 @@ def test_an_incompletely_written_chunk_is_computed_again(
 
 @pytest.mark.parametrize("wheel", [vrw.UnilateralWheel(), vrw.LadderWheel(friction=0.7)])
 def test_settings_of_every_model_can_be_stored(wheel):
-    attrs = plan_scan(vrw.grid(friction=[0.5, 0.7]), model=wheel).attrs
+    attrs = plan_scan(vrw.grid(friction=[0.5, 0.7]), model=wheel).store_attrs
     assert json.loads(attrs[scan_store.MANIFEST_ATTRIBUTE])["model"]["kind"] == type(wheel).__name__
 
 

@@ -27,7 +27,8 @@ from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivat
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
 WHEELS_PER_BATCH = 512
-"""Number of wheels that one call of the compiled function evaluates."""
+"""Number of wheels in one call of the compiled functions, fixed so that results do not
+depend on the other samples."""
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""

@@ -36,7 +36,7 @@ QUEUED_CHUNKS_PER_THREAD = 2
 """Number of submitted chunks per thread, chosen to keep a thread busy with little memory."""
 
 SCHEDULER_TIMEOUT = "10s"
-"""Longest time in which a scheduler must respond."""
+"""Longest time until a scheduler responds."""
 
 
 @contextlib.contextmanager
@@ -57,9 +57,9 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
             client = Client(stack.enter_context(cluster), set_as_default=False)
         else:
             try:
-                _require_answer(address)
+                _require_response(address)
                 client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-            except Exception as error:  # no answer, no address, or what libraries make of it
+            except Exception as error:  # Libraries raise different errors for a wrong address.
                 raise ValueError(
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
@@ -68,20 +68,20 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
         yield functools.partial(_compute_chunks, client)
 
 
-def _require_answer(address: str) -> None:
-    """Refuse an address where nobody answers in dask's way; a client would wait there for ever."""
+def _require_response(address: str) -> None:
+    """Raise unless a scheduler responds at `address`; a client would wait for ever."""
     from dask.utils import parse_timedelta
     from distributed.comm import connect
     from distributed.security import Security
 
-    async def ask() -> None:
-        how = Security().get_connection_args("client")
+    async def connect_once() -> None:
+        arguments = Security().get_connection_args("client")
         seconds = parse_timedelta(SCHEDULER_TIMEOUT)
-        comm = await asyncio.wait_for(connect(address, timeout=seconds, **how), 2 * seconds)
+        comm = await asyncio.wait_for(connect(address, timeout=seconds, **arguments), 2 * seconds)
         comm.abort()
 
-    with ThreadPoolExecutor(1) as pool:  # a notebook has a loop of its own
-        pool.submit(asyncio.run, ask()).result()
+    with ThreadPoolExecutor(1) as pool:  # The event loop of a notebook is busy.
+        pool.submit(asyncio.run, connect_once()).result()
 
 
 def _compute_chunks(

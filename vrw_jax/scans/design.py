@@ -21,12 +21,16 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 SampleColumns = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
+
 SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
 """Parameters that a design may sweep: those of the wheel, and the ground's friction."""
+
 ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
+
 MAX_LISTED_SAMPLES = 10_000_000
 """Largest number of values of an axis or samples of a list, chosen because memory holds them."""
+
 SALTELLI_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
 
@@ -54,7 +58,7 @@ class AbstractDesign(abc.ABC):
     @property
     @abc.abstractmethod
     def dims(self) -> tuple[str, ...]:
-        """Return the names of the axes of a labelled result."""
+        """Return the names of the axes of a labeled result."""
 
     @property
     @abc.abstractmethod
@@ -67,7 +71,7 @@ class AbstractDesign(abc.ABC):
 
     @abc.abstractmethod
     def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the coordinates of a labelled result: name -> (axis, values)."""
+        """Return the coordinates of a labeled result: name -> (axis, values)."""
 
     def describe_identity(self) -> dict[str, object]:
         """Return the identity of the design: kind, names, shape and a digest of every number."""
@@ -246,7 +250,7 @@ def sobol(
         >>> vrw.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    from scipy.stats import qmc  # imported here because the import is slow
+    from scipy.stats import qmc  # This import is slow.
 
     n, ranges = _require_count("sobol", n), _require_one_form("sobol", ranges, parameters)
     names, lower, upper, n = _parse_box(ranges, n)
@@ -312,7 +316,7 @@ def saltelli(
         >>> vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 8).shape
         (32,)
     """
-    from scipy.stats import qmc  # imported here because the import is slow
+    from scipy.stats import qmc  # This import is slow.
 
     n, ranges = _require_count("saltelli", n), _require_one_form("saltelli", ranges, parameters)
     names, lower, upper, n = _parse_box(ranges, n)
@@ -350,6 +354,7 @@ def _make_generator(seed: int) -> np.random.Generator:
 def _parse_box(
     ranges: Mapping[str, ParameterRange], n: int
 ) -> tuple[list[str], np.ndarray, np.ndarray, int]:
+    """Return names, lower and upper bounds of the parameters, and the number of samples."""
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(
@@ -378,11 +383,11 @@ def _require_sweepable(values: Mapping[str, object]) -> Mapping:
 
 
 def _to_column(name: str, value: object) -> np.ndarray:
-    """Return the values of one parameter as an array of one axis; raise if they are not numbers."""
+    """Return the values of one parameter as a vector; raise if they are not numbers."""
     check_not_traced("a design", "use jax.vmap", value)
     try:
         column = np.atleast_1d(np.asarray(value))
-    except Exception:  # lists of lists of several lengths, or whatever a foreign object raises
+    except Exception:  # Lists may have different lengths, and a foreign object may raise anything.
         column = np.array([None])
     if column.dtype.kind not in "fiu" and column.size:
         raise TypeError(

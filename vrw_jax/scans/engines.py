@@ -37,9 +37,12 @@ from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import RIGID_MODEL_INDEX, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
-SAMPLES_PER_TASK, GAITS_PER_READ = 512, 64
-"""Number of samples per task of a thread, and number of gaits whose measures are read in one call;
-fixed, so that the result of a sample does not depend on the other samples."""
+SAMPLES_PER_TASK = 512
+"""Largest number of samples per task of a thread."""
+
+GAITS_PER_READ = 64
+"""Number of gaits whose measures are computed in one call, fixed so that the result of a sample
+does not depend on the other samples."""
 
 SampleMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -51,7 +54,7 @@ class UnilateralEngine:
     """Engine for unilateral contact and a fixed set of measures."""
 
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        measures, base, model, options, *_ = request  # walks find these gaits
+        measures, base, model, options, *_ = request
         self._base, self._model = base, model
         self._threads = count_cores() if threads is None else threads
         derivatives = tuple(d for name in measures if (d := parse_derivative(name)) is not None)
@@ -70,7 +73,7 @@ class UnilateralEngine:
         values = stack_parameters(columns, self._model, self._base)
         parts = np.array_split(values, max(self._threads, -(-len(values) // SAMPLES_PER_TASK)))
         first_part, *other_parts = (part for part in parts if len(part))
-        results = [self._evaluate_part(first_part)]  # the first call compiles for all threads
+        results = [self._evaluate_part(first_part)]  # The first call compiles for all threads.
         with ThreadPoolExecutor(self._threads) as pool:
             results += pool.map(self._evaluate_part, other_parts)
         return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
@@ -83,7 +86,7 @@ class UnilateralEngine:
         results = self._evaluate_gaits(
             values[has_enough_friction] if has_enough_friction.any() else values[:1]
         )
-        row = np.maximum(np.cumsum(has_enough_friction) - 1, 0)  # any row if there is no gait
+        row = np.maximum(np.cumsum(has_enough_friction) - 1, 0)  # Any row if there is no gait.
         results_of_all = {name: leaf[row] for name, leaf in results.items()}
         outcome = np.where(
             has_enough_friction, results_of_all.pop("outcome"), Outcome.NO_CYCLE_FOUND
@@ -173,7 +176,7 @@ class LadderEngine:
         return results | {"rung": rung, "reason": reason}
 
     def find_reasons(self, paper_results: ResultColumns, friction: np.ndarray) -> np.ndarray:
-        """Return `ModelChoice.reason` of each gait of the paper's model, over its repeated step."""
+        """Return `ModelChoice.reason_code` of each gait of the paper's model, over its step."""
         reason, _ = find_selection_reason(paper_results, friction - self._paper_model.friction)
         return np.asarray(reason, np.int8)
 
@@ -183,7 +186,7 @@ class ToleranceEngine:
 
     def __init__(self, request: EvaluationRequest) -> None:
         self._measures, self._base, self._model, *_, tol = request
-        assert tol is not None  # the caller has checked it
+        assert tol is not None
         self._tol = tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Scans: the steady gait of every sample of a design, as one labelled dataset.
+"""Scans: the steady gait of every sample of a design, as one labeled dataset.
 
 A scan is divided into chunks, which the same compiled function computes. If a store is given, each
 chunk is written as soon as it is computed. An interrupted scan continues with the missing chunks.
@@ -70,7 +70,7 @@ def scan(
     dask: str | None = None,
     tol: float | None = None,
 ) -> xr.Dataset:
-    """Return the steady gait of every sample with its outcome and margins, as a labelled dataset.
+    """Return the steady gait of every sample with its outcome and margins, as a labeled dataset.
 
     `measures` are names (see `vrw_jax.scans.measure_catalog`), including derivatives as in
     'd dls_fraction / d damping'. The variables have the requested names and order. The result of a
@@ -163,7 +163,7 @@ def run_scan(
 def _open_storage(scan_plan: ScanPlan, store: str | Path | None) -> AbstractStore:
     """Return the storage of a scan; warn if some of its chunks are damaged."""
     if store is None:
-        return MemoryStore(scan_plan.layout, scan_plan.attrs)
+        return MemoryStore(scan_plan.layout, scan_plan.store_attrs)
     storage = open_or_create_store(scan_plan, Path(store))
     if storage.damage_description:
         warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=4)
@@ -206,7 +206,7 @@ def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
     """Return the store at `path`, created if there is none; raise if it holds another scan."""
     storage = find_store(scan_plan, path)
     if storage is None:
-        create_store(path, scan_plan.layout, scan_plan.attrs)
+        create_store(path, scan_plan.layout, scan_plan.store_attrs)
         storage = find_store(scan_plan, path)
         assert storage is not None
     manifest = read_stored_manifest(path) or {}

@@ -80,7 +80,7 @@ def _measure_peak_memory() -> float:
     """Return the peak memory of this process, in bytes."""
     try:
         import resource
-    except ImportError:  # on Windows
+    except ImportError:  # Windows does not report it.
         return TYPICAL_MEMORY_BYTES
     unit = 1 if sys.platform == "darwin" else 1024
     return float(unit) * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,11 +1,10 @@
 """Integrity of a store: a checksum of each chunk's files, and a lock against a second writer.
 
 A chunk's mark is the digest of the scan's settings, the chunk's number and the files that hold its
-variables: it says that the chunk is done, and lets a damaged, truncated, deleted or moved file be
-noticed without opening any of them. The attributes of the group of marks list the scan's own
-variables, so that others are ignored, and repeat the store's attributes. Stores without that list
-have marks of the files alone. Stores of version 0.1 mark with a 1; there a chunk is read to see
-whether it can be.
+variables. A mark means that the chunk is written, and it reveals a damaged, truncated, deleted or
+moved file. The attributes of the group of marks list the scan's variables, so that others are
+ignored, and repeat the store's attributes. In stores without that list a mark is the digest of the
+files alone. In stores of version 0.1 it is a 1, and a chunk is intact if it can be read.
 """
 
 from __future__ import annotations
@@ -28,129 +27,163 @@ ZarrGroup = Any
 
 MANIFEST_ATTRIBUTE = "scan"
 """Name of the attribute that holds the settings of a scan."""
+
 LEGACY_MARKS_NAME = "chunk_done"
 """Name of the array of marks in a store of version 0.1."""
-CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME = "bookkeeping", "bookkeeping/digest"
-"""Names of the group of marks, which is hidden from users of the store, and of its array."""
+
+CHECKSUM_GROUP_NAME = "bookkeeping"
+"""Name of the group of marks, which is hidden from users of the store."""
+
+CHECKSUM_ARRAY_NAME = "bookkeeping/digest"
+"""Name of the array of marks."""
+
 DIGEST_SIZE_BYTES = 16
-"""Bytes of a digest."""
-VARIABLES, ATTRIBUTES, COORDINATES, SEAL = "variables", "attributes", "coordinates", "seal"
-"""Keys of the attributes of the group of marks; the last one is a digest of the others."""
-METADATA = "zarr.json"
+"""Size of a digest, chosen because stores have it."""
+
+VARIABLES_KEY = "variables"
+"""Key of the names of the scan's variables, in the attributes of the group of marks."""
+
+ATTRIBUTES_KEY = "attributes"
+"""Key of the copy of the store's attributes, in the attributes of the group of marks."""
+
+COORDINATES_KEY = "coordinates"
+"""Key of the digests of the coordinates, in the attributes of the group of marks."""
+
+SEAL_KEY = "seal"
+"""Key of the digest of all other attributes of the group of marks."""
+
+METADATA_FILE_NAME = "zarr.json"
+"""Name of the file that holds the metadata of an array or a group."""
 
 
 def read_manifest(attrs: Any) -> dict[str, Any]:
-    """Return the settings that a store or a labelled result was made with."""
+    """Return the settings with which a store or a labeled result was made."""
     manifest = attrs.get(MANIFEST_ATTRIBUTE, {})
     return json.loads(manifest) if isinstance(manifest, str) else dict(manifest)
 
 
-def seal(book: dict[str, Any]) -> dict[str, Any]:
+def seal_attributes(attributes: dict[str, Any]) -> dict[str, Any]:
     """Return the attributes of the group of marks with a digest of them."""
-    rest = {key: value for key, value in book.items() if key != SEAL}
-    return rest | {SEAL: _hex(json.dumps(rest, sort_keys=True).encode())}
+    content = {key: value for key, value in attributes.items() if key != SEAL_KEY}
+    return content | {SEAL_KEY: _hex_digest(json.dumps(content, sort_keys=True).encode())}
 
 
 def digest_values(values: np.ndarray) -> str:
     """Return the digest of a coordinate's values."""
-    return _hex(f"{values.dtype.str} {values.shape} ".encode() + values.tobytes())
+    return _hex_digest(f"{values.dtype.str} {values.shape} ".encode() + values.tobytes())
 
 
-def read_metadata(place: Path) -> dict[str, Any]:
-    """Return what a file of metadata holds; nothing if it can't be read."""
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Return the content of a file of metadata; empty if it cannot be read."""
     try:
-        told = json.loads(place.read_text(encoding="utf-8"))
+        metadata = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return told if isinstance(told, dict) else {}
+    return metadata if isinstance(metadata, dict) else {}
 
 
 class StoredMetadata:
-    """The metadata of a store as two copies: of each array its own, and all in one file."""
+    """Metadata of a store, which is kept twice: in a file per array, and in one file for all."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.root = path, read_metadata(path / METADATA)
-        attrs, whole = self.root.get("attributes"), self.root.get("consolidated_metadata")
-        whole = whole.get("metadata") if isinstance(whole, dict) else None
-        self.inline: dict[str, Any] = whole if isinstance(whole, dict) else {}
+        self._path, self.root = path, read_metadata(path / METADATA_FILE_NAME)
+        root_attrs = self.root.get("attributes")
+        consolidated = self.root.get("consolidated_metadata")
+        inline = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+        self.inline: dict[str, Any] = inline if isinstance(inline, dict) else {}
+        """Metadata of all arrays and groups by name, from the one file for all."""
         copies = [
-            self._attributes(x)
-            for x in (self.inline.get(CHECKSUM_GROUP_NAME), self._own(CHECKSUM_GROUP_NAME))
+            _get_attributes(metadata)
+            for metadata in (
+                self.inline.get(CHECKSUM_GROUP_NAME),
+                self._read_file_of(CHECKSUM_GROUP_NAME),
+            )
         ]
-        listed = [x for x in copies if isinstance(x.get(VARIABLES), list)]
-        self.book: dict[str, Any] = next((x for x in listed if x == seal(x)), (*listed, {})[0])
-        """Attributes of the group of marks, by the sound copy; empty in stores without them."""
-        told = self.book.get(ATTRIBUTES, {})
-        self._root_attrs = attrs if isinstance(attrs, dict) else {}
-        self.attrs: dict[str, Any] = self._root_attrs | told
-        """The store's attributes."""
-        self._books_differ = bool(listed) and copies[0] != copies[-1]
+        usable = [copy for copy in copies if isinstance(copy.get(VARIABLES_KEY), list)]
+        intact = (copy for copy in usable if copy == seal_attributes(copy))
+        self.mark_attrs: dict[str, Any] = next(intact, (*usable, {})[0])
+        """Attributes of the group of marks, from the intact copy; empty in stores without them."""
+        self._root_attrs = root_attrs if isinstance(root_attrs, dict) else {}
+        self.attrs: dict[str, Any] = self._root_attrs | self.mark_attrs.get(ATTRIBUTES_KEY, {})
+        """Attributes of the store."""
+        self._mark_attrs_differ = bool(usable) and copies[0] != copies[-1]
 
     @property
     def coordinates(self) -> list[str]:
-        told = self.book.get(COORDINATES)
-        return list(told) if told else str(self.attrs.get("coordinates", "")).split()
+        """Return the names of the coordinates."""
+        digests = self.mark_attrs.get(COORDINATES_KEY)
+        return list(digests) if digests else str(self.attrs.get("coordinates", "")).split()
 
-    def own_variables(self, names: Iterable[str]) -> list[str]:
-        """Return those of these arrays that the scan wrote, but coordinates."""
-        if VARIABLES in self.book:
-            return sorted(self.book[VARIABLES])
+    def select_variables(self, names: Iterable[str]) -> list[str]:
+        """Return the arrays among `names` that the scan wrote, without coordinates."""
+        if VARIABLES_KEY in self.mark_attrs:
+            return sorted(self.mark_attrs[VARIABLES_KEY])
         manifest = read_manifest(self.attrs)
         measures, swept = manifest.get("measures", []), manifest.get("design", {}).get("swept", [])
-        out_of = (*self.coordinates, *swept, LEGACY_MARKS_NAME)
-        return sorted(n for n in names if n not in out_of and (n in measures or _is_measure(n)))
+        excluded = (*self.coordinates, *swept, LEGACY_MARKS_NAME)
+        return sorted(n for n in names if n not in excluded and (n in measures or _is_measure(n)))
 
-    def damaged(self) -> list[str]:
-        """Return the arrays whose two copies differ, and "attributes" if the store's are others."""
-        known = [
-            n
-            for n, told in self.inline.items()
-            if self._is_array(told) and n != CHECKSUM_ARRAY_NAME
+    def find_damaged(self) -> list[str]:
+        """Return the arrays whose two copies differ, and "attributes" if those of the store do."""
+        arrays = [
+            name
+            for name, metadata in self.inline.items()
+            if name != CHECKSUM_ARRAY_NAME
+            and isinstance(metadata, dict)
+            and metadata.get("node_type") == "array"
         ]
-        names = [*self.coordinates, *self.own_variables(known)] if self.inline else []
+        names = [*self.coordinates, *self.select_variables(arrays)] if self.inline else []
         names += [CHECKSUM_ARRAY_NAME] if self.inline else []
-        found = [n for n in names if not self._own(n) or self._own(n) != self.inline.get(n)]
-        told = self.book.get(ATTRIBUTES, {})
-        differ = any(self._root_attrs.get(key, told[key]) != told[key] for key in told)
-        return found + [CHECKSUM_GROUP_NAME] * self._books_differ + ["attributes"] * differ
+        damaged = []
+        for name in names:
+            metadata = self._read_file_of(name)
+            if not metadata or metadata != self.inline.get(name):
+                damaged.append(name)
+        if self._mark_attrs_differ:
+            damaged.append(CHECKSUM_GROUP_NAME)
+        sealed_attrs = self.mark_attrs.get(ATTRIBUTES_KEY, {})
+        if any(self._root_attrs.get(key, value) != value for key, value in sealed_attrs.items()):
+            damaged.append("attributes")
+        return damaged
 
-    def mend(self, fresh: StoredMetadata) -> None:
-        """Write both copies of each array again, as in a store of the same scan made afresh."""
-        arrays = fresh.inline | {
-            CHECKSUM_GROUP_NAME: fresh.inline[CHECKSUM_GROUP_NAME] | {"attributes": self.book}
+    def rewrite(self, intact: StoredMetadata) -> None:
+        """Write both copies of all metadata, as in an intact new store of the same scan."""
+        arrays = intact.inline | {
+            CHECKSUM_GROUP_NAME: intact.inline[CHECKSUM_GROUP_NAME]
+            | {"attributes": self.mark_attrs}
         }
-        others = {name: told for name, told in self.inline.items() if name not in arrays}
-        whole = {"kind": "inline", "must_understand": False, "metadata": arrays | others}
-        root = fresh.root | {"attributes": self.attrs, "consolidated_metadata": whole}
-        for name, told in [*arrays.items(), ("", root)]:
-            place = self._path / name / METADATA
-            if read_metadata(place) != told:
-                place.parent.mkdir(parents=True, exist_ok=True)
-                unfinished = place.with_name(f"{METADATA}.partial")
-                unfinished.write_text(json.dumps(told, indent=2), encoding="utf-8")
-                unfinished.replace(place)
+        others = {name: metadata for name, metadata in self.inline.items() if name not in arrays}
+        consolidated = {"kind": "inline", "must_understand": False, "metadata": arrays | others}
+        root = intact.root | {"attributes": self.attrs, "consolidated_metadata": consolidated}
+        for name, metadata in [*arrays.items(), ("", root)]:
+            path = self._path / name / METADATA_FILE_NAME
+            if read_metadata(path) != metadata:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                unfinished = path.with_name(f"{METADATA_FILE_NAME}.partial")
+                unfinished.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+                unfinished.replace(path)
 
-    def _own(self, name: str) -> dict[str, Any]:
-        return read_metadata(self._path / name / METADATA)
+    def _read_file_of(self, name: str) -> dict[str, Any]:
+        """Return the metadata in the file of one array or group."""
+        return read_metadata(self._path / name / METADATA_FILE_NAME)
 
-    @staticmethod
-    def _attributes(told: object) -> dict[str, Any]:
-        attrs = told.get("attributes") if isinstance(told, dict) else None
-        return attrs if isinstance(attrs, dict) else {}
 
-    @staticmethod
-    def _is_array(told: object) -> bool:
-        return isinstance(told, dict) and told.get("node_type") == "array"
+def _get_attributes(metadata: object) -> dict[str, Any]:
+    """Return the attributes in the metadata of an array or group; empty if there are none."""
+    attrs = metadata.get("attributes") if isinstance(metadata, dict) else None
+    return attrs if isinstance(attrs, dict) else {}
 
 
 def _is_measure(name: str) -> bool:
+    """Return whether a variable of this name is a measure of a scan."""
     try:
         return parse_derivative(name) is None and bool(get_variable_attrs(name))
     except (KeyError, ValueError):
         return False
 
 
-def _hex(content: bytes) -> str:
+def _hex_digest(content: bytes) -> str:
+    """Return the digest of some bytes as hexadecimal text."""
     return hashlib.blake2b(content, digest_size=DIGEST_SIZE_BYTES).hexdigest()
 
 
@@ -162,11 +195,13 @@ class ChunkChecksums:
         self._is_legacy = LEGACY_MARKS_NAME in group
         self._marks = group[LEGACY_MARKS_NAME if self._is_legacy else CHECKSUM_ARRAY_NAME]
         names = [name for name, _ in group.arrays()]
-        self._arrays = {name: group[name] for name in metadata.own_variables(names)}
+        self._arrays = {name: group[name] for name in metadata.select_variables(names)}
         outcome = self._arrays["outcome"]
         self._counts = tuple(-(-n // c) for n, c in zip(outcome.shape, outcome.chunks, strict=True))
-        settings = json.dumps(read_manifest(metadata.attrs), sort_keys=True)
-        self._settings = _hex(settings.encode()) if VARIABLES in metadata.book else ""
+        self._settings_digest = ""  # It is empty if marks are digests of the files alone.
+        if VARIABLES_KEY in metadata.mark_attrs:
+            settings = json.dumps(read_manifest(metadata.attrs), sort_keys=True)
+            self._settings_digest = _hex_digest(settings.encode())
 
     def is_chunk_marked(self) -> np.ndarray:
         """Return whether each chunk is marked, shape (chunks,)."""
@@ -193,10 +228,13 @@ class ChunkChecksums:
         return [int(i) for i in np.flatnonzero(_are_marks_set(marks)) if not is_intact(int(i))]
 
     def find_damaged_coordinates(self) -> list[str]:
-        """The coordinates whose values are not those that were written; before there were digests
-        of each, the swept parameters, if their values are not those of the samples."""
-        if COORDINATES in self._metadata.book:
-            digests = self._metadata.book[COORDINATES].items()
+        """Return the coordinates whose values differ from what was written.
+
+        In stores without a digest of each coordinate, return the swept parameters if their values
+        are not those of the samples.
+        """
+        if COORDINATES_KEY in self._metadata.mark_attrs:
+            digests = self._metadata.mark_attrs[COORDINATES_KEY].items()
             return [name for name, digest in digests if self._coordinate_digest(name) != digest]
         design = read_manifest(self._metadata.attrs).get("design", {})
         if "digest" not in design:
@@ -209,6 +247,7 @@ class ChunkChecksums:
         return [] if is_intact else list(design["swept"])
 
     def _coordinate_digest(self, name: str) -> str:
+        """Return the digest of a coordinate's values, or "" if they cannot be read."""
         try:
             return digest_values(np.asarray(self._group[name][:]))
         except (KeyError, *READ_ERRORS):
@@ -229,13 +268,13 @@ class ChunkChecksums:
     def _compute_chunk_digest(self, index: int) -> np.ndarray:
         """Return the digest of the files of a chunk, as bytes."""
         digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
-        if self._settings:  # else of a store whose marks cover the files alone
-            digest.update(f"{self._settings} {index} ".encode())
+        if self._settings_digest:
+            digest.update(f"{self._settings_digest} {index} ".encode())
         for name in self._arrays:
             try:
                 data = self._chunk_file(name, index).read_bytes()
             except OSError:
-                data = b"none"  # zarr writes no file if all values of a chunk are missing
+                data = b"none"  # Zarr writes no file if all values of a chunk are missing.
             digest.update(f"{name} {len(data)} ".encode() + data)
         return np.frombuffer(digest.digest(), np.uint8)
 
@@ -248,22 +287,17 @@ class ChunkChecksums:
             return False
         outcome = np.asarray(variables.pop("outcome"))
         has_gait = outcome == Outcome.STEPPED
-        is_file_absent = [not self._chunk_file(name, index).exists() for name in variables]
-        is_lost = [
-            is_absent and not _holds_numbers(x[has_gait])
-            for is_absent, x in zip(is_file_absent, variables.values(), strict=True)
-        ]
+        is_lost = []
+        for name, variable in variables.items():
+            values = variable[has_gait]
+            has_no_number = values.size and bool(np.all(np.isnan(values) | (values == -1)))
+            is_lost.append(has_no_number and not self._chunk_file(name, index).exists())
         return bool(np.all(outcome >= 0)) and not any(is_lost)
 
 
 def _are_marks_set(marks: np.ndarray) -> np.ndarray:
     """Return whether the mark of each chunk is set, shape (chunks,)."""
     return np.any(marks.reshape(len(marks), -1) != 0, axis=1)
-
-
-def _holds_numbers(values: np.ndarray) -> bool:
-    """Return whether some value of a gait is a number; true if there is no gait."""
-    return not values.size or not bool(np.all(np.isnan(values) | (values == -1)))
 
 
 READ_ERRORS = (OSError, ValueError, RuntimeError)
@@ -273,7 +307,7 @@ READ_ERRORS = (OSError, ValueError, RuntimeError)
 def describe_damage(
     location: object, chunks: list[int], coordinates: list[str], metadata: list[str]
 ) -> str:
-    """In words what is damaged; empty where nothing is."""
+    """Return a sentence about the damage of a store, or "" if there is none."""
     parts = []
     if chunks:
         chunks_text = ", ".join(map(str, chunks[:10])) + (", ..." if len(chunks) > 10 else "")
@@ -291,7 +325,7 @@ def store_lock(path: Path) -> Iterator[None]:
     try:
         import fcntl
         import os
-    except ImportError:  # not on Windows
+    except ImportError:  # Windows has no such locks.
         yield
         return
     descriptor = os.open(path, os.O_RDONLY)
@@ -304,7 +338,7 @@ def store_lock(path: Path) -> Iterator[None]:
                 "again, or give another place."
             ) from error
         except OSError:
-            pass  # a file system without locks
+            pass  # The file system has no locks.
         yield
     finally:
         os.close(descriptor)

@@ -49,9 +49,7 @@ class MeasureCatalog(NamedTuple):
     requestable: tuple[str, ...]
     always_included: tuple[str, ...]  # in every scan, requested or not
     differentiable: tuple[str, ...]
-    differentiation_parameters: tuple[
-        str, ...
-    ]  # parameters with respect to which derivatives are taken
+    differentiation_parameters: tuple[str, ...]  # of derivatives
     default_measures: tuple[str, ...]
     forecast_samples_per_core: int  # samples per core that a forecast computes
 
@@ -127,15 +125,16 @@ class MeasureDerivative(NamedTuple):
         return f"d_{self.measure}_d_{self.parameter}"
 
     @property
-    def attrs(self) -> dict[str, object]:
+    def variable_attrs(self) -> dict[str, object]:
         """Return unit, name, symbol and description of the derivative."""
-        above, below = MEASURES[self.measure], MEASURES[self.parameter]
-        units = {unit for unit in (above.unit, below.unit) if unit != "1"}
-        unit = "1" if not units else above.unit if below.unit == "1" else None
+        measure, parameter = MEASURES[self.measure], MEASURES[self.parameter]
+        unit = f"{measure.unit}/({parameter.unit})"
+        if parameter.unit == "1":
+            unit = measure.unit
         return {
-            "units": unit or f"{above.unit}/({below.unit})",
-            "long_name": f"derivative of {above.long_name} by {below.long_name}",
-            "symbol": f"∂({above.symbol})/∂{below.symbol}",
+            "units": unit,
+            "long_name": f"derivative of {measure.long_name} by {parameter.long_name}",
+            "symbol": f"∂({measure.symbol})/∂{parameter.symbol}",
             "description": "Along the branch of limit cycles, by the implicit function theorem.",
         }
 
@@ -197,5 +196,5 @@ def get_variable_attrs(name: str) -> dict[str, object]:
     if name.removesuffix(ERROR_SUFFIX) in MEASURE_FUNCTIONS and name.endswith(ERROR_SUFFIX):
         measure = MEASURES[name.removesuffix(ERROR_SUFFIX)]
         return {"units": measure.unit, "long_name": f"bound of the error of {measure.long_name}"}
-    requested_derivative = parse_derivative(name)
-    return measure_attrs(name) if requested_derivative is None else requested_derivative.attrs
+    derivative = parse_derivative(name)
+    return measure_attrs(name) if derivative is None else derivative.variable_attrs

@@ -45,11 +45,11 @@ MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples, chosen because it takes over a day and some hundred GB."""
 
 DEFAULT_CHUNK_SIZE = 4096
-"""Default number of samples per chunk; a killed scan can lose so many."""
+"""Default number of samples per chunk, which a killed scan may lose."""
 
 STORED_KINDS = {"StepOptions": "Options"}
-"""Names of classes in stores, where they differ from the names in Python: stores of version 0.1
-keep opening."""
+"""Names of classes in stores, if they differ from the names in Python."""
+
 STORED_FIELD_NAMES = {
     "StepOptions": {
         "dt0": "first_step",
@@ -66,19 +66,22 @@ STORED_FIELD_NAMES = {
     },
     "UnilateralWheel": {"infinite_friction_rule": "infinite"},
 }
-"""Names of fields in stores, where they differ from the names in Python, by class."""
+"""Names of fields in stores by class, if they differ from the names in Python."""
+
 STORED_MODEL_NAMES = {
     "model_name": "rung",
     "reports_contacts": "tells_contacts",
     "batch_kernel": "lanes",
     "is_compliant": "legs_yield",
 }
-"""Names in stores of the class variables of all models, where they differ from those in Python."""
+"""Names of class variables of models in stores, if they differ from the names in Python."""
 
 EvaluateSamples = Callable[[SampleColumns], Mapping[str, np.ndarray]]
 """Function that returns the results of samples by variable, with the axis of samples first."""
+
 ChunkResult = tuple[int, Mapping[str, np.ndarray]]
 """Index of a chunk and its results."""
+
 ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
 """Function that computes chunks of a plan, given by index, and yields them in any order."""
 
@@ -111,13 +114,13 @@ class ScanPlan:
         } | ({} if tol is None else {"tol": tol})
 
     @property
-    def attrs(self) -> dict[str, object]:
-        """Return the attributes of the labelled result."""
+    def store_attrs(self) -> dict[str, object]:
+        """Return the attributes of the labeled result and its store."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
             f"{', '.join(self.design.names)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST_ATTRIBUTE: json.dumps(self.settings),  # text: other formats take no tables
+            MANIFEST_ATTRIBUTE: json.dumps(self.settings),  # Other formats have no tables.
             PROVENANCE_ATTRIBUTE: json.dumps(describe_environment()),
             REQUESTED_ATTRIBUTE: ", ".join(self.requested_measures),
             "config": self.config_text,
@@ -280,7 +283,7 @@ def _record_fields(settings: object) -> dict[str, object]:
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
         if isinstance(value, StepOptions | ModelCapabilities):
-            continue  # options are recorded separately, capabilities are code
+            continue  # Options are recorded separately, and capabilities are code.
         if value is None or isinstance(value, bool | int | str):
             record[stored_names.get(name, name)] = value
         elif isinstance(value, tuple):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,16 +18,23 @@ from vrw_jax.scans.integrity import read_manifest
 from vrw_jax.validation import check_names, check_type, suggest_name
 from vrw_jax.wheel import Outcome
 
-MIN_SOBOL_ROWS = 64
-"""Least number of rows, chosen because indices of fewer rows are noise."""
 
-N_RESAMPLES, INTERVAL_QUANTILES = 200, (0.025, 0.975)
-"""Number of bootstrap resamples of the rows, and quantiles that bound the interval."""
+@dataclass(frozen=True)
+class SobolOptions:
+    """Numbers of the estimate of Sobol' indices.
 
-MAX_ROUNDOFF_SPREAD = 1e-11
-"""Largest spread of a measure, as a fraction of its largest magnitude, that counts as round-off;
-chosen because parameters that differ in their last digit alone leave measures spread by 4e-14 of
-it, and margins by 5e-12."""
+    - `min_rows`: smallest number of rows, chosen because indices of fewer rows are noise;
+    - `n_resamples`: number of bootstrap resamples of the rows;
+    - `interval_quantiles`: quantiles that bound the interval, chosen for a 95 % interval;
+    - `max_roundoff_spread`: largest spread of a measure, as a fraction of its largest magnitude,
+      that counts as round-off. It is chosen because the spread of measures is 4e-14 of it, and that
+      of margins 5e-12, if parameters differ in their last digit alone.
+    """
+
+    min_rows: int = 64
+    n_resamples: int = 200
+    interval_quantiles: tuple[float, float] = (0.025, 0.975)
+    max_roundoff_spread: float = 1e-11
 
 
 def sobol_indices(
@@ -34,13 +42,16 @@ def sobol_indices(
 ) -> xr.Dataset:
     """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
-    The first-order index is the share of a measure's variance that one parameter makes by itself,
-    the total index the share that would vanish if it were known; each with `lower` and `upper` of a
-    95 % bootstrap interval. Rows with a sample that has no gait are left out, then as many more as
-    leave a power of two: `rows` of them count, and `left_out` is the share without a gait. Where it
-    is not small, the indices are those of gaits only, whose parameters are no longer independent.
-    A measure that varies by no more than round-off has no variance to share: its indices are 0, it
-    is marked in `is_constant`, and a warning names it.
+    The first-order index is the share of a measure's variance that one parameter causes by itself.
+    The total index is the share that would vanish if the parameter were known. Each has the bounds
+    `lower` and `upper` of a 95 % bootstrap interval.
+
+    Rows with a sample without a gait are omitted, and then more rows, so that their number `rows`
+    is a power of two. `left_out` is the share of rows without a gait. If it is not small, the
+    indices are those of gaits only, whose parameters are no longer independent.
+
+    A measure that varies by no more than round-off has no variance: its indices are 0, it is marked
+    in `is_constant`, and a warning names it.
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
@@ -72,25 +83,29 @@ def sobol_indices(
                 f"{name!r} is no measure of this scan{suggest_name(name, map(str, scan))}: "
                 "ask for one that was scanned."
             )
+    options = SobolOptions()
     n_blocks = 2 + len(parameters)
     has_gaits = (scan.outcome.values == Outcome.STEPPED).reshape(n_blocks, -1).all(axis=0)
     rows_with_gaits = np.flatnonzero(has_gaits)
     n = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
-    if n < MIN_SOBOL_ROWS:
+    if n < options.min_rows:
         raise ValueError(
             f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices "
-            f"need {MIN_SOBOL_ROWS}: narrow the ranges to where there are gaits, or take more rows."
+            f"need {options.min_rows}: narrow the ranges to where there are gaits, or take more "
+            "rows."
         )
     rows = rows_with_gaits[:n]
     measure_values = np.stack(
         [scan[name].values.reshape(n_blocks, -1)[:, rows] for name in measure_names], axis=1
     )
 
-    generator = np.random.default_rng(0)  # the same scan gives the same intervals
-    compute_indices = _SobolIndices(measure_values)
+    generator = np.random.default_rng(0)  # The same scan gives the same intervals.
+    compute_indices = _SobolIndices(measure_values, options.max_roundoff_spread)
     estimates = compute_indices(np.arange(n))
-    resampled_estimates = [compute_indices(generator.integers(0, n, n)) for _ in range(N_RESAMPLES)]
-    lower, upper = np.quantile(resampled_estimates, INTERVAL_QUANTILES, axis=0)
+    resampled_estimates = [
+        compute_indices(generator.integers(0, n, n)) for _ in range(options.n_resamples)
+    ]
+    lower, upper = np.quantile(resampled_estimates, options.interval_quantiles, axis=0)
     constant = compute_indices.is_constant(measure_values)
     if constant.any():
         warnings.warn(
@@ -112,11 +127,15 @@ def sobol_indices(
 
 
 class _SobolIndices:
-    """First-order and total indices from rows of a design, by measure and parameter."""
+    """Estimator of first-order and total indices from rows of a design.
 
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values  # (2 + parameters, measures, rows)
-        self.roundoff = MAX_ROUNDOFF_SPREAD * np.abs(values).max(axis=(0, 2))
+    - `values`: measures of the samples, shape (2 + parameters, measures, rows);
+    - `roundoff`: spread of each measure that counts as round-off.
+    """
+
+    def __init__(self, values: np.ndarray, max_roundoff_spread: float) -> None:
+        self.values = values
+        self.roundoff = max_roundoff_spread * np.abs(values).max(axis=(0, 2))
 
     def is_constant(self, values: np.ndarray) -> np.ndarray:
         """Return for each measure whether it varies by round-off alone between these samples."""
@@ -124,17 +143,17 @@ class _SobolIndices:
         return constant
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return both indices from some of the rows; 0 where nothing varies."""
-        from scipy.stats import sobol_indices as indices_of
+        """Return the indices from these rows, shape (2, measures, parameters); 0 of constants."""
+        from scipy.stats import sobol_indices as compute_sobol_indices
 
-        drawn = self.values[..., rows]
-        varies = np.flatnonzero(~self.is_constant(drawn))
-        n_blocks, n_measures, _ = drawn.shape
-        both = np.zeros((2, n_measures, n_blocks - 2))
-        if len(varies):
-            drawn = drawn[:, varies]
-            functions = {"f_A": drawn[0], "f_B": drawn[1], "f_AB": drawn[2:]}
-            found = indices_of(func=functions, n=len(rows))
-            both[0, varies] = np.reshape(found.first_order, (len(varies), -1))
-            both[1, varies] = np.reshape(found.total_order, (len(varies), -1))
-        return both
+        drawn_values = self.values[..., rows]
+        varying = np.flatnonzero(~self.is_constant(drawn_values))
+        n_blocks, n_measures, _ = drawn_values.shape
+        indices = np.zeros((2, n_measures, n_blocks - 2))
+        if len(varying):
+            drawn_values = drawn_values[:, varying]
+            functions = {"f_A": drawn_values[0], "f_B": drawn_values[1], "f_AB": drawn_values[2:]}
+            estimate = compute_sobol_indices(func=functions, n=len(rows))
+            indices[0, varying] = np.reshape(estimate.first_order, (len(varying), -1))
+            indices[1, varying] = np.reshape(estimate.total_order, (len(varying), -1))
+        return indices

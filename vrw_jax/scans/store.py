@@ -26,20 +26,21 @@ from vrw_jax.measures import MEASURES
 from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.integrity import (
-    ATTRIBUTES,
+    ATTRIBUTES_KEY,
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,
-    COORDINATES,
+    COORDINATES_KEY,
     DIGEST_SIZE_BYTES,
     LEGACY_MARKS_NAME,
     MANIFEST_ATTRIBUTE,
-    VARIABLES,
+    METADATA_FILE_NAME,
+    VARIABLES_KEY,
     ChunkChecksums,
     StoredMetadata,
     describe_damage,
     digest_values,
     read_manifest,
-    seal,
+    seal_attributes,
     store_lock,
 )
 from vrw_jax.scans.measure_catalog import canonicalize_name
@@ -51,8 +52,11 @@ if TYPE_CHECKING:
 else:
     zarr = lazy_import("zarr")
 
-PROVENANCE_ATTRIBUTE, REQUESTED_ATTRIBUTE = "provenance", "asked"
-"""Names of the attributes that hold the origin of the numbers and the requested measures."""
+PROVENANCE_ATTRIBUTE = "provenance"
+"""Name of the attribute that holds the origin of the numbers."""
+
+REQUESTED_ATTRIBUTE = "asked"
+"""Name of the attribute that holds the requested measures."""
 
 ChunkRegion = tuple[slice, ...]
 """Slices of a chunk along the axes of the samples."""
@@ -127,7 +131,7 @@ def choose_chunk_shape(shape: tuple[int, ...], max_samples: int) -> tuple[int, .
 
 
 class AbstractStore(abc.ABC):
-    """Storage that accepts chunks, lists the missing ones and returns the labelled result."""
+    """Storage that accepts chunks, lists the missing ones and returns the labeled result."""
 
     location: str = "memory"
     damage_description: str = ""
@@ -143,7 +147,7 @@ class AbstractStore(abc.ABC):
 
     @abc.abstractmethod
     def load_dataset(self) -> xr.Dataset:
-        """Return the labelled result."""
+        """Return the labeled result."""
 
     @abc.abstractmethod
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
@@ -203,21 +207,22 @@ class ZarrStore(AbstractStore):
         self._path, self._layout, self.location, self._verify = path, layout, str(path), verify
         self._open()
         self.damage_description = describe_damage(
-            path, self.damaged_chunks, self._damaged_coordinates, self._metadata
+            path, self.damaged_chunks, self._damaged_coordinates, self._damaged_metadata
         )
 
     def _open(self) -> None:
+        """Open the arrays and find damage; arrays with damaged metadata stay closed."""
         metadata, self._checksums = StoredMetadata(self._path), None
-        self._metadata = metadata.damaged() if self._verify else []
+        self._damaged_metadata = metadata.find_damaged() if self._verify else []
         self.damaged_chunks: list[int] = []
         self._damaged_coordinates: list[str] = []
         try:
             self._group = _open_group(self._path, "r+", metadata)
             self._checksums = ChunkChecksums(self._path, self._group, metadata)
-        except NOT_METADATA:
-            if not self._metadata:
+        except METADATA_ERRORS:
+            if not self._damaged_metadata:
                 raise
-            return  # they are mended before anything is written
+            return  # They are written again before anything else is.
         if self._verify:
             self.damaged_chunks = self._checksums.find_damaged_chunks()
             self._damaged_coordinates = self._checksums.find_damaged_coordinates()
@@ -245,8 +250,8 @@ class ZarrStore(AbstractStore):
         with store_lock(self._path):
             for path in self._path.rglob("*.partial"):
                 path.unlink(missing_ok=True)
-            if self._metadata:
-                _mend_metadata(self._path, self._layout)
+            if self._damaged_metadata:
+                _rewrite_metadata(self._path, self._layout)
                 self._open()
             for name in self._damaged_coordinates:
                 _get_array(self._group, name)[:] = self._layout.coordinates[name][1]
@@ -262,7 +267,7 @@ def _get_array(group: zarr.Group, name: str) -> zarr.Array:
 
 
 def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
-    """Return the labelled result of a scan, finished or not; values are read when they are used.
+    """Return the labeled result of a scan, finished or not; values are read when they are used.
 
     In an unfinished scan, samples that are not yet computed have the outcome -1 and the measures
     NaN. A store with damaged files is refused; `verify=False` opens it without that check.
@@ -286,17 +291,20 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
     check_type("path", path, (str, Path), "give the folder that a scan wrote")
-    metadata = _open_scan_group(Path(path))
-    broken = metadata.damaged() if verify else []
+    metadata = _read_scan_metadata(Path(path))
+    damaged_metadata = metadata.find_damaged() if verify else []
     try:
         group = _open_group(Path(path), "r", metadata)
         checksums = ChunkChecksums(Path(path), group, metadata)
         if verify:
             damage_description = describe_damage(
-                path, checksums.find_damaged_chunks(), checksums.find_damaged_coordinates(), broken
+                path,
+                checksums.find_damaged_chunks(),
+                checksums.find_damaged_coordinates(),
+                damaged_metadata,
             )
             if damage_description:
-                raise ValueError(f"{damage_description}: {ANEW}")
+                raise ValueError(f"{damage_description}: {RECOMPUTE_REMEDY}")
         dataset = xr.open_zarr(
             path,
             consolidated=group.metadata.consolidated_metadata is not None,
@@ -304,13 +312,13 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
             mask_and_scale=False,
             decode_times=False,
         )
-    except NOT_METADATA as error:
-        if isinstance(error, ValueError) and ANEW in str(error):
+    except METADATA_ERRORS as error:
+        if isinstance(error, ValueError) and RECOMPUTE_REMEDY in str(error):
             raise
-        what = ", ".join(broken) or " ".join(str(error).split()).rstrip(".")
+        reason = ", ".join(damaged_metadata) or " ".join(str(error).split()).rstrip(".")
         raise ValueError(
-            f"{path} can't be opened ({what}): run the scan again, which mends the arrays that it "
-            "wrote, and delete others without dimension names."
+            f"{path} can't be opened ({reason}): run the scan again, which mends the arrays that "
+            "it wrote, and delete others without dimension names."
         ) from error
     dataset = dataset.assign_attrs({k: v for k, v in metadata.attrs.items() if k != "coordinates"})
     return _arrange_as_requested(
@@ -318,26 +326,27 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     )
 
 
-ANEW = (
+RECOMPUTE_REMEDY = (
     "run the scan again, which computes these anew, or read the rest with "
     "open_scan(path, verify=False)."
 )
-NOT_METADATA = (
+METADATA_ERRORS = (
     ArithmeticError, AssertionError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
-"""What zarr, its codecs and xarray raise for metadata that they can't make sense of."""
+"""Exceptions that zarr, its codecs and xarray raise for metadata that they cannot interpret."""
 
 
 def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) -> zarr.Group:
-    """Open a store by whichever copy of its metadata can be read; the one in its file first."""
+    """Open a store by the first copy of its metadata that can be read."""
+    variables = metadata.mark_attrs.get(VARIABLES_KEY, ())
     for consolidated in (None, False):
         try:
             group = zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=consolidated)
-            for name in (*metadata.coordinates, *metadata.book.get(VARIABLES, ()), "outcome"):
+            for name in (*metadata.coordinates, *variables, "outcome"):
                 _get_array(group, name)
             return group
-        except NOT_METADATA:
+        except METADATA_ERRORS:
             if consolidated is False:
                 raise
     raise AssertionError
@@ -394,7 +403,8 @@ def _split_legacy_stability_margin(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.assign(stability_margin=paper_margin)
 
 
-def _open_scan_group(path: Path) -> StoredMetadata:
+def _read_scan_metadata(path: Path) -> StoredMetadata:
+    """Return the metadata of a store; raise if it is not a store of a scan."""
     metadata = StoredMetadata(path)
     if metadata.root.get("node_type") != "group" or metadata.root.get("zarr_format") != 3:
         raise ValueError(
@@ -411,7 +421,7 @@ def read_stored_manifest(path: Path) -> dict | None:
     """Return the settings and provenance of the store at `path`, or None if there is no store."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
-    attrs = _open_scan_group(path).attrs
+    attrs = _read_scan_metadata(path).attrs
     try:
         origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
         origin = json.loads(origin) if isinstance(origin, str) else origin
@@ -464,7 +474,7 @@ def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
     group_attrs = {**attrs, "coordinates": " ".join(layout.coordinates)}
     group = zarr.create_group(path, zarr_format=3, attributes=group_attrs)
-    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # the checksum reveals damage
+    compressors = [ZstdCodec(level=3), Crc32cCodec()]  # The checksum reveals damage.
     for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
         array = group.create_array(
             name,
@@ -488,48 +498,38 @@ def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]
             attributes=dict(variable.attrs),
         )
     chunks = (layout.n_chunks, DIGEST_SIZE_BYTES)
-    book = seal(
+    mark_attrs = seal_attributes(
         {
-            VARIABLES: [variable.name for variable in layout.variables],
-            COORDINATES: {
+            VARIABLES_KEY: [variable.name for variable in layout.variables],
+            COORDINATES_KEY: {
                 name: digest_values(np.asarray(values))
                 for name, (_, values, _) in layout.coordinates.items()
             },
-            ATTRIBUTES: dict(group_attrs),
+            ATTRIBUTES_KEY: dict(group_attrs),
         }
     )
-    group.create_group(CHECKSUM_GROUP_NAME, attributes=book).create_array(
+    group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attrs).create_array(
         "digest", shape=chunks, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
     )
-    _consolidate_metadata(
-        path,
-        [
-            *layout.coordinates,
-            *(v.name for v in layout.variables),
-            CHECKSUM_GROUP_NAME,
-            CHECKSUM_ARRAY_NAME,
-        ],
-    )
+    # Write all metadata into one file in this order; zarr's function for it sorts and warns.
+    names = [*layout.coordinates, *(variable.name for variable in layout.variables)]
+    parts = {
+        name: json.loads((path / name / METADATA_FILE_NAME).read_text())
+        for name in (*names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
+    }
+    root_path = path / METADATA_FILE_NAME
+    root = json.loads(root_path.read_text())
+    root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": parts}
+    root_path.write_text(json.dumps(root, indent=2))
 
 
-def _consolidate_metadata(path: Path, names: list[str]) -> None:
-    """Write all metadata into one file in the given order; zarr's own function sorts and warns."""
-    metadata_path = path / "zarr.json"
-    metadata = json.loads(metadata_path.read_text())
-    parts = {name: json.loads((path / name / "zarr.json").read_text()) for name in names}
-    consolidated = {"kind": "inline", "must_understand": False, "metadata": parts}
-    metadata_path.write_text(
-        json.dumps(metadata | {"consolidated_metadata": consolidated}, indent=2)
-    )
-
-
-def _mend_metadata(path: Path, layout: ResultLayout) -> None:
-    """Write the metadata of the scan's own arrays again, as in a store made anew beside it."""
+def _rewrite_metadata(path: Path, layout: ResultLayout) -> None:
+    """Write the metadata of the scan's arrays as in a new store, which is made temporarily."""
     stored = StoredMetadata(path)
-    building = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+    temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
     try:
-        building.mkdir()
-        _create_arrays(building, layout, stored.attrs)
-        stored.mend(StoredMetadata(building))
+        temporary_path.mkdir()
+        _create_arrays(temporary_path, layout, stored.attrs)
+        stored.rewrite(StoredMetadata(temporary_path))
     finally:
-        shutil.rmtree(building, ignore_errors=True)
+        shutil.rmtree(temporary_path, ignore_errors=True)
