@@ -34,9 +34,9 @@ LEGS = (6, 8, 10)
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-MAX_UNSPLIT_LENGTH = 64
-"""Arrays so small are kept whole where a walk on real ground is taken apart: of ten legs the code
-is else five times as long."""
+UNSPLIT_LIMITS = simd.RegisterLimits(max_unrolled=64)
+"""Limits with which small arrays stay whole in a walk with unilateral contact: for ten legs the
+code is five times as long otherwise."""
 
 SOLVER = StepOptions.__dataclass_fields__["solver"].default
 
@@ -46,13 +46,13 @@ class Program(NamedTuple):
 
     function: Callable[..., tuple]
     numbers: int
-    max_unrolled: int = simd.MAX_UNROLLED
+    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS
     section: int = 3
 
     def object(self, name: str) -> bytes:
         """As code for WebAssembly."""
         rows = len(PARAMETER_NAMES), self.section
-        return simd.compile_wasm_object(self.function, self.numbers, rows, name, self.max_unrolled)
+        return simd.compile_wasm_object(self.function, self.numbers, rows, name, self.limits)
 
 
 PAGE_MARGINS = {name: m for name, m in MARGIN_MEASURES.items() if name != "takeoff_acceleration"}
@@ -222,7 +222,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
     return {
         "ground_begun": Program(begun, 0),
         "ground_opened": Program(opened, 2, section=size),
-        "ground_onward": Program(onward, 2, MAX_UNSPLIT_LENGTH, _size(form)),
+        "ground_onward": Program(onward, 2, UNSPLIT_LIMITS, _size(form)),
         "ground_between": Program(between, 2, section=2 * n + 2 * n_legs + 1),
     }
 

@@ -26,6 +26,7 @@ from vrw_jax.integrator.tableaus import (
     real_stability_limit,
     rk_step,
 )
+from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.trigonometry import sine_cosine
 
 STARTS = truth.stack_quantity("step", "start")
@@ -169,14 +170,14 @@ COARSE_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60, rtol=1e-4,
 def test_xla_blocks_agree_with_machine_code(monkeypatch):
     vectors, states = draw_hard_starts(300)
     solution, codes = compute_values(vectors, states, COARSE_OPTIONS)
-    monkeypatch.setattr(simd, "serves", lambda: False)
-    monkeypatch.setattr(programs, "BLOCK", 64)
-    monkeypatch.setattr(programs, "FEW", 10**9)  # waits for all
+    monkeypatch.setattr(simd, "is_available", lambda: False)
+    monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
+    monkeypatch.setattr(programs, "STRAGGLER_DIVISOR", 10**9)  # no block stops early
     patient, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, solution, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(programs, "FEW", 2)  # late lanes run again, and change no bit
+    monkeypatch.setattr(programs, "STRAGGLER_DIVISOR", 2)  # stragglers run again
     second_result, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(second_result, patient)
     np.testing.assert_array_equal(code, codes)
@@ -480,7 +481,7 @@ def test_wheels_too_stiff_for_an_explicit_solver_use_an_implicit_one():
     batch_result = vrw.step_batch(truth.make_wheels(vectors), starts, options=options)
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Tsit5",
-        lane_batch.IMPLICIT_SOLVER,
+        lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
     ]
     assert list(batch_result.outcome) == [Outcome.STEPPED, Outcome.STEPPED]
     _, explicit = compute_values(vectors, starts, options, engine="lanes")
@@ -498,7 +499,10 @@ def test_a_stiff_wheel_with_an_unexpectedly_long_phase_uses_an_implicit_solver()
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
     batch_result = vrw.step_batch(truth.make_wheels(vectors), starts, options=options)
     solvers = [batch_result.solver_names[i] for i in batch_result.solver_index]
-    assert solvers == [lane_batch.IMPLICIT_SOLVER, lane_batch.STABLE_SOLVER]
+    assert solvers == [
+        lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
+        lane_batch.SOLVER_SELECTION_OPTIONS.stable_solver,
+    ]
     assert list(batch_result.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
     _, code = compute_values(vectors[1:], starts[1:], options)
     assert code[0] == Outcome.FELL_BACK

@@ -25,16 +25,19 @@ def call_program(function, *arrays):
     ("function", "sentence"),
     [
         (lambda x: jnp.sort(x, 0), "sort has no machine code: write it by primitives that"),
-        (lambda x: jnp.cumsum(x, 1), "cumsum moves, joins or picks lanes"),
-        (lambda x: x[:, :1] + x, "slice moves, joins or picks lanes"),
-        (lambda x: lax.pad(x, 0.0, [(0, 0, 0), (1, 1, 0)])[:, 1:-1], "pad moves, joins or picks"),
-        (lambda x: x - jnp.max(x, 1)[:, None], "reduce_max moves, joins or picks lanes"),
-        (lambda x: jnp.sum(x.astype(int)) | x.astype(int), "reduce_sum moves, joins or picks"),
+        (lambda x: jnp.cumsum(x, 1), "cumsum moves, joins or selects lanes"),
+        (lambda x: x[:, :1] + x, "slice moves, joins or selects lanes"),
+        (lambda x: lax.pad(x, 0.0, [(0, 0, 0), (1, 1, 0)])[:, 1:-1], "pad moves, joins or selects"),
+        (lambda x: x - jnp.max(x, 1)[:, None], "reduce_max moves, joins or selects lanes"),
+        (lambda x: jnp.sum(x.astype(int)) | x.astype(int), "reduce_sum moves, joins or selects"),
         (lambda x: lax.reduce_or(x.astype(int), (1,))[0] | x.astype(int), "reduce_or moves"),
         (lambda x: lax.dynamic_update_slice(x, jnp.ones((2, 3)), (0, 3)), "dynamic_update_slice m"),
-        (lambda x: lax.concatenate([jnp.ones((2, 0)), x], 1), "concatenate moves, joins or picks"),
+        (
+            lambda x: lax.concatenate([jnp.ones((2, 0)), x], 1),
+            "concatenate moves, joins or selects",
+        ),
         (lambda x: lax.pad(x, 0.0, [(0, 0, 0), (1, -1, 0)]), "pad takes entries away"),
-        (lambda x: x + (x[0] @ x[1]), "dot_general moves, joins or picks lanes"),
+        (lambda x: x + (x[0] @ x[1]), "dot_general moves, joins or selects lanes"),
         (lambda x: lax.pad(x, 0.0, [(-1, 0, 0), (0, 0, 0)]), "pad takes entries away"),
         (lambda x: (x + 1j).real, "complex128.* convert them to one of bool, int32"),
         (lambda x: x.astype(int) // 3 + lax.div(x.astype(int), 2), "div of int64 has no machine"),
@@ -79,7 +82,7 @@ def test_an_axis_as_long_as_the_lane_axis_is_refused_at_its_origin(function, wha
 def test_arguments_have_one_axis_of_lanes():
     with pytest.raises(NotImplementedError, match=r"An argument has .* float64\[1021,1021\]"):
         call_program(lambda x: x[0] + x[1], np.zeros((LANE_AXIS_SENTINEL, 9)))
-    with pytest.raises(ValueError, match=r"shape \(3,\), but the first one 9 lanes"):
+    with pytest.raises(ValueError, match=r"shape \(3,\), but the first one has 9 lanes"):
         call_program(lambda x, table: x * table[0], X, np.zeros(3))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import simd
-from vrw_jax.batches import batch_steps as batch
+from vrw_jax.numerics import batch_sizes
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, wheel_from_parameters
 
 N = 96
@@ -48,7 +48,7 @@ def flatten_derivatives(by_input):
 def results_of_both_engines():
     params, states = draw_box(N, 0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "DIFFRAX_BATCH_SIZE", N)  # not filled up to more
+        patch.setattr(batch_sizes, "DIFFRAX_BATCH_SIZE", N)  # without padding
         lanes, diffrax = (
             vrw.step_batch(
                 params, states, options=TIGHT_OPTIONS, engine=engine, derivatives=ALL_INPUT_NAMES
@@ -161,5 +161,5 @@ def test_unsupported_uses_of_the_batch_engine_are_refused_in_one_sentence():
 
 @pytest.mark.parametrize("names", [("speed",), "c", ("section_state", "friction")])
 def test_derivatives_by_inputs_without_effect_are_refused_in_one_sentence(names):
-    with pytest.raises(ValueError, match="a step moves with one of section_state, hub_mass"):
+    with pytest.raises(ValueError, match="a step depends on section_state, hub_mass"):
         vrw.step_batch(vrw.WheelParams(), np.array([START]), derivatives=names)

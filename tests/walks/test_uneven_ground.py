@@ -178,9 +178,9 @@ def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
 
     edge = 0.21
     for _ in range(5):
-        found = at([edge], moved=("slope_ahead",))
+        found = at([edge], derivatives=("next_slope",))
         edge = edge - found.stopper_margin[0] / found.jacobian[0, 3, 0]
-    near = at([edge - 1e-6, edge + 1e-6], moved=("slope_ahead",))
+    near = at([edge - 1e-6, edge + 1e-6], derivatives=("next_slope",))
     early = vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
     assert near.outcome.tolist() == [early, vrw.Outcome.STEPPED]
     slopes = near.jacobian[0, 3]
@@ -188,7 +188,7 @@ def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
     h, options = 1e-5, TIGHT
     ends = [at([0.29 + d], options=options) for d in (h, -h)]
     rows = [np.array([*end.state[:, 0], *end.rear_impulse, *end.stopper_margin]) for end in ends]
-    told = at([0.29], moved=("slope_ahead",)).jacobian[0, :, 0]
+    told = at([0.29], derivatives=("next_slope",)).jacobian[0, :, 0]
     np.testing.assert_allclose(told, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
 
 

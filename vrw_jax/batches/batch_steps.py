@@ -1,9 +1,9 @@
 """Gait steps of batches of wheels: one function for several engines.
 
 On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU it is an
-XLA program for very many lanes, and a few stragglers are run again in smaller batches. In both
-cases every lane runs the same code, and no data pass between lanes. The result of a batch element
-is bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
+XLA program for very many lanes, and stragglers are run again in smaller batches. In both cases
+every lane runs the same code, and no data pass between lanes. The result of a batch element is
+bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
 side.
 """
 
@@ -18,16 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.batches.collocation_step import collocation_gait_step
 from vrw_jax.batches.contact_step import CONTACT_STEP_INPUTS, step_batch_with_contact
 from vrw_jax.batches.programs import run_compiled
 from vrw_jax.batches.stiffness import (
-    IMPLICIT_SOLVER,
-    IMPLICIT_SOLVER_INDEX,
-    NAMED_SOLVER_INDEX,
-    STABLE_SOLVER,
-    STABLE_SOLVER_INDEX,
-    TSIT5_TOLERANCE_FACTOR,
+    SOLVER_SELECTION_OPTIONS,
+    SolverIndex,
+    SolverSelectionOptions,
     select_solver,
 )
 from vrw_jax.batches.walk_batch import (
@@ -47,7 +45,7 @@ from vrw_jax.models import (
     jacobian_columns,
     scaled_jacobian_columns,
 )
-from vrw_jax.numerics import StepOptions, map_in_batches
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.simulation import check_model, check_options, check_section_state
 from vrw_jax.validation import (
     check_choice,
@@ -71,11 +69,11 @@ BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
 PAPER_STEP_INPUTS = (START_NAME, *PARAMETER_NAMES)
 """Inputs with respect to which a step of the paper's model can be differentiated."""
 
-SLOPE, AHEAD = PARAMETER_NAMES.index("slope"), len(PARAMETER_NAMES) + 3
-"""Places among the numbers of a step (parameters, start, slope of the line ahead) of its slopes."""
-
-DIFFRAX_BATCH_SIZE = 256
-"""Number of batch elements that the diffrax engine takes at a time."""
+SLOPE_INDEX = PARAMETER_NAMES.index("slope")
+"""Index of the slope among the inputs of a step: parameters, section state, slope of the next
+line."""
+NEXT_SLOPE_INDEX = len(PARAMETER_NAMES) + 3
+"""Index of the slope of the next line among the same inputs."""
 
 
 def step_batch(
@@ -103,22 +101,23 @@ def step_batch(
     tolerance of 1e-6, from 300 1/s. It is Kvaerno5 by "diffrax" if explicit solvers need too many
     steps (from 4e5, or from 1.4e5) or Tsit5 failed.
 
-    Derivatives go through all steps and their events; those of a lane that fell are zero. Not by
-    collocation. With unilateral contact (`UnilateralWheel`, its friction a scalar or of the lanes'
-    axis) the only engine is "lanes". Not for use inside `jax.jit`: it compiles itself, once.
+    Derivatives include all steps and their events. They are zero for an element that fell, and are
+    not available by collocation. With unilateral contact (`UnilateralWheel`) the only engine is
+    "lanes"; friction is a scalar or an array over the batch. The function compiles itself once, so
+    that it cannot be called inside `jax.jit`.
 
-    On uneven ground the slope, with unilateral contact friction too, has the shape (lanes, n_steps)
-    or (lanes, n_steps + 1), over the steps of each lane as in `walk`; derivatives by it have the
-    axis over steps last.
+    On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), over
+    the steps of each element as in `walk`. With unilateral contact, friction may have these shapes
+    too. Derivatives with respect to such an array have the axis over steps last.
 
     Args:
-        params: the wheels; fields are scalars or of shape (lanes,); the slope as above.
-        states: section states, shape (lanes, 3), rad, rad/s, m/s, or real ground's own.
-        n_steps: at most so many.
-        model: the rung; the paper's, `ViscoelasticWheel()`, by default.
-        options: numerical choices of the steps.
+        params: the wheels; fields are scalars or of shape (elements,); the slope as above.
+        states: section states, shape (elements, 3), rad, rad/s, m/s, or those of the model.
+        n_steps: largest number of steps.
+        model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
+        options: numerical options of the steps.
         engine: "auto", "lanes", "diffrax" or "collocation", as above.
-        durations: of the phases, shape (elements, 3), s, for "collocation".
+        durations: durations of the phases, shape (elements, 3), s, for "collocation".
         derivatives: "section_state" and names of parameters; with unilateral contact "friction"
             too.
 
@@ -143,7 +142,7 @@ def step_batch(
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
     checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
-    columns = _check_columns(params, checked_states, checked_model, options, n_steps)
+    columns = _check_parameters(params, checked_states, checked_model, options, n_steps)
     checked_states = checked_states.astype(columns[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
     arguments = checked_model, columns, checked_states, n_steps, options, engine, params.n_legs
@@ -160,12 +159,13 @@ def step_batch(
 def _check_derivatives(
     derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
 ) -> list[str]:
-    """What the end is to be told to move with; one clear sentence for what it can't be."""
+    """Return the requested derivatives, or raise a ValueError if one is not available."""
     names = list(derivatives)
     for name in names:
         if name not in known_names:
             raise ValueError(
-                f"derivatives name {name!r}, but a step moves with one of {', '.join(known_names)}."
+                f"derivatives contain {name!r}, but a step depends on {', '.join(known_names)}: "
+                "give names of these."
             )
     if names and engine == "collocation":
         raise ValueError(
@@ -175,7 +175,7 @@ def _check_derivatives(
     return names
 
 
-def _check_columns(
+def _check_parameters(
     params: WheelParams,
     states: np.ndarray,
     model: AbstractWheel,
@@ -191,14 +191,12 @@ def _check_columns(
         sizes = sorted({3, model.section_size(params)})
     if states.ndim != 2 or states.shape[1] not in sizes:
         raise ValueError(
-            f"states have shape {states.shape}, but they are section states, shape (lanes, "
+            f"states have shape {states.shape}, but section states have the shape (elements, "
             f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
         )
     n_states, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
     parameter_dtype = np.result_type(*(column.dtype for column in columns))
-    StepOptions.check_tolerances(
-        options, parameter_dtype
-    )  # equinox takes 0.1 ms for a bound method
+    StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
     friction = getattr(model, FRICTION_NAME, np.zeros(()))
     for name, column in zip((*PARAMETER_NAMES, FRICTION_NAME), (*columns, friction), strict=True):
         varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(column) == 2
@@ -206,8 +204,8 @@ def _check_columns(
         if np.shape(column) not in ((), (n_states,), *over_steps):
             raise ValueError(
                 f"{name} has shape {np.shape(column)}, but there are {n_states} states"
-                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one "
-                f"for each"
+                f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for "
+                "each"
                 f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * varies_by_step}."
             )
     dtype = np.promote_types(parameter_dtype, states.dtype)
@@ -224,75 +222,86 @@ def _step_paper_model(
     n_legs: int,
     durations: Any,
     derivative_names: Sequence[str],
+    selection: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> StepBatchResult:
-    slopes, over_steps = _read_slopes(parameter_columns[SLOPE], n_steps, engine)
-    parameter_columns = [slopes[0] if i == SLOPE else x for i, x in enumerate(parameter_columns)]
+    """Return `step_batch` of the paper's wheel, or of another model by the diffrax engine."""
+    slopes, stepwise = _split_slopes_by_step(parameter_columns[SLOPE_INDEX], n_steps, engine)
+    parameter_columns = [
+        slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameter_columns)
+    ]
     order = sort_by_work(parameter_columns, states)
     wheels = np.empty((len(parameter_columns), len(states)), states.dtype)
     for row, column in zip(wheels, parameter_columns, strict=True):
         row[:] = column[order] if column.ndim else column
-    slopes = slopes.take(order, -1) if over_steps else slopes
-    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES, over_steps)
+    is_uneven = bool(stepwise)
+    slopes = slopes.take(order, -1) if is_uneven else slopes
+    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES, stepwise)
     settings = n_legs, walks.input_indices
-    engines = {NAMED_SOLVER_INDEX: _select_engine(engine, model, options, *settings)}
-    solver_index = np.full(len(states), NAMED_SOLVER_INDEX, np.int32)
+    engines = {SolverIndex.NAMED: _select_engine(engine, model, options, *settings)}
+    solver_index = np.full(len(states), SolverIndex.NAMED, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
-    engine_name = engines[NAMED_SOLVER_INDEX].name
+    engine_name = engines[SolverIndex.NAMED].name
     if engine == "auto" and engine_name == "lanes":
-        solver_names, solver_index = (
-            (options.solver, STABLE_SOLVER, IMPLICIT_SOLVER),
-            select_solver(
-                wheels, options.with_derivative_tolerances() if derivative_names else options
-            ),
-        )
-    if np.any(solver_index != NAMED_SOLVER_INDEX):
-        with_solver = lambda solver_index: dataclasses.replace(options, solver=solver_index)
-        stable_options = with_solver(STABLE_SOLVER).with_tightened_tolerances(
-            TSIT5_TOLERANCE_FACTOR
-        )
-        engines[STABLE_SOLVER_INDEX] = _select_engine("lanes", model, stable_options, *settings)
-        engines[IMPLICIT_SOLVER_INDEX] = _select_engine(
-            "diffrax", model, with_solver(IMPLICIT_SOLVER), *settings
+        solver_names = (options.solver, selection.stable_solver, selection.implicit_solver)
+        actual_options = options.with_derivative_tolerances() if derivative_names else options
+        solver_index = select_solver(wheels, actual_options, selection)
+    if np.any(solver_index != SolverIndex.NAMED):
+        implicit_options = dataclasses.replace(options, solver=selection.implicit_solver)
+        stable_options = dataclasses.replace(options, solver=selection.stable_solver)
+        stable_options = stable_options.with_tightened_tolerances(selection.stable_tolerance_factor)
+        engines[SolverIndex.STABLE] = _select_engine("lanes", model, stable_options, *settings)
+        engines[SolverIndex.IMPLICIT] = _select_engine(
+            "diffrax", model, implicit_options, *settings
         )
     if engine == "collocation":
         engine_name = engine
-        walks.durations[:] = _check_durations(durations, states, wheels.dtype).T.take(order, -1)
+        if durations is None or np.shape(durations) != states.shape:
+            shape = None if durations is None else np.shape(durations)
+            raise ValueError(
+                f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and "
+                "SLS-II to some per cent, shape (elements, 3): give those of a limit cycle, or "
+                "take 'lanes'."
+            )
+        expected_durations = check_numpy_reals("durations", durations)
+        walks.durations[:] = expected_durations.astype(wheels.dtype).T.take(order, -1)
     for k in range(n_steps):
         active = walks.active_lanes()
-        if over_steps:
-            wheels[SLOPE] = slopes[k]
+        if is_uneven:
+            wheels[SLOPE_INDEX] = slopes[k]
         if engine == "collocation" and len(active):
             index = lane_index(active, walks)
-            own = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
-            walks.record_step(
-                active, *_step_by_collocation(engines[NAMED_SOLVER_INDEX], model, n_legs, *own)
+            lane_arrays = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
+            collocated = _step_by_collocation(
+                engines[SolverIndex.NAMED], model, n_legs, *lane_arrays
             )
+            walks.record_step(active, *collocated)
             continue
         for engine_index, selected_engine in engines.items():
             lane_indices = active[solver_index[active] == engine_index]
             if len(lane_indices) > 0:
                 index = lane_index(lane_indices, walks)
-                ahead = (slopes[k + 1][index],) if over_steps else ()
+                next_slopes = (slopes[k + 1][index],) if is_uneven else ()
                 result = selected_engine.take_step(
-                    wheels[:, index], walks.section_state[:, index], *ahead
+                    wheels[:, index], walks.section_state[:, index], *next_slopes
                 )
-                if engine_index == STABLE_SOLVER_INDEX:
-                    # A phase may last longer than `select_solver` assumes; the next is implicit.
+                if engine_index == SolverIndex.STABLE:
+                    # A phase may last longer than `select_solver` assumes. The implicit solver,
+                    # whose turn is next, then repeats the step.
                     has_failed = result[2] == Outcome.SOLVER_FAILED
-                    solver_index[lane_indices[has_failed]] = IMPLICIT_SOLVER_INDEX
-                    lane_indices, result = (
-                        lane_indices[~has_failed],
-                        tuple(part[..., ~has_failed] for part in result),
-                    )
+                    solver_index[lane_indices[has_failed]] = SolverIndex.IMPLICIT
+                    lane_indices = lane_indices[~has_failed]
+                    result = tuple(part[..., ~has_failed] for part in result)
                 walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
     return walks.to_result(order, solver_index, engine_name, solver_names)
 
 
-def _read_slopes(
+def _split_slopes_by_step(
     slope: np.ndarray, n_steps: int, engine: str
 ) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Slopes of the lines of all steps, and how a walk moves with them; on flat ground the slope
-    alone, as a list."""
+    """Return the slopes of the lines of all steps, and how they enter the steps.
+
+    On flat ground they are a list with the slope, and an empty mapping.
+    """
     if slope.ndim < 2:
         return [slope], {}
     if engine == "collocation":
@@ -300,11 +309,10 @@ def _read_slopes(
             "engine is 'collocation', which takes one slope, but slope is an array over steps: "
             "take 'auto', 'lanes' or 'diffrax'."
         )
-    n = slope.shape[1]
-    by_line = lambda k: ((0, k, 1.0), (1, min(k + 1, n - 1), 1.0))
-    return complete_batch_slopes(slope, n_steps), {
-        "slope": StepwiseParameter((SLOPE, AHEAD), n, by_line)
-    }
+    n_values = slope.shape[1]
+    terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_values - 1), 1.0))
+    stepwise_slope = StepwiseParameter((SLOPE_INDEX, NEXT_SLOPE_INDEX), n_values, terms)
+    return complete_batch_slopes(slope, n_steps), {"slope": stepwise_slope}
 
 
 def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
@@ -328,27 +336,19 @@ def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
     return np.argsort(work)
 
 
-def _check_durations(durations: Any, states: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    if durations is None or np.shape(durations) != states.shape:
-        shape = None if durations is None else np.shape(durations)
-        raise ValueError(
-            f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and SLS-II "
-            "to some per cent, shape (lanes, 3): give those of a limit cycle, or take 'lanes'."
-        )
-    return check_numpy_reals("durations", durations).astype(dtype, copy=False)
-
-
 class _BatchEngine(NamedTuple):
     """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
 
     name: str
     take_step: Callable[..., tuple[np.ndarray, ...]]
-    """Of parameters, section states and, on uneven ground, slopes of the lines ahead."""
+    """A function of parameters, section states and, on uneven ground, slopes of the next lines. It
+    returns section state, durations, outcome, solver steps and, if requested, the Jacobian."""
 
 
 def _select_engine(
     engine: str, model: Any, options: StepOptions, n_legs: int, input_indices: tuple[int, ...]
 ) -> _BatchEngine:
+    """Return the engine of that name, or the fastest possible one for "auto"."""
     has_lane_kernel = (
         model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
     )
@@ -375,9 +375,9 @@ def _step_by_lanes(
     input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
-    *ahead: np.ndarray,
+    *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Take one gait step by the lane engine."""
+    """Take one gait step by the lane engine; see `_BatchEngine.take_step`."""
     option_leaves, structure = jax.tree.flatten(options)
     uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
     tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
@@ -385,15 +385,12 @@ def _step_by_lanes(
 
     def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
         current_options = jax.tree.unflatten(structure, uniform)
-        current_options = (
-            current_options.with_derivative_tolerances() if input_indices else current_options
-        )
+        if input_indices:
+            current_options = current_options.with_derivative_tolerances()
 
         def step_outputs(*lanes: Array) -> tuple:
-            params, x = (
-                wheel_from_parameters(lanes[:n_parameters], n_legs, *lanes[AHEAD:]),
-                lanes[n_parameters:AHEAD],
-            )
+            params = wheel_from_parameters(lanes[:n_parameters], n_legs, *lanes[NEXT_SLOPE_INDEX:])
+            x = lanes[n_parameters:NEXT_SLOPE_INDEX]
             result = gait_step(
                 params, x, current_options, tableau, stop_at_lift_off, straggler_count
             )
@@ -403,10 +400,10 @@ def _step_by_lanes(
         if not input_indices:
             values, diagnostics = step_outputs(*lanes)
             return (*diagnostics, values)
-        jacobian_of_step = (
-            scaled_jacobian_columns if len(input_indices) == len(lanes) else jacobian_columns
-        )
-        jacobian, values, diagnostics = jacobian_of_step(step_outputs, lanes, input_indices)
+        # With respect to all inputs, two columns follow from the units.
+        needs_all = len(input_indices) == len(lanes)
+        compute_columns = scaled_jacobian_columns if needs_all else jacobian_columns
+        jacobian, values, diagnostics = compute_columns(step_outputs, lanes, input_indices)
         return (*diagnostics, values, jacobian)
 
     settings = (
@@ -415,10 +412,12 @@ def _step_by_lanes(
         stop_at_lift_off,
         structure,
         input_indices,
-        *("uneven" for _ in ahead),
+        *("uneven" for _ in next_slopes),
     )
-    max_group_size = (N_STEP_INPUTS + len(ahead),) if input_indices else ()
-    results = run_compiled(step, uniform, [*wheels, *states, *ahead], settings, *max_group_size)
+    n_inputs = N_STEP_INPUTS + len(next_slopes)
+    limits = simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_LIMITS
+    lane_arrays = [*wheels, *states, *next_slopes]
+    results = run_compiled(step, uniform, lane_arrays, settings, limits)
     _, outcome, n_solver_steps, values, *jacobian = results
     return values[:3], values[3:], outcome, n_solver_steps, *jacobian
 
@@ -431,24 +430,19 @@ def _step_by_collocation(
     states: np.ndarray,
     durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Take one step by collocation, and by the lane engine for lanes that fail the check; return
-    which passed."""
+    """Take one step by collocation, and by the lane engine for lanes that fail the check.
+
+    Returns the results as `_BatchEngine.take_step` does, and which lanes passed the check.
+    """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
     def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
-        params, states_and_durations = (
-            wheel_from_parameters(lanes[:n_parameters], n_legs),
-            tuple(lanes[n_parameters:]),
-        )
-        result = collocation_gait_step(
-            params, states_and_durations[:3], states_and_durations[3:], stop_at_lift_off
-        )
+        params = wheel_from_parameters(lanes[:n_parameters], n_legs)
+        x, expected_durations = tuple(lanes[n_parameters:-3]), tuple(lanes[-3:])
+        result = collocation_gait_step(params, x, expected_durations, stop_at_lift_off)
         is_unfinished = jnp.zeros_like(result.is_trusted)
-        return (
-            is_unfinished,
-            result.is_trusted,
-            jnp.stack([*result.section_state, *result.durations]),
-        )
+        values = jnp.stack([*result.section_state, *result.durations])
+        return is_unfinished, result.is_trusted, values
 
     settings = ("gait step by collocation", n_legs, stop_at_lift_off)
     _, is_trusted, values = run_compiled(step, [], [*wheels, *states, *durations], settings)
@@ -456,9 +450,8 @@ def _step_by_collocation(
     result = values[:3], values[3:], outcome, n_solver_steps
     untrusted = np.flatnonzero(~is_trusted)
     if len(untrusted) > 0:
-        for all_values, new_values in zip(
-            result, lane_engine.take_step(wheels[:, untrusted], states[:, untrusted]), strict=True
-        ):
+        repeated = lane_engine.take_step(wheels[:, untrusted], states[:, untrusted])
+        for all_values, new_values in zip(result, repeated, strict=True):
             all_values[..., untrusted] = new_values
     return result, is_trusted
 
@@ -470,16 +463,14 @@ def _step_by_diffrax(
     input_indices: tuple[int, ...],
     wheels: np.ndarray,
     states: np.ndarray,
-    *ahead: np.ndarray,
+    *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Take one step by the model's own step under `jax.vmap`, DIFFRAX_BATCH_SIZE elements at a
-    time."""
+    """Take one step by the model's own step under `jax.vmap`; see `_BatchEngine.take_step`."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
-    rows = np.concatenate([wheels, states, *(row[None] for row in ahead)]).T
+    rows = np.concatenate([wheels, states, *(row[None] for row in next_slopes)]).T
     step_rows = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
-    return jax.tree.map(
-        lambda x: np.array(x).T, map_in_batches(step_rows, (DIFFRAX_BATCH_SIZE,), rows)
-    )
+    results = map_in_batches(step_rows, (batch_sizes.DIFFRAX_BATCH_SIZE,), rows)
+    return jax.tree.map(lambda x: np.array(x).T, results)
 
 
 @eqx.filter_jit
@@ -495,8 +486,10 @@ def _vmapped_step(
     def step_one(inputs: Array) -> tuple[Array, ...]:
         def step_from_inputs(varied_inputs: Array) -> tuple[Array, AdvanceResult]:
             all_inputs = inputs.at[np.array(input_indices, int)].set(varied_inputs)
-            params = wheel_from_parameters(all_inputs[:n_parameters], n_legs, *all_inputs[AHEAD:])
-            result = model.advance(params, all_inputs[n_parameters:AHEAD], options)
+            next_slope = all_inputs[NEXT_SLOPE_INDEX:]
+            params = wheel_from_parameters(all_inputs[:n_parameters], n_legs, *next_slope)
+            x = all_inputs[n_parameters:NEXT_SLOPE_INDEX]
+            result = model.advance(params, x, options)
             return jnp.concatenate([result.section_state, result.durations]), result
 
         varied_inputs = inputs[np.array(input_indices, int)]

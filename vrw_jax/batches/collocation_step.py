@@ -1,4 +1,4 @@
-"""Gait steps of many wheels in a fixed amount of work, near gaits whose durations are known.
+"""Gait steps of many wheels by collocation, in a fixed amount of work, near known gaits.
 
 The method is Gauss collocation of order 8 on a few graded steps. The unknowns are the accelerations
 at the four nodes of a step. The airborne leg's fast mode, near c/m, which forces an explicit method
@@ -15,6 +15,7 @@ lane that fails these checks is stepped again by the adaptive engine.
 import functools
 import operator
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -39,37 +40,67 @@ from vrw_jax.models import PAPER_START, is_valid_start, replace_invalid
 from vrw_jax.numerics import Vector, value_and_partials
 from vrw_jax.wheel import AbstractPhase, PhaseInstant, WheelParams, make_phases, transitions
 
+_EIGENVALUES, _EIGENVECTORS = np.linalg.eig(INTEGRATION_MATRIX)
+_UPPER_HALF = np.flatnonzero(_EIGENVALUES.imag > 0.0)
+RULE_EIGENVALUES = _EIGENVALUES[_UPPER_HALF]
+"""One eigenvalue of each conjugate pair of the rule."""
+TO_EIGENVECTORS = np.linalg.inv(_EIGENVECTORS)[_UPPER_HALF]
+"""Rows that project node values onto the eigenvectors of these eigenvalues."""
+FROM_EIGENVECTORS = _EIGENVECTORS[:, _UPPER_HALF]
+"""The eigenvectors of these eigenvalues, as columns."""
 
-def _eigenpairs() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return one eigenvalue of each conjugate pair of the rule, with its rows and columns."""
-    values, vectors = np.linalg.eig(INTEGRATION_MATRIX)
-    upper_half = np.flatnonzero(values.imag > 0.0)
-    return values[upper_half], np.linalg.inv(vectors)[upper_half], vectors[:, upper_half]
-
-
-RULE_EIGENVALUES, TO_EIGENVECTORS, FROM_EIGENVECTORS = _eigenpairs()
-START_WEIGHTS, MIDDLE_WEIGHTS, END_NODE_WEIGHTS = (
-    lagrange_weights(0.0),
-    lagrange_weights(0.5),
-    lagrange_weights(1.0),
-)
-"""Weights that interpolate node values to both ends and to the middle of a step."""
+START_WEIGHTS = lagrange_weights(0.0)
+"""Weights that interpolate node values to the start of a step."""
+MIDDLE_WEIGHTS = lagrange_weights(0.5)
+"""Weights that interpolate node values to the middle of a step."""
+END_NODE_WEIGHTS = lagrange_weights(1.0)
+"""Weights that interpolate node values to the end of a step."""
 MIDDLE_INTEGRATION_WEIGHTS = integration_weights(0.5)
+"""Weights that integrate node values once and twice from the start to the middle of a step."""
 _DIFFERENTIATION_MATRIX = differentiation_matrix()
-STRETCH_WEIGHTS, CURVATURE_WEIGHTS = (
-    GAUSS_NODES[:, None] * _DIFFERENTIATION_MATRIX,
-    0.5
-    * (GAUSS_NODES * GAUSS_NODES)[:, None]
-    * (_DIFFERENTIATION_MATRIX @ _DIFFERENTIATION_MATRIX),
+STRETCH_WEIGHTS = GAUSS_NODES[:, None] * _DIFFERENTIATION_MATRIX
+"""Weights of the first derivative of the node values by the length of the step, relative to it."""
+CURVATURE_WEIGHTS = (
+    0.5 * (GAUSS_NODES * GAUSS_NODES)[:, None] * (_DIFFERENTIATION_MATRIX @ _DIFFERENTIATION_MATRIX)
 )
-"""Weights of the first and second derivative of the node values as the step, with its nodes, is
-stretched."""
+"""Weights of half of the second derivative of the same."""
+
+PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
 
 
-SWEEPS_PER_STEP = 3
-"""Number of sweeps in each step but a phase's last."""
-N_EVENT_ROUNDS, SWEEPS_PER_ROUND = 2, 2
-"""Number of corrections of the duration in the last step, and of sweeps after each."""
+@dataclass(frozen=True)
+class CollocationStepOptions:
+    """Amount of work of a collocated step, and limits of the indicators of a trusted lane."""
+
+    meshes: tuple[PhaseMesh, ...] = PHASE_MESHES
+    """Meshes of DLS, SLS-I and SLS-II.
+
+    They are chosen because they are the cheapest of those tried with errors below 1e-8. The errors
+    are the 99th percentile over lanes near their gaits. The cost includes that of the lanes left to
+    the adaptive engine (experiments/speed/engine_benchmark.py).
+    """
+    sweeps_per_step: int = 3
+    """Number of sweeps in each step except the last of a phase."""
+    n_event_rounds: int = 2
+    """Number of corrections of the duration in the last step."""
+    sweeps_per_round: int = 2
+    """Number of sweeps after each of these corrections."""
+    max_correction: float = 5e-8
+    """Limit of `CollocatedPhase.correction`, rad/s and m/s."""
+    max_event_shift: float = 1e-5
+    """Limit of `CollocatedPhase.event_shift`, s.
+
+    The end is extrapolated by the last shift, with an error of half of its square times a rate.
+    """
+    max_mismatch: tuple[float, float, float] = (2e-3, 1.2e-1, 8e-5)
+    """Limits of `CollocatedPhase.mismatch` in DLS, SLS-I and SLS-II.
+
+    They are chosen because errors are at most the square of a mismatch. One in a hundred lanes near
+    its gait exceeds one of the limits.
+    """
+
+
+COLLOCATION_STEP_OPTIONS = CollocationStepOptions()
 
 
 class CollocatedPhase(NamedTuple):
@@ -104,7 +135,12 @@ class _SolvedStep(NamedTuple):
 
 
 def collocate_phase(
-    phase: AbstractPhase, q: Vector, v: Vector, expected_duration: Array, mesh: PhaseMesh
+    phase: AbstractPhase,
+    q: Vector,
+    v: Vector,
+    expected_duration: Array,
+    mesh: PhaseMesh,
+    options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocatedPhase:
     """Integrate from (q, v) to the phase's own end, its first guard, near the expected duration."""
     fractions, zero = mesh.interval_fractions, jnp.zeros_like(expected_duration)
@@ -113,7 +149,8 @@ def collocate_phase(
 
     def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
         q, v, correction, mismatch, min_guard, guards, nonlinear_part = carry
-        solved_step = _solve_step(phase, q, v, fraction * expected_duration, nonlinear_part)
+        h = fraction * expected_duration
+        solved_step = _solve_step(phase, q, v, h, nonlinear_part, options)
         low_guard, guards = _min_guard(phase, q, v, solved_step, guards, 0)
         carry = (
             *solved_step.end,
@@ -130,9 +167,8 @@ def collocate_phase(
     if len(fractions) > 1:
         carry, _ = lax.scan(march, carry, jnp.asarray(fractions[:-1], expected_duration.dtype))
     q, v, correction, mismatch, min_guard, guards, nonlinear_part = carry
-    last_step = _solve_step(
-        phase, q, v, float(fractions[-1]) * expected_duration, nonlinear_part, ends_at_event=True
-    )
+    h = float(fractions[-1]) * expected_duration
+    last_step = _solve_step(phase, q, v, h, nonlinear_part, options, ends_at_event=True)
     low_guard, _ = _min_guard(phase, q, v, last_step, guards, 1)
     return CollocatedPhase(
         *last_step.end,
@@ -185,6 +221,7 @@ def _solve_step(
     v: Vector,
     h: Array,
     nonlinear_part: NodeAccelerations,
+    options: CollocationStepOptions,
     ends_at_event: bool = False,
 ) -> _SolvedStep:
     """Solve for the node accelerations of one step by sweeps, and for its length if it ends at an
@@ -196,8 +233,13 @@ def _solve_step(
     """
     dimension = len(q)
     start_acceleration = phase.acceleration(phase.motion_at(q, v))[:dimension]
+    coordinates = range(dimension)
+    middle_state = (
+        tuple(q[d] + 0.5 * h * (v[d] + 0.25 * h * start_acceleration[d]) for d in coordinates),
+        tuple(v[d] + 0.5 * h * start_acceleration[d] for d in coordinates),
+    )
     residual, residual_by_q, residual_by_v, residual_by_a = _linearize_residual(
-        phase, *_middle_state(q, v, start_acceleration, h), start_acceleration
+        phase, *middle_state, start_acceleration
     )
     inverses = [
         _invert_stage_matrix(complex(value), h, residual_by_q, residual_by_v, residual_by_a)
@@ -207,11 +249,14 @@ def _solve_step(
     def correct(
         nodes: NodeAccelerations, h: Array, projections: list
     ) -> tuple[NodeAccelerations, Array]:
-        corrections = [
-            _apply_inverse(inverse, pair)
-            for inverse, pair in zip(inverses, projections, strict=True)
-        ]
-        return _correct_nodes(nodes, tuple(corrections), h)
+        corrections = []
+        for inverse, projection in zip(inverses, projections, strict=True):
+            products = [
+                [_multiply(entry, x) for entry, x in zip(row, projection, strict=True)]
+                for row in inverse
+            ]
+            corrections.append([_add_terms(row) for row in products])
+        return _correct_nodes(nodes, corrections, h)
 
     def sweep(step: _SweepState, _: None) -> tuple[_SweepState, None]:
         residuals = []
@@ -233,7 +278,7 @@ def _solve_step(
         step = step._replace(
             h=step.h + event_shift, nodes=_stretch_step(step.nodes, event_shift / step.h)
         )
-        step, _ = lax.scan(sweep, step, None, length=SWEEPS_PER_ROUND)
+        step, _ = lax.scan(sweep, step, None, length=options.sweeps_per_round)
         return (step, shift_to_event(step)), None
 
     linear_nodes, largest_correction = correct(
@@ -241,24 +286,28 @@ def _solve_step(
         h,
         _project_linear_residuals(residual, residual_by_q, residual_by_v, v, start_acceleration, h),
     )
-    step, event_shift = (
-        _SweepState(
-            h, _add_nodes(linear_nodes, nonlinear_part, 1.0), largest_correction, largest_correction
-        ),
-        jnp.zeros_like(h),
-    )
+    first_nodes = _add_nodes(linear_nodes, nonlinear_part, 1.0)
+    step = _SweepState(h, first_nodes, largest_correction, largest_correction)
+    event_shift = jnp.zeros_like(h)
     if ends_at_event:
         (step, event_shift), _ = lax.scan(
-            run_round, (step, shift_to_event(step)), None, length=N_EVENT_ROUNDS
+            run_round, (step, shift_to_event(step)), None, length=options.n_event_rounds
         )
     else:
-        step, _ = lax.scan(sweep, step, None, length=SWEEPS_PER_STEP)
+        step, _ = lax.scan(sweep, step, None, length=options.sweeps_per_step)
     mismatches = [
         jnp.abs(_weighted_sum(START_WEIGHTS, step.nodes, d) - start_acceleration[d])
-        for d in range(dimension)
+        for d in coordinates
     ]
     mismatch = step.h * functools.reduce(jnp.maximum, mismatches)
-    end_state = _shifted_end_state(q, v, step.h, step.nodes, event_shift)
+    # The end is extrapolated by the last shift, whose square is negligible.
+    Q, V = _end_state(q, v, step.h, step.nodes)
+    end_state = (
+        tuple(Q[d] + event_shift * V[d] for d in coordinates),
+        tuple(
+            V[d] + event_shift * _weighted_sum(END_NODE_WEIGHTS, step.nodes, d) for d in coordinates
+        ),
+    )
     return _SolvedStep(
         step, end_state, event_shift, mismatch, _add_nodes(step.nodes, linear_nodes, -1.0)
     )
@@ -286,26 +335,6 @@ def _stretch_step(nodes: NodeAccelerations, relative_growth: Array) -> NodeAccel
             for coordinate in coordinates
         )
         for node_index in range(N_GAUSS_NODES)
-    )
-
-
-def _middle_state(q: Vector, v: Vector, a: Vector, h: Array) -> tuple[Vector, Vector]:
-    n = range(len(q))
-    return (
-        tuple(q[d] + 0.5 * h * (v[d] + 0.25 * h * a[d]) for d in n),
-        tuple(v[d] + 0.5 * h * a[d] for d in n),
-    )
-
-
-def _shifted_end_state(
-    q: Vector, v: Vector, h: Array, nodes: NodeAccelerations, event_shift: Array
-) -> tuple[Vector, Vector]:
-    """Return the step's end, extrapolated by a time whose square is negligible."""
-    Q, V = _end_state(q, v, h, nodes)
-    n = range(len(q))
-    return (
-        tuple(Q[d] + event_shift * V[d] for d in n),
-        tuple(V[d] + event_shift * _weighted_sum(END_NODE_WEIGHTS, nodes, d) for d in n),
     )
 
 
@@ -344,12 +373,14 @@ def _add_terms(terms: Sequence[ComplexPair]) -> ComplexPair:
 def _invert_stage_matrix(
     eigenvalue: complex, h: Array, residual_by_q: Any, residual_by_v: Any, residual_by_a: Any
 ) -> Any:
-    """Return the inverse of by_a + h value by_v + (h value)^2 by_q."""
+    """Return the inverse of A + h e V + (h e)^2 Q.
+
+    e is the eigenvalue. A, V and Q are the derivatives of the residual by accelerations, rates and
+    coordinates.
+    """
     n, square = len(residual_by_q), eigenvalue * eigenvalue
-    scaled_value, scaled_square = (
-        (h * eigenvalue.real, h * eigenvalue.imag),
-        (h * h * square.real, h * h * square.imag),
-    )
+    scaled_value = (h * eigenvalue.real, h * eigenvalue.imag)
+    scaled_square = (h * h * square.real, h * h * square.imag)
     matrix: list[list[ComplexPair]] = [
         [
             (
@@ -409,11 +440,9 @@ def _project_linear_residuals(
     middle."""
     n = range(len(v))
     multiply_columns = lambda columns, x: tuple(sum(columns[j][i] * x[j] for j in n) for i in n)
-    damping_term, stiffness_rate_term, stiffness_acceleration_term = (
-        multiply_columns(residual_by_v, a),
-        multiply_columns(residual_by_q, v),
-        multiply_columns(residual_by_q, a),
-    )
+    damping_term = multiply_columns(residual_by_v, a)
+    stiffness_rate_term = multiply_columns(residual_by_q, v)
+    stiffness_acceleration_term = multiply_columns(residual_by_q, a)
     projections = []
     for weights in TO_EIGENVECTORS:
         constant_weight, linear_weight, quadratic_weight = (
@@ -441,15 +470,8 @@ def _project_linear_residuals(
     return projections
 
 
-def _apply_inverse(inverse: Any, right_side: list[ComplexPair]) -> list[ComplexPair]:
-    products = [
-        [_multiply(entry, x) for entry, x in zip(row, right_side, strict=True)] for row in inverse
-    ]
-    return [_add_terms(row) for row in products]
-
-
 def _correct_nodes(
-    nodes: NodeAccelerations, corrections: tuple[list[ComplexPair], ...], h: Array
+    nodes: NodeAccelerations, corrections: list[list[ComplexPair]], h: Array
 ) -> tuple[NodeAccelerations, Array]:
     """Return the accelerations after the correction, and the largest rate that it changed."""
     corrected_nodes, largest_change = [], jnp.zeros_like(h)
@@ -505,37 +527,19 @@ def _min_guard(
         tuple(v[i] + step.h * velocity_integral[i] for i in coordinates),
     )
     evaluate_guards = lambda q, v, a: phase.guards(PhaseInstant(phase, phase.motion_at(q, v), a))
-    middle_guards, end_guards = (
-        evaluate_guards(*middle_state, middle_acceleration),
-        evaluate_guards(*solved_step.end, end_acceleration),
-    )
-
+    middle_guards = evaluate_guards(*middle_state, middle_acceleration)
+    end_guards = evaluate_guards(*solved_step.end, end_acceleration)
     min_guard = jnp.full_like(step.h, jnp.inf)
     for i, (start_value, middle_value, end_value) in enumerate(
         zip(start_guards, middle_guards, end_guards, strict=True)
     ):
         low_guard = jnp.minimum(start_value, middle_value)
         if i >= n_skipped:
-            low_guard, possible_dip = (
-                jnp.minimum(low_guard, end_value),
-                0.25 * jnp.abs(start_value - 2.0 * middle_value + end_value),
-            )
+            low_guard = jnp.minimum(low_guard, end_value)
+            possible_dip = 0.25 * jnp.abs(start_value - 2.0 * middle_value + end_value)
             low_guard = jnp.where(low_guard > possible_dip, low_guard, -1.0)
         min_guard = jnp.minimum(min_guard, low_guard)
     return min_guard, end_guards
-
-
-PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
-"""Meshes of DLS, SLS-I and SLS-II, chosen because they are the cheapest of those tried with errors
-below 1e-8. The errors are the 99th percentile over lanes near their gaits. The cost includes that
-of the lanes left to the adaptive engine (experiments/speed/engine_benchmark.py)."""
-
-MAX_LAST_CORRECTION = 5e-8
-MAX_EVENT_SHIFT = 1e-5
-MAX_MISMATCH = (2e-3, 1.2e-1, 8e-5)
-"""Limits of the indicators of a trusted lane, see `CollocatedPhase`. Errors are at most the square
-of a mismatch. The end is extrapolated by the last shift, which leaves half of its square times a
-rate. One in a hundred lanes exceeds the limits near its gait."""
 
 
 class CollocationStep(NamedTuple):
@@ -551,6 +555,7 @@ def collocation_gait_step(
     x: Vector,
     expected_durations: Vector,
     stop_at_lift_off: bool,
+    options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocationStep:
     """Take one gait step of every lane, near the expected durations of DLS, SLS-I and SLS-II."""
     has_valid_duration = [(duration > 0.0) & (duration < 10.0) for duration in expected_durations]
@@ -566,15 +571,17 @@ def collocation_gait_step(
     phases = make_phases(s, landing.distance, stop_at_lift_off)
     durations = []
     for phase, duration, mesh, max_mismatch in zip(
-        phases, expected_durations, PHASE_MESHES, MAX_MISMATCH, strict=True
+        phases, expected_durations, options.meshes, options.max_mismatch, strict=True
     ):
-        end = collocate_phase(phase, *phase.own_coordinates(theta, motion), duration, mesh)
+        start = phase.own_coordinates(theta, motion)
+        end = collocate_phase(phase, *start, duration, mesh, options)
         is_trusted = (
             is_trusted
-            & (end.correction <= MAX_LAST_CORRECTION)
-            & (end.event_shift <= MAX_EVENT_SHIFT)
+            & (end.correction <= options.max_correction)
+            & (end.event_shift <= options.max_event_shift)
+            & (end.mismatch <= max_mismatch)
+            & (end.min_guard > 0.0)
         )
-        is_trusted = is_trusted & (end.mismatch <= max_mismatch) & (end.min_guard > 0.0)
         theta, motion = end.q[0], phase.reset_map(phase.motion_at(end.q, end.v))
         durations.append(end.duration)
     mask = lambda values: tuple(jnp.where(is_trusted, value, 0.0) for value in values)

@@ -1,11 +1,17 @@
-"""Steps of batches with unilateral contact."""
+"""Steps of batches with unilateral contact.
+
+Machine code takes the steps. On uneven ground with restitution, or by the diffrax engine, they are
+those of `walk` under `jax.vmap`.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.batches.uneven_ground import walk_uneven_ground
 from vrw_jax.batches.walk_batch import (
     START_NAME,
     StepBatchResult,
@@ -15,14 +21,16 @@ from vrw_jax.batches.walk_batch import (
 )
 from vrw_jax.contact import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.numerics import StepOptions
-from vrw_jax.wheel import PARAMETER_NAMES
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches
+from vrw_jax.simulation import walk
+from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
 
 CONTACT_PARAMETERS = (*PARAMETER_NAMES, "friction")
-UNEVEN_COLUMNS = "friction_before", "tilt"
-"""Columns that uneven ground adds: friction of the feet that landed before, and by how much the
-line ahead is steeper, rad."""
-SLOPE, FRICTION = CONTACT_PARAMETERS.index("slope"), CONTACT_PARAMETERS.index("friction")
+UNEVEN_GROUND_PARAMETERS = ("previous_friction", "tilt")
+"""Parameters that uneven ground adds: friction of the feet that landed earlier, and the angle by
+which the next line is steeper, rad."""
+SLOPE_INDEX = CONTACT_PARAMETERS.index("slope")
+FRICTION_INDEX = CONTACT_PARAMETERS.index("friction")
 CONTACT_STEP_INPUTS = (START_NAME, *CONTACT_PARAMETERS)
 """Inputs with respect to which a step can be differentiated."""
 
@@ -37,11 +45,14 @@ def step_batch_with_contact(
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
-    """See `steps`; without derivatives all steps of a lane on flat ground are one walk."""
+    """Return `step_batch` with unilateral contact.
+
+    Without derivatives, all steps of an element on flat ground are one walk of the kernel.
+    """
     friction = np.asarray(model.friction, states.dtype)
-    uneven = any(np.ndim(x) == 2 for x in (*parameters, friction))
-    if uneven and (engine == "diffrax" or model.restitution is not None):
-        return walk_uneven_ground(
+    is_uneven = any(np.ndim(x) == 2 for x in (*parameters, friction))
+    if is_uneven and (engine == "diffrax" or model.restitution is not None):
+        return _walk_with_diffrax(
             model, parameters, states, n_steps, options, engine, n_legs, derivative_names
         )
     if engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
@@ -49,37 +60,38 @@ def step_batch_with_contact(
             f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
             "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
         )
-    ground = _Ground.of(parameters[SLOPE], friction, len(states), n_steps)
-    parameters = [ground.slopes[0] if i == SLOPE else x for i, x in enumerate(parameters)]
+    ground = _GroundBySteps.from_arrays(parameters[SLOPE_INDEX], friction, len(states), n_steps)
+    parameters = [ground.slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameters)]
     columns = np.stack([np.broadcast_to(x, len(states)) for x in (*parameters, ground.friction[0])])
     states = embed_section_states(columns, states, n_legs)
     zeros = np.zeros(len(states), np.int32)
-    if not derivative_names and not uneven:
+    if not derivative_names and not is_uneven:
         walk_result = walk_batch(columns, states, n_steps, model, options, n_legs)
         x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, walk_result)
         results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
         return StepBatchResult(*results, engine="lanes", solver_names=(options.solver,))
-    names, over_steps = CONTACT_PARAMETERS, {}
-    if uneven:
-        names, over_steps = (*CONTACT_PARAMETERS, *UNEVEN_COLUMNS), ground.over_steps()
-    walks = WalkBatch(states.T.copy(), derivative_names, names, over_steps)
+    parameter_names: tuple[str, ...] = CONTACT_PARAMETERS
+    stepwise_parameters: dict[str, StepwiseParameter] = {}
+    if is_uneven:
+        parameter_names = (*CONTACT_PARAMETERS, *UNEVEN_GROUND_PARAMETERS)
+        stepwise_parameters = ground.stepwise_parameters()
+    walks = WalkBatch(states.T.copy(), derivative_names, parameter_names, stepwise_parameters)
     for k in range(n_steps):
         active = walks.active_lanes()
         if not len(active):
             break
-        columns = ground.columns_at(k, columns) if uneven else columns
+        columns = ground.parameters_of_step(k, columns) if is_uneven else columns
         arguments = columns[:, active], walks.section_state[:, active].T, model, options, n_legs
         if not derivative_names:
-            args = arguments[0], arguments[1], 1, *arguments[2:]
-            x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, walk_batch(*args))
+            walk_result = walk_batch(arguments[0], arguments[1], 1, *arguments[2:])
+            x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, walk_result)
             walks.record_step(
                 active, (x.T, durations.T, outcome, n_solver_steps), zeros[active] > 0
             )
             continue
         step_result, step_jacobian = step_batch_with_jacobian(*arguments, walks.input_indices)
-        input_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)[
-            :, :, list(walks.input_indices)
-        ]
+        full_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)
+        input_jacobian = full_jacobian[:, :, list(walks.input_indices)]
         step_values = (
             step_result.section_state,
             step_result.durations,
@@ -94,39 +106,111 @@ def step_batch_with_contact(
     return walks.to_result(np.arange(len(states)), zeros, "lanes", (options.solver,))
 
 
-class _Ground(NamedTuple):
-    """Lines and footholds of walks of some steps."""
+class _GroundBySteps(NamedTuple):
+    """Slope and friction of the ground, step by step."""
 
-    slopes: np.ndarray  # (n_steps + 1, wheels), rad
-    friction: np.ndarray  # (n_steps, wheels)
-    n_slopes: int | None  # given for each wheel; None: no array over steps
+    slopes: np.ndarray  # (n_steps + 1, elements), rad
+    friction: np.ndarray  # (n_steps, elements)
+    n_slopes: int | None  # number of given slopes of an element; None: no array over steps
     n_frictions: int | None
 
     @classmethod
-    def of(cls, slope: np.ndarray, friction: np.ndarray, n: int, n_steps: int) -> "_Ground":
+    def from_arrays(
+        cls, slope: np.ndarray, friction: np.ndarray, n_elements: int, n_steps: int
+    ) -> "_GroundBySteps":
+        """Return the ground; scalars and arrays over the batch are repeated for each step."""
         sizes = (x.shape[1] if x.ndim == 2 else None for x in (slope, friction))
-        over = lambda x, n_rows: x if x.ndim == 2 else np.tile(np.broadcast_to(x, n), (n_rows, 1)).T
-        slopes = complete_batch_slopes(over(slope, n_steps + 1), n_steps)
-        return cls(slopes, over(friction, n_steps).T[:n_steps], *sizes)
 
-    def columns_at(self, k: int, columns: np.ndarray) -> np.ndarray:
-        """Those of step k."""
+        def expand(x: np.ndarray, n_rows: int) -> np.ndarray:
+            return x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_rows, 1)).T
+
+        slopes = complete_batch_slopes(expand(slope, n_steps + 1), n_steps)
+        return cls(slopes, expand(friction, n_steps).T[:n_steps], *sizes)
+
+    def parameters_of_step(self, k: int, columns: np.ndarray) -> np.ndarray:
+        """Return the parameters of step k, with those of `UNEVEN_GROUND_PARAMETERS`."""
         columns = np.concatenate(
             [columns[: len(CONTACT_PARAMETERS)], np.empty((2, columns.shape[1]))]
         )
-        columns[SLOPE], columns[FRICTION] = self.slopes[k], self.friction[k]
+        columns[SLOPE_INDEX], columns[FRICTION_INDEX] = self.slopes[k], self.friction[k]
         columns[-2:] = self.friction[max(k - 1, 0)], self.slopes[k + 1] - self.slopes[k]
         return columns
 
-    def over_steps(self) -> dict[str, StepwiseParameter]:
-        """How steps move with slopes and frictions over steps."""
-        before, tilt = len(CONTACT_PARAMETERS), len(CONTACT_PARAMETERS) + 1
-        last = (self.n_slopes or 1) - 1
-        on_lines = lambda k: ((0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last), 1.0))
-        own, others = (lambda k: k), (lambda k: max(k - 1, 0))
-        if self.n_frictions is None:
-            own = others = lambda k: 0
-        feet = lambda k: ((0, own(k), 1.0), (1, others(k), 1.0))
-        slopes = {"slope": StepwiseParameter((SLOPE, tilt), self.n_slopes, on_lines)}
-        friction = {"friction": StepwiseParameter((FRICTION, before), self.n_frictions, feet)}
-        return (slopes if self.n_slopes else {}) | friction
+    def stepwise_parameters(self) -> dict[str, StepwiseParameter]:
+        """Return how slopes and friction enter the steps."""
+        previous_friction_index = len(CONTACT_PARAMETERS)
+        tilt_index = previous_friction_index + 1
+        n_slopes, n_frictions = self.n_slopes, self.n_frictions
+
+        def slope_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_slopes or 1) - 1), 1.0)
+
+        def friction_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+            if n_frictions is None:
+                return (0, 0, 1.0), (1, 0, 1.0)
+            return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
+
+        friction = StepwiseParameter(
+            (FRICTION_INDEX, previous_friction_index), n_frictions, friction_terms
+        )
+        if n_slopes is None:
+            return {"friction": friction}
+        slope = StepwiseParameter((SLOPE_INDEX, tilt_index), n_slopes, slope_terms)
+        return {"slope": slope, "friction": friction}
+
+
+def _walk_with_diffrax(
+    model: Any,
+    parameters: list[np.ndarray],
+    states: np.ndarray,
+    n_steps: int,
+    options: StepOptions,
+    engine: str,
+    n_legs: int,
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    """Return `step_batch` on uneven ground by `walk` under `jax.vmap`, without derivatives."""
+    if engine not in ("auto", "diffrax") or len(derivative_names):
+        raise ValueError(
+            "uneven ground with restitution needs engine 'diffrax' and no derivatives: leave "
+            "engine and derivatives out, or map vrw.walk over the elements."
+        )
+    n_states = len(states)
+    parameter_columns = (*parameters, np.asarray(model.friction, states.dtype))
+    full_columns = [np.broadcast_to(x, (n_states, *x.shape[1:])) for x in parameter_columns]
+    walk_rows = lambda x, *full_columns: _vmapped_walk(
+        model, options, n_legs, n_steps, x, full_columns
+    )
+    x, durations, outcome, n_stepped, n_solver_steps = map_in_numpy_batches(
+        walk_rows, batch_sizes.UNEVEN_GROUND_BATCH_SIZES, states, *full_columns
+    )
+    zeros = np.zeros(n_states, np.int32)
+    results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
+    return StepBatchResult(*results, engine="diffrax", solver_names=(options.solver,))
+
+
+@eqx.filter_jit
+def _vmapped_walk(
+    model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, columns: Any
+) -> tuple:
+    def walk_one(x: Any, columns: Any) -> tuple:
+        *values, friction = columns
+        model_with_friction = eqx.tree_at(lambda model: model.friction, model, friction)
+        params = wheel_from_parameters(tuple(values), n_legs)
+        walk_result = walk(
+            params, x, n_steps, model=model_with_friction, options=options, engine="diffrax"
+        )
+        last_step = jax.tree.map(
+            lambda x: x[jnp.minimum(walk_result.n_stepped, n_steps - 1)], walk_result.steps
+        )
+        n_solver_steps = jnp.sum(walk_result.steps.solver_steps)
+        return (
+            last_step.section_state,
+            last_step.durations,
+            walk_result.outcome,
+            walk_result.n_stepped,
+            n_solver_steps,
+        )
+
+    narrow_integers = lambda x: x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
+    return jax.tree.map(narrow_integers, jax.vmap(walk_one)(states, columns))

@@ -1,6 +1,7 @@
-"""Steps of the paper's wheel between landings with both feet on the ground: its two-number section.
+"""Steps of the paper's wheel from just after one landing to just after the next.
 
-Just after such a landing the wheel has two free numbers, and the ground of its step is two lines.
+Both landings leave both feet on the ground, so that the state has two numbers. The ground of a step
+consists of two lines.
 """
 
 from collections.abc import Sequence
@@ -11,47 +12,51 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax import simd
 from vrw_jax.batches.programs import run_compiled
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models import N_STEP_INPUTS, ViscoelasticWheel, jacobian_columns, step_after_landing
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
 
-INPUTS = (*PARAMETER_NAMES, "theta", "dtheta", "slope_ahead")
-"""What a step moves with, in the order of the columns of `LandingSteps.jacobian`."""
+LANDING_STEP_INPUTS = (*PARAMETER_NAMES, "theta", "dtheta", "next_slope")
+"""Inputs with respect to which a step can be differentiated."""
 
 
 class LandingSteps(NamedTuple):
     """Steps of a batch; lanes are the last axis.
 
-    A step ends just after the next landing; where it failed (`outcome`) its numbers are zeros, but
-    for `stopper_margin`, which is NaN only where SLS-I was not reached.
+    If a step failed, its values are zero, except `stopper_margin`.
     """
 
     state: np.ndarray
-    """(theta+, dtheta+) just after the next landing with both feet held, in the frame of the line
-    ahead, (2, lanes), rad, rad/s."""
+    """(theta+, dtheta+) just after the next landing with both feet held, in the frame of the next
+    line, (2, lanes), rad, rad/s."""
     rear_impulse: np.ndarray
-    """Normal impulse of the rear foot in that landing, N s: where it is negative, the landing frees
-    the foot, and the two numbers are not the wheel's."""
+    """Normal impulse of the rear foot in that landing, N s. If it is negative, the landing releases
+    the foot, and `state` is not the motion of the wheel."""
     stopper_margin: np.ndarray
-    """Positive where Leg 2 met its stopper before the next foot lands, negative where that foot
-    landed first, m^2/s; it and its first derivatives are continuous where both come at once."""
-    outcome: np.ndarray
+    """Margin of the order of events, m^2/s; NaN if SLS-I was not reached.
+
+    It is positive if Leg 2 meets its stopper before the next foot lands, and negative if that foot
+    lands first. The margin and its first derivatives are continuous where both happen at once.
+    """
+    outcome: np.ndarray  # an Outcome
     durations: np.ndarray  # of DLS, SLS-I, SLS-II, (3, lanes), s
     jacobian: np.ndarray | None
-    """Of (theta+, dtheta+, rear_impulse, stopper_margin) by `moved`: (moved, 4, lanes)."""
+    """Jacobian of (theta+, dtheta+, rear_impulse, stopper_margin) by the requested inputs, shape
+    (inputs, 4, lanes); None if no derivatives were requested."""
 
 
 def step_batch_after_landing(
     wheels: np.ndarray,
     states: np.ndarray,
-    ahead: np.ndarray,
+    next_slopes: np.ndarray,
     *,
     n_legs: int = 8,
     model: ViscoelasticWheel | None = None,
     options: StepOptions | None = None,
-    moved: Sequence[str] = (),
+    derivatives: Sequence[str] = (),
 ) -> LandingSteps:
     """Return one step of every lane from landing to landing on uneven ground.
 
@@ -60,11 +65,14 @@ def step_batch_after_landing(
             line under both feet.
         states: (theta+, dtheta+) just after a landing with both feet held, in the frame of that
             line, (2, lanes), rad, rad/s.
-        ahead: slopes of the lines on which the steps end, (lanes,), rad.
-        n_legs: of all wheels.
-        model: says whether a foot that would have to be pulled ends a step.
+        next_slopes: slopes of the lines on which the steps end, (lanes,), rad.
+        n_legs: number of legs of all wheels.
+        model: model whose `stop_at_lift_off` applies.
         options: numerical choices.
-        moved: `INPUTS` by which derivatives are wanted.
+        derivatives: names in `LANDING_STEP_INPUTS`.
+
+    Raises:
+        ValueError: the solver is not explicit.
     """
     model, options = model or ViscoelasticWheel(), options or StepOptions()
     tableau = load_explicit_tableau(options.solver)
@@ -72,30 +80,41 @@ def step_batch_after_landing(
         raise ValueError(
             f"solver is {options.solver}, but lanes need an explicit one: take Dopri8."
         )
-    dynamic, structure = jax.tree.flatten(options)
-    uniform = [np.asarray(leaf, wheels.dtype) for leaf in dynamic]
-    n, stop = len(PARAMETER_NAMES), model.stop_at_lift_off
-    places = tuple(INPUTS.index(name) for name in moved)
+    option_leaves, structure = jax.tree.flatten(options)
+    uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    n_parameters, stop_at_lift_off = len(PARAMETER_NAMES), model.stop_at_lift_off
+    input_indices = tuple(LANDING_STEP_INPUTS.index(name) for name in derivatives)
 
-    def step(uniform: Any, lanes: Any, few: Array | None = None) -> tuple:
-        known = jax.tree.unflatten(structure, uniform)
-        known = known.with_derivative_tolerances() if places else known
+    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        current_options = jax.tree.unflatten(structure, uniform)
+        if input_indices:
+            current_options = current_options.with_derivative_tolerances()
 
-        def told(*lanes: Array) -> tuple:
-            params = wheel_from_parameters(lanes[:n], n_legs, lanes[-1])
-            step = step_after_landing(params, lanes[n:-1], known, tableau, stop, few)
-            return step.numbers, (step.unfinished, step.outcome, jnp.stack(step.durations))
+        def step_outputs(*lanes: Array) -> tuple:
+            params = wheel_from_parameters(lanes[:n_parameters], n_legs, lanes[-1])
+            state = lanes[n_parameters:-1]
+            result = step_after_landing(
+                params, state, current_options, tableau, stop_at_lift_off, straggler_count
+            )
+            diagnostics = result.is_unfinished, result.outcome, jnp.stack(result.durations)
+            return result.values, diagnostics
 
-        if not places:
-            numbers, others = told(*lanes)
-            return (*others, numbers)
-        columns, numbers, others = jacobian_columns(told, lanes, places)
-        return (*others, numbers, columns)
+        if not input_indices:
+            values, diagnostics = step_outputs(*lanes)
+            return (*diagnostics, values)
+        columns, values, diagnostics = jacobian_columns(step_outputs, lanes, input_indices)
+        return (*diagnostics, values, columns)
 
-    settings = ("step after landing", n_legs, stop, structure, places)
-    small = (N_STEP_INPUTS,) if places else ()
-    given = [*wheels, *states, ahead]
-    _, outcome, durations, numbers, *columns = run_compiled(step, uniform, given, settings, *small)
-    margin = np.where(durations[1] > 0.0, numbers[3], np.nan)
-    told = numbers[:2], numbers[2], margin, outcome, durations
-    return LandingSteps(*told, columns[0] if columns else None)
+    settings = ("step after landing", n_legs, stop_at_lift_off, structure, input_indices)
+    limits = simd.RegisterLimits(N_STEP_INPUTS) if input_indices else simd.DEFAULT_LIMITS
+    lane_arrays = [*wheels, *states, next_slopes]
+    results = run_compiled(step, uniform, lane_arrays, settings, limits)
+    _, outcome, durations, values, *columns = results
+    return LandingSteps(
+        state=values[:2],
+        rear_impulse=values[2],
+        stopper_margin=np.where(durations[1] > 0.0, values[3], np.nan),
+        outcome=outcome,
+        durations=durations,
+        jacobian=columns[0] if columns else None,
+    )

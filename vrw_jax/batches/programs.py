@@ -1,4 +1,4 @@
-"""Functions of lanes, compiled and run on numpy arrays: as machine code, or in blocks by XLA."""
+"""Compiled functions of lanes on numpy arrays: machine code, or programs of XLA in blocks."""
 
 import functools
 from collections.abc import Callable
@@ -8,15 +8,15 @@ import jax
 import numpy as np
 
 from vrw_jax import simd
+from vrw_jax.numerics import batch_sizes
 from vrw_jax.runtime import cached_lane_program
 
-N_LANES_PER_BLOCK = 32_768
-"""Number of lanes of a block that XLA runs side by side, as on a GPU."""
 STRAGGLER_DIVISOR = 8
-"""A block stops early once less than one in `STRAGGLER_DIVISOR` of its lanes is running."""
+"""Inverse share of running lanes below which a block by XLA stops; the rest is run again together.
+It is chosen because the last lanes of a block take as many iterations as all others."""
 
 _program_cache: dict[Any, Callable] = {}
-"""Compiled steps by all that they depend on, see `run_compiled`."""
+"""Compiled steps by everything that they depend on, see `run_compiled`."""
 
 
 def run_compiled(
@@ -24,42 +24,47 @@ def run_compiled(
     uniform_values: list[np.ndarray],
     lane_arrays: list[np.ndarray],
     cache_key: Any,
-    max_group_size: int = simd.MAX_UNROLLED,
+    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS,
 ) -> list[np.ndarray]:
-    """Compile and run `step(uniform, lanes, few)`. Its first result marks the lanes that are
-    unfinished.
+    """Compile and run `step(uniform, lanes, straggler_count)`, whose first result marks unfinished
+    lanes, and return its results.
 
     `cache_key` contains all that `step` depends on except its arguments.
     """
     dtype, uses_machine_code = lane_arrays[0].dtype, simd.is_available()
-    program_key = (cache_key, dtype, uses_machine_code, N_LANES_PER_BLOCK)
+    block_size = batch_sizes.XLA_LANE_BATCH_SIZE
+    program_key = (cache_key, dtype, uses_machine_code, block_size)
     if program_key not in _program_cache:
         if uses_machine_code:
             uniform_dtypes = [x.dtype for x in uniform_values]
             _program_cache[program_key] = cached_lane_program(
-                step, uniform_dtypes, len(lane_arrays), dtype, cache_key, max_group_size
+                step, uniform_dtypes, len(lane_arrays), dtype, cache_key, limits
             )
         else:
-            _program_cache[program_key] = functools.partial(_run_xla_blocks, jax.jit(step))
+            _program_cache[program_key] = functools.partial(
+                _run_xla_blocks, jax.jit(step), block_size
+            )
     return _program_cache[program_key](uniform_values, lane_arrays)
 
 
 def _run_xla_blocks(
-    program: Callable, uniform_values: list[np.ndarray], lane_arrays: list[np.ndarray]
+    program: Callable,
+    block_size: int,
+    uniform_values: list[np.ndarray],
+    lane_arrays: list[np.ndarray],
 ) -> list[np.ndarray]:
-    """Run the program block by block; stragglers are run again together."""
+    """Return the results of a program that is run block by block, with stragglers run again
+    together.
+    """
     results: list[np.ndarray] = []
     unfinished = np.arange(len(lane_arrays[0]))
     while len(unfinished) > 0:
-        straggler_count = np.int32(
-            N_LANES_PER_BLOCK // STRAGGLER_DIVISOR if len(unfinished) > N_LANES_PER_BLOCK else 0
-        )
+        is_last_round = len(unfinished) <= block_size
+        straggler_count = np.int32(0 if is_last_round else block_size // STRAGGLER_DIVISOR)
         stragglers = []
-        for block_start in range(0, len(unfinished), N_LANES_PER_BLOCK):
-            block = unfinished[block_start : block_start + N_LANES_PER_BLOCK]
-            padded_block = np.concatenate(
-                [block, np.repeat(block[-1:], N_LANES_PER_BLOCK - len(block))]
-            )
+        for block_start in range(0, len(unfinished), block_size):
+            block = unfinished[block_start : block_start + block_size]
+            padded_block = np.concatenate([block, np.repeat(block[-1:], block_size - len(block))])
             block_arrays = tuple(x[padded_block] for x in lane_arrays)
             outputs = [
                 np.asarray(x)[..., : len(block)]

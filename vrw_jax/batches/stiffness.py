@@ -1,34 +1,57 @@
 """Selection of the cheapest solver for a wheel from the stiffness of its airborne leg."""
 
 import functools
+from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from vrw_jax.integrator import load_explicit_tableau, real_stability_limit
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import SolverName, StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES
 
-NAMED_SOLVER_INDEX, STABLE_SOLVER_INDEX, IMPLICIT_SOLVER_INDEX = range(3)
-"""Indices of the solvers: the one in the options, and two for stiff wheels."""
-STABLE_SOLVER, TSIT5_TOLERANCE_FACTOR = "Tsit5", 4.0
-"""Explicit solver of wheels whose steps are limited by stability, and the factor by which its
-tolerance is tightened.
 
-Of diffrax's solvers of order 5 and more it has the largest stable step per evaluation: 0.58 over
-the mode's rate, against 0.40 for Dopri8. The factor is chosen because it costs little, and for
-tolerances of 1e-6 and below the error is then no larger than Dopri8's at the named one.
-"""
-IMPLICIT_SOLVER = "Kvaerno5"
-"""Solver of wheels that are too stiff for explicit ones."""
-IMPLICIT_COST_EVALS = 6e4
-"""Number of evaluations of an explicit solver with the same cost as IMPLICIT_SOLVER at a tolerance
-of 1e-6 (docs/verification/failures.md). The cost of the implicit solver scales as the tolerance to
-the power of -0.17, from 1e-4 to 1e-10. At the limit of stability the cost of explicit solvers does
-not depend on it."""
+class SolverIndex(IntEnum):
+    """Index of a solver in `StepBatchResult.solver_names`."""
+
+    NAMED = 0  # the solver of the step options
+    STABLE = 1  # an explicit one for wheels whose solver steps are limited by stability
+    IMPLICIT = 2  # one for wheels that are too stiff for explicit solvers
 
 
-def select_solver(parameters: np.ndarray, options: StepOptions) -> np.ndarray:
-    """Return the index of the cheapest solver for each lane.
+@dataclass(frozen=True)
+class SolverSelectionOptions:
+    """Solvers of stiff wheels, and their costs, which are compared by `select_solver`."""
+
+    stable_solver: SolverName = "Tsit5"
+    """Explicit solver for steps limited by stability.
+
+    It is chosen because of diffrax's solvers of order 5 and more it has the largest stable step per
+    evaluation: 0.58 over the mode's rate, against 0.40 for Dopri8.
+    """
+    stable_tolerance_factor: float = 4.0
+    """Factor by which the tolerance of the stable solver is tightened.
+
+    It is chosen because it costs little. At tolerances of 1e-6 and below the error is then no
+    larger than that of Dopri8.
+    """
+    implicit_solver: SolverName = "Kvaerno5"
+    """Solver for wheels that are too stiff for explicit ones."""
+    implicit_cost: float = 6e4
+    """Cost of the implicit solver at a tolerance of 1e-6, in evaluations of an explicit solver.
+
+    It was measured (docs/verification/failures.md). It scales as the tolerance to the power of
+    -0.17. The cost of explicit solvers at the limit of stability does not depend on the tolerance.
+    """
+
+
+SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
+
+
+def select_solver(
+    parameters: np.ndarray, options: StepOptions, selection: SolverSelectionOptions
+) -> np.ndarray:
+    """Return the `SolverIndex` of the cheapest solver for each lane.
 
     The airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g), s, if legs are
     light. A step times that rate must stay below an explicit solver's limit of stability; rejected
@@ -52,11 +75,16 @@ def select_solver(parameters: np.ndarray, options: StepOptions) -> np.ndarray:
             )
 
         _, named_cost = evaluations(options.solver)
-        n_solver_steps, stable_cost = evaluations(STABLE_SOLVER)
-        is_stability_limited = n_solver_steps > (tolerance / TSIT5_TOLERANCE_FACTOR) ** -0.2
-        implicit_cost = np.full_like(decay_count, IMPLICIT_COST_EVALS * (1e-6 / tolerance) ** 0.17)
-        costs = named_cost, np.where(is_stability_limited, stable_cost, np.inf), implicit_cost
-        return np.argmin(costs, axis=0).astype(np.int32)  # invalid wheels: the first
+        n_solver_steps, stable_cost = evaluations(selection.stable_solver)
+        stable_tolerance = tolerance / selection.stable_tolerance_factor
+        is_stability_limited = n_solver_steps > stable_tolerance**-0.2
+        implicit_cost = selection.implicit_cost * (1e-6 / tolerance) ** 0.17
+        costs = (
+            named_cost,
+            np.where(is_stability_limited, stable_cost, np.inf),
+            np.full_like(decay_count, implicit_cost),
+        )
+        return np.argmin(costs, axis=0).astype(np.int32)  # for an invalid wheel the first
 
 
 @functools.cache

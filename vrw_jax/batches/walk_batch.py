@@ -19,8 +19,10 @@ from vrw_jax.wheel import Outcome
 
 
 class StepSensitivity(eqx.Module):
-    """How the end of a walk moves with its start or a parameter; the start and parameters that are
-    arrays over steps have an axis of their own."""
+    """Derivatives of the end of a walk with respect to its start or a parameter.
+
+    The start, and a parameter that is an array over steps, have an axis of their own, the last one.
+    """
 
     section_state: Float[np.ndarray, "lanes section *start"]
     durations: Float[np.ndarray, "lanes 3 *start"]
@@ -36,13 +38,13 @@ class StepBatchResult(AbstractPrintable):
     - `durations`: of DLS, SLS-I, SLS-II, s; with unilateral contact see its step;
     - `outcome`: an Outcome; the walk ends at the first that is not STEPPED;
     - `n_stepped`: number of steps that ended in a touchdown;
-    - `solver_steps`: tried by the integrator, over all steps;
-    - `is_collocated`: whether the last step was taken in fixed work, by collocation;
-    - `solver_index`: index in `solver_names` of the solver of the element; "auto" selects by
+    - `solver_steps`: number of solver steps tried, over all steps;
+    - `is_collocated`: whether the last step was computed by collocation, in a fixed amount of work;
+    - `solver_index`: index in `solver_names` of the solver of the element; "auto" selects it by
       stiffness;
     - `engine`: "lanes", "diffrax" or "collocation";
-    - `solver_names`: the named one first;
-    - `derivatives`: by name of the requested input.
+    - `solver_names`: names of solvers; the one of the options is the first;
+    - `derivatives`: derivatives by the name of the requested input.
 
     Examples:
         >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
@@ -85,16 +87,22 @@ START_NAME = "section_state"
 
 
 class StepwiseParameter(NamedTuple):
-    """A parameter that one step moves with in several places, or that is an array over steps."""
+    """How a parameter enters the steps of a walk, for the chain rule.
 
-    inputs: tuple[int, ...]  # its places among the numbers of a step
-    size: int | None  # values of a lane; None: one that is no array
-    parts: Callable[[int], tuple[tuple[int, int, float], ...]]
-    """Of a step: which of the inputs, which value, and how the one moves with the other."""
+    It may be several inputs of one step, and its values may differ from step to step.
+    """
+
+    input_indices: tuple[int, ...]  # indices of its inputs among those of a step
+    n_values: int | None  # number of values of one lane; None for a single number
+    terms: Callable[[int], tuple[tuple[int, int, float], ...]]
+    """Return for a step its terms (which of the inputs, which value, derivative of the first by the
+    second)."""
 
 
 def complete_batch_slopes(slopes: np.ndarray, n_steps: int) -> np.ndarray:
-    """Slopes of the lines that n steps use, (n_steps + 1, lanes): the last of n is used twice."""
+    """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad; the last of n given
+    slopes is used twice.
+    """
     return slopes.T if slopes.shape[1] > n_steps else np.concatenate([slopes.T, slopes.T[-1:]])
 
 
@@ -106,30 +114,35 @@ class WalkBatch:
         states: np.ndarray,
         derivative_names: Sequence[str],
         parameters: tuple[str, ...],
-        over_steps: Mapping[str, StepwiseParameter],
+        stepwise_parameters: Mapping[str, StepwiseParameter],
     ) -> None:
-        """`asked`: START and names of these parameters, which lead the numbers of a lane; some may
-        be `over_steps`."""
+        """Begin the walks.
+
+        - `derivative_names`: requested derivatives: `START_NAME` and names of `parameters`;
+        - `parameters`: names of the first inputs of a step; the section state follows them;
+        - `stepwise_parameters`: those that do not enter every step as one equal input.
+        """
         state_size, n_lanes = states.shape
         self.section_state, self.durations = states, np.zeros((3, n_lanes), states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.is_collocated = np.zeros(n_lanes, bool)
         # Inputs of the Jacobian: the requested parameters, then the start.
-        self.derivative_names, self.parameter_names = (
-            derivative_names,
-            [name for name in derivative_names if name != START_NAME],
-        )
-        state_inputs = range(len(parameters), len(parameters) + state_size)
-        own = lambda name: StepwiseParameter(
+        self.derivative_names = derivative_names
+        self.parameter_names = [name for name in derivative_names if name != START_NAME]
+        self.is_flat_ground = not stepwise_parameters
+        single_input = lambda name: StepwiseParameter(
             (parameters.index(name),), None, lambda _: ((0, 0, 1.0),)
         )
-        self.columns = [over_steps.get(name, own(name)) for name in self.parameter_names]
-        inputs = [i for column in self.columns for i in column.inputs]
-        self.input_indices = (*inputs, *state_inputs) if derivative_names else ()
-        rows = [1 if column.size is None else column.size for column in self.columns]
-        self.begins = np.cumsum([0, *rows])  # of each name's rows, then of the start's
-        self.simple = not over_steps
-        n_rows = self.begins[-1] + state_size if derivative_names else 0
+        self.parameters = [
+            stepwise_parameters.get(name, single_input(name)) for name in self.parameter_names
+        ]
+        parameter_inputs = [i for parameter in self.parameters for i in parameter.input_indices]
+        state_inputs = range(len(parameters), len(parameters) + state_size)
+        self.input_indices = (*parameter_inputs, *state_inputs) if derivative_names else ()
+        n_rows_by_parameter = [parameter.n_values or 1 for parameter in self.parameters]
+        # First row of the Jacobian of each parameter, and then that of the start.
+        self.first_rows = np.cumsum([0, *n_rows_by_parameter])
+        n_rows = self.first_rows[-1] + state_size if derivative_names else 0
         self.jacobian = np.zeros((n_rows, state_size + 3, n_lanes), states.dtype)
 
     def active_lanes(self) -> np.ndarray:
@@ -166,15 +179,16 @@ class WalkBatch:
             return {}
         self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
         jacobian, state_size = self.jacobian.take(inverse_order, -1).T, len(self.section_state)
-        columns_by_name: dict[str, Any] = {START_NAME: slice(self.begins[-1], None)}
-        for name, column, begin in zip(
-            self.parameter_names, self.columns, self.begins[:-1], strict=True
+        rows_by_name: dict[str, Any] = {START_NAME: slice(self.first_rows[-1], None)}
+        for name, parameter, first_row in zip(
+            self.parameter_names, self.parameters, self.first_rows[:-1], strict=True
         ):
-            columns_by_name[name] = (
-                begin if column.size is None else slice(begin, begin + column.size)
+            n_values = parameter.n_values
+            rows_by_name[name] = (
+                first_row if n_values is None else slice(first_row, first_row + n_values)
             )
         jacobian_by_name = {
-            name: jacobian[:, :, columns_by_name[name]] for name in self.derivative_names
+            name: jacobian[:, :, rows_by_name[name]] for name in self.derivative_names
         }
         return {
             name: StepSensitivity(x[:, :state_size], x[:, state_size:])
@@ -203,8 +217,8 @@ class WalkBatch:
 
         Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
-        if not self.simple:
-            return self._after_uneven(index, step_jacobian)
+        if not self.is_flat_ground:
+            return self._chain_stepwise_jacobian(index, step_jacobian)
         n_parameters, state_size = len(self.parameter_names), len(self.section_state)
         if not self.n_stepped[index].any():
             return step_jacobian
@@ -216,25 +230,35 @@ class WalkBatch:
         chained[:n_parameters] += step_jacobian[:n_parameters]
         return chained
 
-    def _after_uneven(self, some: Any, by: np.ndarray) -> np.ndarray:
-        """The same, with rows for each value over steps; later steps' values move nothing yet."""
-        size, start = len(self.section_state), self.begins[-1]
-        n = len(by) - size
-        k = int(np.max(self.n_stepped[some], initial=0))
-        total = np.zeros((len(self.jacobian), *by.shape[1:]), by.dtype)
+    def _chain_stepwise_jacobian(self, index: Any, step_jacobian: np.ndarray) -> np.ndarray:
+        """Return `_chain_jacobian` with one row for each value over steps.
+
+        The values of later steps have no effect yet, and their rows are zero.
+        """
+        state_size, first_start_row = len(self.section_state), self.first_rows[-1]
+        n_inputs = len(step_jacobian) - state_size
+        k = int(np.max(self.n_stepped[index], initial=0))
+        shape = len(self.jacobian), *step_jacobian.shape[1:]
+        chained = np.zeros(shape, step_jacobian.dtype)
         if k == 0:
-            total[start:] = by[n:]
+            chained[first_start_row:] = step_jacobian[n_inputs:]
         else:
-            known = [range(b, min(b + k + 1, e)) for b, e in itertools.pairwise(self.begins)]
-            rows = np.array([*itertools.chain(*known), *range(start, len(total))])
-            before = self.jacobian[rows, :size][..., some]
-            total[rows] = sum(by[n + i] * before[:, i, None] for i in range(size))
-        first = 0
-        for column, begin in zip(self.columns, self.begins[:-1], strict=True):
-            for which, value, factor in column.parts(k):
-                total[begin + value] += factor * by[first + which]
-            first += len(column.inputs)
-        return total
+            used_rows = [
+                range(first, min(first + k + 1, end))
+                for first, end in itertools.pairwise(self.first_rows)
+            ]
+            rows = np.array([*itertools.chain(*used_rows), *range(first_start_row, len(chained))])
+            previous_jacobian = self.jacobian[rows, :state_size][..., index]
+            chained[rows] = sum(
+                step_jacobian[n_inputs + i] * previous_jacobian[:, i, None]
+                for i in range(state_size)
+            )
+        first_input = 0
+        for parameter, first_row in zip(self.parameters, self.first_rows[:-1], strict=True):
+            for which, value, factor in parameter.terms(k):
+                chained[first_row + value] += factor * step_jacobian[first_input + which]
+            first_input += len(parameter.input_indices)
+        return chained
 
 
 def lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
@@ -243,7 +267,7 @@ def lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
 
 
 def _replace_lanes(values: np.ndarray, index: Any, new_values: np.ndarray) -> np.ndarray:
-    """Replace the values of some lanes and return the array."""
+    """Return the array with the values of the lanes at `index` replaced, in place if possible."""
     if isinstance(index, slice):
         return new_values
     values[..., index] = new_values

@@ -76,10 +76,8 @@ def locate_event(
             step.start_values, values, rates, is_crossing, strict=True
         ):
             is_past, is_curved = _is_past_or_curved(g0, g, rate, search.length)
-            is_before_event, is_straight = (
-                is_before_event & ~(is_crossing_guard & is_past),
-                is_straight & ~(is_crossing_guard & is_curved),
-            )
+            is_before_event = is_before_event & ~(is_crossing_guard & is_past)
+            is_straight = is_straight & ~(is_crossing_guard & is_curved)
         low = jnp.where(is_before_event, search.length, search.lower_bound)
         high = jnp.where(is_before_event, search.upper_bound, search.length)
         proposal = search.length + change
@@ -102,11 +100,25 @@ def locate_event(
             n_iterations=search.n_iterations + 1,
         )
 
-    first_length = h * _initial_fraction(tableau, *step[1:4], step.crossing_bits)
+    first_fraction = jnp.ones_like(h)
+    values_by_guard = zip(step.start_values, step.middle_values, step.end_values, strict=True)
+    for is_crossing_guard, values in zip(is_crossing, values_by_guard, strict=True):
+        fraction = _parabola_zero(tableau, is_crossing_guard, *values)
+        first_fraction = jnp.where(
+            is_crossing_guard, jnp.minimum(first_fraction, fraction), first_fraction
+        )
     zero_index, zero = jnp.zeros(h.shape, jnp.int32), jnp.zeros_like(h)
     count = jnp.zeros((), jnp.int32)
     start = EventSearch(
-        first_length, zero, h, step.has_crossed, step.start, zero, zero_index, zero_index, count
+        h * first_fraction,
+        zero,
+        h,
+        step.has_crossed,
+        step.start,
+        zero,
+        zero_index,
+        zero_index,
+        count,
     )
     needs_iteration = lambda search: (
         jnp.any(search.is_unresolved) & (search.n_iterations < options.max_event_iterations)
@@ -133,9 +145,8 @@ def _refine_event(
     short step, s.
     """
     linear_limit, short_step_limit = limits
-    low_order_tableau = load_explicit_tableau(
-        "Bosh3"
-    )  # exact to round-off over a thousandth of a step
+    # Over a thousandth of a step, a method of order 3 is exact to round-off.
+    low_order_tableau = load_explicit_tableau("Bosh3")
     assert low_order_tableau is not None
 
     def can_step(is_distant: Array, remaining_time: Array) -> Array:
@@ -181,19 +192,14 @@ def _refine_event(
     end, remaining_time, length, guard, is_distant, _ = lax.while_loop(
         needs_iteration, take_short_step, initial_carry
     )
-    end = tree_where(is_distant, step.start, _extrapolate(end, remaining_time))
+    q = tuple(x + remaining_time * y for x, y in zip(end.q, end.v, strict=True))
+    v = tuple(
+        x + remaining_time * y for x, y in zip(end.v, end.acceleration.acceleration, strict=False)
+    )
+    end = tree_where(is_distant, step.start, end._replace(q=q, v=v))
     return search._replace(
         length=length, is_unresolved=search.is_unresolved | is_distant, end=end, guard=guard
     )
-
-
-def _extrapolate(state: StageState, time_step: Array) -> StageState:
-    """Return the state a time step later, extrapolated along its rate."""
-    q = tuple(x + time_step * y for x, y in zip(state.q, state.v, strict=True))
-    v = tuple(
-        x + time_step * y for x, y in zip(state.v, state.acceleration.acceleration, strict=False)
-    )
-    return state._replace(q=q, v=v)
 
 
 @jax.jit  # traced once, for whichever guard
@@ -201,9 +207,7 @@ def _is_past_or_curved(start: Array, g: Array, rate: Array, length: Array) -> tu
     """Return whether a guard has crossed, and whether it is too curved for Newton's
     method alone.
     """
-    is_past = (g < 0.0) | (
-        (g == 0.0) & (rate <= 0.0)
-    )  # a guard that rises from zero has not crossed
+    is_past = (g < 0.0) | ((g == 0.0) & (rate <= 0.0))  # a guard that rises from zero is not past
     fall = rate * length
     return is_past, jnp.abs(2.0 * (start - g + fall) * g) > 0.25 * fall * fall
 
@@ -232,26 +236,14 @@ def _time_to_zero(is_crossing: Array, g: Array, rate: Array) -> Array:
     return jnp.where(is_falling, -g / jnp.where(is_falling, rate, -1.0), unknown)
 
 
-def _initial_fraction(
-    tableau: ButcherTableau, start: Vector, middle: Vector, end: Vector, crossing_bits: Array
-) -> Array:
-    """Return the fraction of the step to the earliest zero of the guards' parabolas.
-
-    The root is found by the secant, then by Newton's method.
-    """
-    earliest = jnp.ones_like(start[0])
-    for index, values in enumerate(zip(start, middle, end, strict=True)):
-        is_crossing = (crossing_bits >> index) & 1 == 1
-        fraction = _parabola_zero(tableau, is_crossing, *values)
-        earliest = jnp.where(is_crossing, jnp.minimum(earliest, fraction), earliest)
-    return earliest
-
-
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def _parabola_zero(
     tableau: ButcherTableau, is_crossing: Array, g0: Array, gm: Array, g1: Array
 ) -> Array:
-    """Return the fraction of the step to the zero of a guard's parabola."""
+    """Return the fraction of the step to the zero of a guard's parabola.
+
+    The zero is found by the secant, then by Newton's method.
+    """
     curvature, linear_rate = fit_guard_parabola(tableau, g0, gm, g1)
     fall = jnp.where(is_crossing & (g0 > g1), g0 - g1, 1.0)
     fraction = jnp.clip(g0 / fall, 0.0, 1.0)

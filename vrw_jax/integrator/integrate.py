@@ -7,6 +7,7 @@ ended does not change.
 """
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
@@ -21,11 +22,11 @@ from vrw_jax.integrator.minima import (
     MinimaResult,
     MinimaState,
     init_minima,
+    minima_jvp,
     refine_minima,
     update_minima,
     values_and_rates,
 )
-from vrw_jax.integrator.minima import minima_jvp as moved_minima
 from vrw_jax.integrator.tableaus import (
     AccelerationFn,
     ButcherTableau,
@@ -93,12 +94,19 @@ class _IntegratorState(NamedTuple):
     tangents: Array | None  # of the state, (directions, ., batch), see `tangents`
 
 
-RUNNING_STATUS, TIMED_OUT_STATUS, FAILED_STATUS, CROSSED_STATUS, IDLE_STATUS = range(5)
-"""Status codes of a batch element in the integration."""
+class IntegrationStatus(IntEnum):
+    """Status of a batch element in the integration."""
+
+    RUNNING = 0
+    TIMED_OUT = 1
+    FAILED = 2
+    CROSSED = 3  # the last tried step crosses a guard
+    IDLE = 4  # not active, or its start is already an event
+
 
 STRAGGLER_FACTOR = 2
-"""Ratio of iterations at which stragglers are cut off to the iterations after which half of the
-batch had finished."""
+"""Ratio of the iterations after which stragglers are cut off to the iterations after which half of
+the batch had finished. It is chosen because fewer iterations would cut off regular elements."""
 
 
 BatchPhaseFn = Callable[[Any, Vector], BatchPhase]
@@ -117,12 +125,13 @@ def integrate_batch_phase(
     options: StepOptions,
     straggler_count: Array | None = None,
 ) -> BatchPhaseEnd:
-    """Integrate every active element from (q, v) to the earliest of its guards.
+    """Return the end of a phase: every active element integrated to its earliest event.
 
-    Errors are those of `integrate_phase`. In a large batch, as on a GPU, the last `straggler_count`
-    elements are cut off if they take `STRAGGLER_FACTOR` times as long as half of the batch. They
-    are marked unfinished, to be run again from their start together with other stragglers.
-    Derivatives: with respect to `constants`, `held_constants`, `q` and `v`, see `tangents`.
+    Errors are those of `hybrid.integrate_phase`. In a large batch, as on a GPU, the last
+    `straggler_count` elements are cut off if they take `STRAGGLER_FACTOR` times as long as half of
+    the batch. They are marked unfinished, and the caller runs them again together with other
+    stragglers. The result is differentiable with respect to `constants`, `held_constants`, `q` and
+    `v`, see `tangents`.
     """
     integrate = jax.custom_jvp(
         lambda *arguments: _integrate_to_event(phase_of, tableau, None, *arguments).phase_end
@@ -180,14 +189,8 @@ def _phase_end_jvp(
     They are those of the positions, the rates, the duration, and the minima of the margins.
     """
     step_function, start, phase_end, integrator_state, minima, minima_result = phase_run
-    n, last_length = (
-        len(start.q),
-        jnp.where(
-            integrator_state.status == CROSSED_STATUS,
-            phase_end.duration - integrator_state.time,
-            0.0,
-        ),
-    )
+    n, has_crossed = len(start.q), integrator_state.status == IntegrationStatus.CROSSED
+    last_length = jnp.where(has_crossed, phase_end.duration - integrator_state.time, 0.0)
     rk_step = step_function(integrator_state.state, last_length)
     assert integrator_state.tangents is not None
     tangents = phase_tangents.propagate(
@@ -210,11 +213,9 @@ def _phase_end_jvp(
             assert phase.margins is not None
             return phase.margins, phase.evaluate
 
-        phase_ends, end_tangents = (
-            (start, phase_end.state),
-            jnp.stack([*state_tangents, *tangent_rows[2 * n :]], 1),
-        )
-        minima_tangents = moved_minima(
+        phase_ends = start, phase_end.state
+        end_tangents = jnp.stack([*state_tangents, *tangent_rows[2 * n :]], 1)
+        minima_tangents = minima_jvp(
             margins_of,
             step_function,
             tableau,
@@ -244,10 +245,8 @@ def _event_time_jvp(
     phase = phase_of(phase_tangents.constants, phase_tangents.held_constants)
     _, rates = values_and_rates(phase.guards, phase.evaluate, end_state)
     guard_tangents = phase_tangents.value_tangents(evaluate_guards, end_state, tangents)
-    has_crossed, time_tangent = (
-        integrator_state.status == CROSSED_STATUS,
-        jnp.zeros_like(integrator_state.dt),
-    )
+    has_crossed = integrator_state.status == IntegrationStatus.CROSSED
+    time_tangent = jnp.zeros_like(integrator_state.dt)
     for index, (rate, guard_tangent) in enumerate(zip(rates, guard_tangents, strict=True)):
         is_event_guard = has_crossed & (guard == index) & (rate < 0.0)
         time_tangent = jnp.where(
@@ -279,7 +278,10 @@ def _integrate_to_event(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(values, rates, strict=True)
     )
-    immediate_guard = _first_true(is_past)
+    # Index of the first guard whose event is the start itself; -1 if there is none.
+    immediate_guard = jnp.full(is_past[0].shape, -1, jnp.int32)
+    for index in range(len(is_past) - 1, -1, -1):
+        immediate_guard = jnp.where(is_past[index], index, immediate_guard)
     is_started = active & (immediate_guard < 0)
 
     integrator_state = _integrate_until_crossing(
@@ -294,11 +296,10 @@ def _integrate_to_event(
         straggler_count,
         phase_tangents,
     )
-    has_crossed = integrator_state.status == CROSSED_STATUS
+    has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     if phase.margins is not None or phase_tangents is not None:
-        phase = _wrap_phase_functions(
-            phase, noinline
-        )  # a long program, which the search for minima makes longer
+        # The program is long, and the search for minima makes it longer.
+        phase = _wrap_phase_functions(phase, noinline)
         step_function = _make_step_function(phase, tableau)
     crossing_step = CrossingStep(
         *integrator_state[:2],
@@ -333,8 +334,8 @@ def _integrate_to_event(
         state=end_state,
         duration=duration,
         guard=jnp.where(is_lost | is_late, -1, guard),
-        timed_out=(integrator_state.status == TIMED_OUT_STATUS) | is_late,
-        is_unfinished=integrator_state.status == RUNNING_STATUS,
+        timed_out=(integrator_state.status == IntegrationStatus.TIMED_OUT) | is_late,
+        is_unfinished=integrator_state.status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_crossed, search.n_tried_steps, 0),
         next_dt=integrator_state.dt,
@@ -368,37 +369,35 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> _IntegratorState:
-    """Take adaptive steps until each element has crossed a guard, run out of time or failed."""
+    """Return the state after adaptive steps until each element has crossed a guard, run out of time
+    or failed.
+    """
 
-    def assess_step(
-        integrator_state: _IntegratorState,
-        rk_step: RKStep,
-        stage_values: list[Vector],
-        end_values: Vector,
-    ) -> tuple:
-        """Return the length to try next, in units of this one, and the decision on the step."""
+    def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
+        rk_step = step_function(integrator_state.state, integrator_state.dt)
+        stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
+        end_values = phase.guards(rk_step.end)
         squared_error = _mean_squared_error(
             rk_step, integrator_state.state, end_values, options.rtol, options.atol
         )
         dip_fraction = earliest_dip_fraction(
             tableau, [integrator_state.guard_values, *stage_values, end_values]
         )
-        return _step_size_change(tableau, squared_error, dip_fraction)
-
-    def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
-        rk_step = step_function(integrator_state.state, integrator_state.dt)
-        stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
-        end_values = phase.guards(rk_step.end)
-        length_factor, decision = assess_step(integrator_state, rk_step, stage_values, end_values)
+        is_precise = squared_error <= 1.0
+        # A step in which a guard may dip is repeated up to the dip.
+        may_dip = is_precise & (dip_fraction < 1.0)
+        is_rejected = may_dip | ~is_precise
+        controller_factor = step_size_factor(tableau, squared_error, dip_fraction.dtype)
+        length_factor = jnp.where(may_dip, dip_fraction, controller_factor)
         status, crossing_bits, is_accepted, time, length = _classify_step(
-            options, integrator_state, length_factor, decision, end_values
+            options, integrator_state, length_factor, is_rejected, end_values
         )
         state, guard_values = tree_where(
             is_accepted,
             (rk_step.end, end_values),
             (integrator_state.state, integrator_state.guard_values),
         )
-        was_running = integrator_state.status == RUNNING_STATUS
+        was_running = integrator_state.status == IntegrationStatus.RUNNING
         middle_values = (
             stage_values[tableau.guard_stages.index(tableau.middle_stage)]
             if stage_values
@@ -409,11 +408,8 @@ def _integrate_until_crossing(
             (middle_values, end_values),
             (integrator_state.middle_values, integrator_state.end_values),
         )
-        minima, half_iterations, tangents = (
-            integrator_state.minima,
-            integrator_state.half_iterations,
-            integrator_state.tangents,
-        )
+        minima, tangents = integrator_state.minima, integrator_state.tangents
+        half_iterations = integrator_state.half_iterations
         if phase.margins is not None and minima is not None:
             margin_arguments = phase.margins, phase.evaluate
             accepted_step = AcceptedStep(
@@ -429,7 +425,7 @@ def _integrate_until_crossing(
                 tableau, rk_step.stage_states, tangents, integrator_state.dt, is_accepted
             )
         if straggler_count is not None:
-            n_running = jnp.sum(status == RUNNING_STATUS, dtype=jnp.int32)
+            n_running = jnp.sum(status == IntegrationStatus.RUNNING, dtype=jnp.int32)
             half_iterations = jnp.where(
                 2 * n_running > status.size, integrator_state.iterations + 1, half_iterations
             )
@@ -449,83 +445,53 @@ def _integrate_until_crossing(
             tangents=tangents,
         )
 
+    def needs_more_steps(integrator_state: _IntegratorState) -> Array:
+        """Return whether enough elements are running to continue the loop."""
+        is_running = integrator_state.status == IntegrationStatus.RUNNING
+        if straggler_count is None:
+            return jnp.any(is_running)
+        n_running = jnp.sum(is_running, dtype=jnp.int32)
+        max_iterations = STRAGGLER_FACTOR * integrator_state.half_iterations + 8
+        is_late = integrator_state.iterations > max_iterations
+        return (n_running > 0) & ~((n_running <= straggler_count) & is_late)
+
     initial_minima = phase.margins and init_minima(
         phase.margins, phase.evaluate, start, phase_tangents
     )
-    initial_state = _init_integrator(
-        start, guard_values, is_started, initial_dt, initial_minima, phase_tangents
-    )
-    return lax.while_loop(
-        lambda integrator_state: _needs_more_steps(integrator_state, straggler_count),
-        take_one_step,
-        initial_state,
-    )
-
-
-def _init_integrator(
-    start: StageState,
-    guard_values: Vector,
-    is_started: Array,
-    initial_dt: Array,
-    minima: MinimaState | None,
-    phase_tangents: PhaseTangents | None,
-) -> _IntegratorState:
-    """Return the state of the integrator before the first step."""
     zero_counts, zero_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    return _IntegratorState(
+    initial_state = _IntegratorState(
         state=start,
         guard_values=guard_values,
         dt=initial_dt,
         time=jnp.zeros_like(initial_dt),
-        status=jnp.where(is_started, RUNNING_STATUS, IDLE_STATUS).astype(jnp.int32),
+        status=jnp.where(is_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE).astype(
+            jnp.int32
+        ),
         crossing_bits=zero_counts,
         middle_values=guard_values,
         end_values=guard_values,
         n_tried_steps=zero_counts,
         half_iterations=zero_count,
         iterations=zero_count,
-        minima=minima,
+        minima=initial_minima,
         tangents=None if phase_tangents is None else phase_tangents.start_tangents,
     )
-
-
-def _needs_more_steps(integrator_state: _IntegratorState, straggler_count: Array | None) -> Array:
-    """Return whether enough elements still run to continue the loop."""
-    is_running = integrator_state.status == RUNNING_STATUS
-    if straggler_count is None:
-        return jnp.any(is_running)
-    n_running = jnp.sum(is_running, dtype=jnp.int32)
-    is_late = integrator_state.iterations > STRAGGLER_FACTOR * integrator_state.half_iterations + 8
-    return (n_running > 0) & ~((n_running <= straggler_count) & is_late)
-
-
-def _step_size_change(
-    tableau: ButcherTableau, squared_error: Array, dip_fraction: Array
-) -> tuple[Array, Array]:
-    """Return the length of the next try over this one's, and the decision: keep (1) or
-    retry (2).
-    """
-    is_kept = squared_error <= 1.0
-    must_retry = is_kept & (dip_fraction < 1.0)
-    decision = jnp.where(must_retry, 2, jnp.where(is_kept, 1, 0)).astype(jnp.int32)
-    return jnp.where(
-        must_retry, dip_fraction, step_size_factor(tableau, squared_error, dip_fraction.dtype)
-    ), decision
+    return lax.while_loop(needs_more_steps, take_one_step, initial_state)
 
 
 def _classify_step(
     options: StepOptions,
     integrator_state: _IntegratorState,
     length_factor: Array,
-    decision: Array,
+    is_rejected: Array,
     end_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return status, crossing guards, acceptance, time and next length of each element.
 
     A dip that would not advance the time does not delay the element.
     """
-    is_running = integrator_state.status == RUNNING_STATUS
-    is_kept = is_running & (decision == 1)
+    is_running = integrator_state.status == IntegrationStatus.RUNNING
+    is_kept = is_running & ~is_rejected
     crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
     for index, value in enumerate(end_values):
         crossing_bits = crossing_bits | jnp.where(value <= 0.0, 1 << index, 0)
@@ -539,9 +505,11 @@ def _classify_step(
     is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
         time + next_length == time
     )
-    status = jnp.where(is_stuck, FAILED_STATUS, RUNNING_STATUS)
+    status = jnp.where(is_stuck, IntegrationStatus.FAILED, IntegrationStatus.RUNNING)
     status = jnp.where(
-        has_timed_out, TIMED_OUT_STATUS, jnp.where(has_crossed, CROSSED_STATUS, status)
+        has_timed_out,
+        IntegrationStatus.TIMED_OUT,
+        jnp.where(has_crossed, IntegrationStatus.CROSSED, status),
     )
     return (
         jnp.where(is_running, status, integrator_state.status).astype(jnp.int32),
@@ -555,10 +523,9 @@ def _classify_step(
 def _mean_squared_error(
     rk_step: RKStep, start: StageState, guards: Vector, rtol: Array, atol: Array
 ) -> Array:
-    """Return the mean square of the error over its tolerance, infinite where the step is not
-    finite.
+    """Return the mean square of the error over its tolerance; infinite if the step is not finite.
 
-    float32 is precise enough for an error estimate.
+    An error estimate needs no more than the precision of float32.
     """
     start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
     to_float32 = lambda x: x.astype(jnp.float32)
@@ -570,14 +537,6 @@ def _mean_squared_error(
     for value in guards:
         total = total + to_float32(0.0 * value)
     return jnp.where(jnp.isfinite(total), total / len(start_numbers), jnp.inf)
-
-
-def _first_true(conditions: tuple[Array, ...]) -> Array:
-    """Return the index of the first condition that holds, -1 if none does."""
-    index = jnp.full(conditions[0].shape, -1, jnp.int32)
-    for i in range(len(conditions) - 1, -1, -1):
-        index = jnp.where(conditions[i], i, index)
-    return index
 
 
 def sample_batch_phase(

@@ -1,8 +1,8 @@
 """Minima of margins along a phase, for a batch, at the integrator's accuracy.
 
-The method is that of `minima` for one wheel. During the integration, the step that holds the lowest
-minimum of each margin is stored; afterwards, secant steps on the margin's rate locate it, one
-margin after the other.
+The method is that of `hybrid/minima` for one wheel. During the integration, the step that holds
+the lowest minimum of each margin is stored. Afterwards, secant steps on the margin's rate locate
+it, one margin after the other.
 """
 
 import functools
@@ -27,10 +27,10 @@ from vrw_jax.numerics import (
 
 
 class MarginFunctions(NamedTuple):
-    """Margins whose minima are searched; `includes_start`: see `minima.MonitoredFunctions`."""
+    """Margins whose minima are searched."""
 
     evaluate_margins: Callable[[StageState], Vector]
-    includes_start: tuple[bool, ...]
+    includes_start: tuple[bool, ...]  # whether the start counts, see `hybrid.MonitoredFunctions`
 
 
 class MinimaState(NamedTuple):
@@ -69,8 +69,8 @@ def init_minima(
 ) -> MinimaState:
     """Return the minima before the first step.
 
-    A margin that is zero at the start by construction rests there: its negative rates are round-off
-    and count as zero.
+    A margin that is zero at the start by construction has no negative rate there except for
+    round-off, which counts as zero.
     """
     values, rates = map(jnp.stack, values_and_rates(margins.evaluate_margins, evaluate, state))
     includes_start = jnp.asarray(margins.includes_start)[:, None]
@@ -271,10 +271,8 @@ def minima_jvp(
     interior_tangents = jnp.moveaxis(
         lax.scan(tangent_of_one, None, (indices, minima, result.length_to_minimum))[1], 0, 1
     )
-    first_tangents, last_tangents = (
-        tangents_of_margins(phase_ends[0], phase_tangents.start_tangents),
-        tangents_of_margins(phase_ends[1], end_tangents),
-    )
+    first_tangents = tangents_of_margins(phase_ends[0], phase_tangents.start_tangents)
+    last_tangents = tangents_of_margins(phase_ends[1], end_tangents)
     end_minima_tangents = jnp.where(
         minima.values <= result.phase_minima, last_tangents, first_tangents
     )

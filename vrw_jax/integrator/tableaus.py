@@ -11,6 +11,7 @@ import json
 import math
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,8 +129,7 @@ def fit_guard_parabola(
 
 
 def _bernstein_coefficients(tableau: ButcherTableau, values: list[Array]) -> list[Array]:
-    """Return a guard's Bernstein coefficients except the last: if all are positive, so is the
-    guard.
+    """Return a guard's Bernstein coefficients except the last; the guard is positive if all are.
 
     `values` are those at the start, at the `guard_stages`, and at the end.
     """
@@ -139,9 +139,8 @@ def _bernstein_coefficients(tableau: ButcherTableau, values: list[Array]) -> lis
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
 def _may_dip(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
     """Return whether a guard may fall below zero inside a step and be positive again at its end."""
-    return (
-        functools.reduce(jnp.minimum, _bernstein_coefficients(tableau, guard_values)) <= 0.0
-    ) & (guard_values[-1] > 0.0)
+    coefficients = _bernstein_coefficients(tableau, guard_values)
+    return (functools.reduce(jnp.minimum, coefficients) <= 0.0) & (guard_values[-1] > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
@@ -162,9 +161,8 @@ def find_dip(tableau: ButcherTableau, values: list[Array]) -> tuple[Array, Array
     is_rising = inner_coefficients[-1] < values[-1]
     for previous_value, next_value in itertools.pairwise(values):
         is_rising = is_rising | (previous_value < next_value)
-    return (min_coefficient <= 0.0) & (dip_fraction > 0.0) & is_rising & (
-        values[-1] > 0.0
-    ), dip_fraction
+    has_dip = (min_coefficient <= 0.0) & (dip_fraction > 0.0) & is_rising & (values[-1] > 0.0)
+    return has_dip, dip_fraction
 
 
 def earliest_dip_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -> Array:
@@ -189,20 +187,35 @@ def earliest_dip_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -
     return run_if_any(jnp.any(may_dip), find_first_dip, whole_step)
 
 
-STEP_SAFETY_FACTOR, MIN_STEP_FACTOR, MAX_STEP_FACTOR = 0.9, 0.2, 5.0
-"""Parameters of the step-size controller: the usual safety factor, and the limits of the change of
-a step's length."""
+@dataclass(frozen=True)
+class StepSizeController:
+    """Parameters of the step-size controller, chosen because they are those of diffrax."""
+
+    safety_factor: float = 0.9
+    """Factor on the length that would meet the tolerance exactly."""
+    min_factor: float = 0.2
+    """Least ratio of successive lengths."""
+    max_factor: float = 5.0
+    """Largest ratio of successive lengths; after a rejected step it is 1."""
 
 
-def step_size_factor(tableau: ButcherTableau, squared_error: Array, dtype: Any) -> Array:
+STEP_SIZE_CONTROLLER = StepSizeController()
+
+
+def step_size_factor(
+    tableau: ButcherTableau,
+    squared_error: Array,
+    dtype: Any,
+    controller: StepSizeController = STEP_SIZE_CONTROLLER,
+) -> Array:
     """Return the next step's length over this one's, from its squared error over tolerance."""
     error_power = jnp.exp(
         jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.order)
     ).astype(dtype)
     return jnp.clip(
-        STEP_SAFETY_FACTOR * error_power,
-        MIN_STEP_FACTOR,
-        jnp.where(squared_error <= 1.0, MAX_STEP_FACTOR, 1.0),
+        controller.safety_factor * error_power,
+        controller.min_factor,
+        jnp.where(squared_error <= 1.0, controller.max_factor, 1.0),
     )
 
 
@@ -270,16 +283,14 @@ def rk_step(
             [stage_acceleration[d] for stage_acceleration in stage_accelerations] for d in range(n)
         ]
         position_errors = [
-            h * h * _weighted_sum(tableau.b_error_position, coordinate_accelerations)
-            for coordinate_accelerations in accelerations_by_coordinate
+            h * h * _weighted_sum(tableau.b_error_position, accelerations)
+            for accelerations in accelerations_by_coordinate
         ]
-        error = tuple(
-            position_errors
-            + [
-                h * _weighted_sum(tableau.b_error, coordinate_accelerations)
-                for coordinate_accelerations in accelerations_by_coordinate
-            ]
-        )
+        rate_errors = [
+            h * _weighted_sum(tableau.b_error, accelerations)
+            for accelerations in accelerations_by_coordinate
+        ]
+        error = (*position_errors, *rate_errors)
     return RKStep(stage_states[-1], error, stage_states)
 
 
@@ -298,10 +309,8 @@ def evaluate_stage(
         coordinate_accelerations = [
             stage_acceleration[d] for stage_acceleration in stage_accelerations
         ]
-        double_sum, single_sum = (
-            _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations),
-            _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations),
-        )
+        double_sum = _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations)
+        single_sum = _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations)
         drift = float(tableau.nodes[stage_index]) * v0[d]
         position.append(q0[d] + h * (drift if double_sum is None else drift + h * double_sum))
         rate.append(v0[d] + h * single_sum)
@@ -311,8 +320,8 @@ def evaluate_stage(
 def _weighted_sum(weights: np.ndarray, terms: list[Array]) -> Any:
     """Return a weighted sum, None if all weights vanish.
 
-    It uses `lax`, because half of a step's operations are such sums, and operators take three times
-    as long to trace.
+    It uses functions of `lax`, because half of a step's operations are such sums, and Python's
+    operators take three times as long to trace.
     """
     pairs = zip(weights, terms, strict=False)
     parts = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]

@@ -3,9 +3,9 @@ batch.
 
 Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
 part shared by all directions, the Jacobians at the stages, is computed once, and each direction
-then costs some hundred products. Step sizes and the tries of an event's search take no part. The
-derivative is that of the discrete flow at the lengths that were taken, and of the time at which its
-guard vanishes.
+then costs some hundred products. Step sizes and the iterations of an event search are not
+differentiated. The derivative is that of the discrete flow at the lengths that were taken, and of
+the time at which its guard vanishes.
 
 `jax.vmap` around a derivative supplies its directions. Here they are the first axis of arrays
 instead: loops are traced once, not again for the vmap.
@@ -37,10 +37,9 @@ class ImplicitDynamics(NamedTuple):
     """The equations of motion near a state whose accelerations are known."""
 
     residual: Callable[[StageState], Vector]
-    """Residual of the equations of motion: left side at the state's accelerations less the right
-    side."""
+    """Left side of the equations at the state's accelerations minus their right side."""
     solve: Callable[[StageState, Vector], Vector]
-    """Accelerations for which the left side equals these rows."""
+    """Accelerations for which the left side equals the given rows."""
 
 
 ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
@@ -68,8 +67,8 @@ def batched_jvp_rule(
         nonlocal output_structure
         if any(axis is not None for axis in axes[:n_primals]):
             raise NotImplementedError(
-                "jax.vmap around a derivative of lanes is for its directions: what has many values "
-                "has them on the lanes' axis, the last."
+                "jax.vmap around a derivative of lanes maps its directions only: put batches of "
+                "values on the lanes' axis, the last one."
             )
         pairs = zip(leaves[n_primals:], axes[n_primals:], strict=True)
         direction_leaves = [
@@ -101,7 +100,6 @@ def _vmap_size_rule(size: int, _: list, _tangent: Any) -> tuple[Array, bool]:
 
 
 _HOIST_PRIMITIVE = Primitive("beyond")
-"""What is traced outside of the `jax.vmap` around: within, its loops would be traced again."""
 _HOIST_PRIMITIVE.multiple_results = True
 batching.primitive_batchers[_HOIST_PRIMITIVE] = lambda values, axes, mapped: mapped(values, axes)
 """Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
@@ -146,7 +144,9 @@ def _stage_jacobians(
     stages: list[StageState],
 ) -> StageJacobians:
     def linearize_stage(row: Array) -> tuple[Array, Array]:
-        state, dynamics = _unpack_state(row), _jit_dynamics(dynamics_of(constants, held_constants))
+        state, dynamics = _unpack_state(row), dynamics_of(constants, held_constants)
+        dynamics = ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
+        n = len(state.q)
         residual = lambda constants, held_constants: dynamics_of(
             constants, held_constants
         ).residual(state)
@@ -155,8 +155,8 @@ def _stage_jacobians(
         )
         zero_constants = jax.tree.map(jnp.zeros_like, constants)
         state_columns = [
-            jnp.stack(_acceleration_tangent(dynamics, state, *unit))
-            for unit in _unit_directions(state)
+            jnp.stack(_acceleration_tangent(dynamics, state, unit[:n], unit[n:]))
+            for unit in _unit_rows((*state.q, *state.v))
         ]
         state_columns += [
             acceleration_along((constants, held_constants), (zero_constants, unit))
@@ -185,10 +185,6 @@ def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
     return jax.vmap(lambda *x: function(jax.tree.unflatten(structure, x)), axes)(*inputs)
 
 
-def _jit_dynamics(dynamics: ImplicitDynamics) -> ImplicitDynamics:
-    return ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
-
-
 def _pack_state(state: StageState) -> Array:
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
@@ -207,11 +203,6 @@ def _unit_rows(template: Vector) -> list[Vector]:
     return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
 
 
-def _unit_directions(state: StageState) -> list[tuple[Vector, Vector]]:
-    rows, n = _unit_rows((*state.q, *state.v)), len(state.q)
-    return [(row[:n], row[n:]) for row in rows]
-
-
 def _acceleration_tangent(
     dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
 ) -> Vector:
@@ -221,11 +212,8 @@ def _acceleration_tangent(
     state_tangent = StageState(
         dq, dv, StageAcceleration(cos * dq[0], -sin * dq[0], zero_accelerations)
     )
-    return tuple(
-        _solve_acceleration(
-            dynamics, state, jax.jvp(dynamics.residual, (state,), (state_tangent,))[1]
-        )
-    )
+    _, residual_tangent = jax.jvp(dynamics.residual, (state,), (state_tangent,))
+    return tuple(_solve_acceleration(dynamics, state, residual_tangent))
 
 
 def _solve_acceleration(dynamics: ImplicitDynamics, state: StageState, rows: Vector) -> Array:

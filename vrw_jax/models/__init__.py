@@ -12,12 +12,16 @@ from vrw_jax.models.batch_step import (
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.section_states import (
+from vrw_jax.models.step_inputs import (
     PAPER_START,
     AnySectionState,
     SectionState,
+    check_step_values,
+    complete_slopes,
+    is_valid_slope,
     is_valid_start,
     replace_invalid,
+    split_slopes,
 )
 from vrw_jax.models.step_results import (
     AbstractContactStep,
@@ -28,12 +32,6 @@ from vrw_jax.models.step_results import (
     Margins,
     StepResult,
     Trajectory,
-)
-from vrw_jax.models.uneven_slopes import (
-    check_step_values,
-    complete_slopes,
-    is_valid_slope,
-    split_slopes,
 )
 from vrw_jax.models.unit_scaling import scaled_jacobian_columns
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -67,13 +67,26 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-MAX_FIRST_STEP_RATIO = 0.3
-"""Upper bound of the first solver step of SLS-I, as a fraction of the last solver step of DLS."""
-FAST_MODE_STEP_FACTOR = 7.0
-"""Upper bound of the same step, in units of m/c times the tolerance's root of the solver's order.
-Dropping the rear foot's force excites the airborne leg's fast mode, which decays within 0.05 s.
-The value was chosen because the controller settles at 7.2 to 9.5. This holds for solvers of
-orders 5 to 8, at tolerances of 1e-4 to 1e-10. A longer step is repeated."""
+
+@dataclasses.dataclass(frozen=True)
+class StiffStartOptions:
+    """Upper bounds of the first solver step of SLS-I.
+
+    The loss of the rear foot's force excites the fast mode of the airborne leg, which decays within
+    0.05 s. A longer first step would be rejected and repeated.
+    """
+
+    max_step_ratio: float = 0.3
+    """Bound as a fraction of the solver step that DLS proposes next."""
+    max_transient_step: float = 7.0
+    """Bound in units of m/c times the tolerance's root of the solver's order.
+
+    It is chosen because the step-size controller settles at 7.2 to 9.5, for solvers of orders 5 to
+    8 and tolerances of 1e-4 to 1e-10.
+    """
+
+
+STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class BatchAdvanceResult(NamedTuple):
@@ -163,17 +176,16 @@ def gait_step(
 
 
 class LandingStep(NamedTuple):
-    """A step of every lane from just after a landing with both feet on the ground, and the next
-    landing."""
+    """A step of every lane between two landings that leave both feet on the ground."""
 
-    numbers: Array
-    """(theta+, dtheta+) just after the next landing, rad, rad/s; normal impulse of the rear foot in
-    it, both feet held, N s; `stopper_margin`, m^2/s: rows of lanes, zeros where not STEPPED but for
-    the last."""
-    outcome: Int[Array, " lanes"]
-    durations: Vector
+    values: Array
+    """Rows of lanes: (theta+, dtheta+) just after the next landing, rad and rad/s; the normal
+    impulse of the rear foot in it with both feet held, N s; `stopper_margin`, m^2/s. The first
+    three are zero unless the outcome is STEPPED."""
+    outcome: Int[Array, " lanes"]  # an Outcome
+    durations: Vector  # of DLS, SLS-I, SLS-II, s
     solver_steps: Int[Array, " lanes"]
-    unfinished: Bool[Array, " lanes"]
+    is_unfinished: Bool[Array, " lanes"]  # see `BatchAdvanceResult`
 
 
 def step_after_landing(
@@ -182,47 +194,57 @@ def step_after_landing(
     options: StepOptions,
     tableau: ButcherTableau,
     stop_at_lift_off: bool,
-    few: Array | None = None,
+    straggler_count: Array | None = None,
 ) -> LandingStep:
-    """One step of every lane from y = (theta+, dtheta+), in the frame of the line under both feet,
-    to just after the next landing, in the frame of the line ahead (see `split_slopes`)."""
+    """Return one step of every lane from just after a landing to just after the next one.
+
+    `y` is (theta+, dtheta+) in the frame of the line under both feet. The result is in the frame of
+    the next line, see `split_slopes`.
+    """
     theta, dtheta = y
-    x = theta + params.leg_angle, dtheta, 0.0 * dtheta
-    given = options, tableau, stop_at_lift_off, False, few
-    walked = run_batch_phases(params, x, *given, land=transitions.stand_on_both)
-    ends, stepped = walked.ends, walked.outcome == Outcome.STEPPED
-    at_landing = tuple(
-        jnp.where(stepped, own, jnp.asarray(safe, own.dtype))
-        for own, safe in zip(next_section(walked), PAPER_START, strict=True)
+    sequence = run_batch_phases(
+        params,
+        (theta + params.leg_angle, dtheta, 0.0 * dtheta),
+        options,
+        tableau,
+        stop_at_lift_off,
+        records_margins=False,
+        straggler_count=straggler_count,
+        land=transitions.start_on_both_feet,
     )
-    next_ = with_batched_jvp(transitions.land)(walked.s, *at_landing)
-    rows = next_.theta, next_.motion.dtheta, next_.rear_impulse.normal
-    told = [jnp.where(stepped, row, 0.0) for row in rows]
-    sls1 = walked.phases[1]
-    margin = with_batched_jvp(_stopper_margin)(walked.s, sls1.turn, ends[1].q, ends[1].v)
-    margin = jnp.where(walked.phases_happened[1], margin, 0.0)
+    ends, has_stepped = sequence.ends, sequence.outcome == Outcome.STEPPED
+    section = tuple(
+        jnp.where(has_stepped, value, jnp.asarray(safe_value, value.dtype))
+        for value, safe_value in zip(next_section(sequence), PAPER_START, strict=True)
+    )
+    landing = with_batched_jvp(transitions.land)(sequence.s, *section)
+    rows = landing.theta, landing.motion.dtheta, landing.rear_impulse.normal
+    landing_values = [jnp.where(has_stepped, row, 0.0) for row in rows]
+    sls1 = sequence.phases[1]
+    margin = with_batched_jvp(_stopper_margin)(sequence.s, sls1.turn, ends[1].q, ends[1].v)
+    margin = jnp.where(sequence.phases_happened[1], margin, 0.0)
     return LandingStep(
-        numbers=jnp.stack([*told, margin]),
-        outcome=walked.outcome,
+        values=jnp.stack([*landing_values, margin]),
+        outcome=sequence.outcome,
         durations=tuple(end.duration for end in ends),
         solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        unfinished=ends[0].engine_carry.is_unfinished
+        is_unfinished=ends[0].engine_carry.is_unfinished
         | ends[1].engine_carry.is_unfinished
         | ends[2].engine_carry.is_unfinished,
     )
 
 
 def _stopper_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
-    """How far SLS-I ended from meeting stopper and ground at once, m^2/s.
+    """Return a margin of the order of two events at the end of SLS-I, m^2/s.
 
-    Where Leg 2 met its stopper, its rate times the landing foot's height; where that foot landed
-    before, minus its rate times the room that Leg 2 had left. Both vanish together, with equal
-    derivatives.
+    If Leg 2 meets its stopper first, it is the rate of Leg 2 times the height of the landing foot.
+    If that foot lands first, it is minus the foot's falling speed times the distance of Leg 2 from
+    its stopper. Both forms vanish together, with equal derivatives.
     """
     phase = SingleSupport1(s, (), False, turn)
     motion = phase.motion_at(q, v)
-    height, falls = phase.landing_height(motion), -phase.landing_rate(motion)
-    return height * motion.dL2 - (s.L0 - motion.L2) * falls
+    falling_speed = -phase.landing_rate(motion)
+    return phase.landing_height(motion) * motion.dL2 - (s.L0 - motion.L2) * falling_speed
 
 
 def run_batch_phases(
@@ -235,10 +257,13 @@ def run_batch_phases(
     straggler_count: Array | None = None,
     is_noinline: bool = False,
     land: Callable[..., transitions.Landing] = transitions.land,
+    stiff_start: StiffStartOptions = STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
     """Return all phases of every lane's step.
 
-    - `is_noinline`: see `BatchPhase`.
+    - `straggler_count`: see `integrate_batch_phase`;
+    - `is_noinline`: see `BatchPhase`;
+    - `land`: the landing that opens the step.
     """
 
     def run(
@@ -250,17 +275,16 @@ def run_batch_phases(
             dt0 = carry.next_dt
             if phase.has_stiff_start:
                 tolerance_root = jnp.exp(jnp.log(options.rtol.astype(jnp.float32)) / tableau.order)
-                max_transient_dt = (
-                    FAST_MODE_STEP_FACTOR * tolerance_root.astype(dt0.dtype) * phase.s.m / phase.s.c
-                )
-                dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
+                transient_dt = stiff_start.max_transient_step * tolerance_root.astype(dt0.dtype)
+                max_transient_dt = transient_dt * phase.s.m / phase.s.c
+                dt0 = jnp.minimum(stiff_start.max_step_ratio * dt0, max_transient_dt)
                 dt0 = jnp.where(carry.has_run, dt0, carry.next_dt)
         floats, static = eqx.partition((phase.s, phase.turn), eqx.is_array)
 
         def make_phase(floats: Any, constants: Vector) -> BatchPhase:
             s, turn = eqx.combine(floats, static)
-            known = dataclasses.replace(phase, s=s, constants=constants, turn=turn)
-            return make_lane_phase(known, records_margins, is_noinline)
+            rebuilt_phase = dataclasses.replace(phase, s=s, constants=constants, turn=turn)
+            return make_lane_phase(rebuilt_phase, records_margins, is_noinline)
 
         end = integrate_batch_phase(
             make_phase,
@@ -423,15 +447,16 @@ def build_step_jacobian(
     evaluate_lanes = lambda *leaves: jacobian_columns(config.compute_outputs, leaves, input_indices)
     cache_key = ("gait step with derivatives", *config.cache_key, input_indices)
     calls = {
-        n: unbatch(cached_lane_function(evaluate_lanes, make_template, cache_key, n))
-        for n in (N_STEP_INPUTS, N_DIRECTIONS_UNEVEN)
+        n: unbatch(
+            cached_lane_function(evaluate_lanes, make_template, cache_key, simd.RegisterLimits(n))
+        )
+        for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
     }
 
     def jacobian(*leaves: Array) -> tuple:
-        n = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
-        columns, value, other = calls[N_STEP_INPUTS if n <= N_STEP_INPUTS else N_DIRECTIONS_UNEVEN](
-            *tighten_tolerances(*leaves)
-        )
+        n_directions = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
+        evaluate = calls[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
+        columns, value, other = evaluate(*tighten_tolerances(*leaves))
         return (split_jacobian(columns, leaves, input_indices), value), other
 
     return jacobian
@@ -454,9 +479,8 @@ def split_jacobian(columns: Any, leaves: Sequence[Array], input_indices: Sequenc
 
 
 N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
-"""All numbers that a step moves with: machine code keeps one of each direction in registers."""
-N_DIRECTIONS_UNEVEN = N_STEP_INPUTS + 1
-"""The same on uneven ground: the slope of the line ahead, too."""
+"""Number of inputs of a step on flat ground: parameters and section state. Uneven ground adds one,
+the slope of the next line. Machine code keeps one number per derivative in registers."""
 
 
 def jacobian_columns(

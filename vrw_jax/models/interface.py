@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.section_states import SectionState
+from vrw_jax.models.step_inputs import SectionState, complete_slopes
 from vrw_jax.models.step_results import AdvanceResult
-from vrw_jax.models.uneven_slopes import complete_slopes
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import is_traced

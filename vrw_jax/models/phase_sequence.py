@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.section_states import PAPER_START, StateValues, replace_invalid
+from vrw_jax.models.step_inputs import PAPER_START, StateValues, replace_invalid, select_line
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -20,7 +20,6 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.models.uneven_slopes import select_line
 from vrw_jax.numerics import Elementwise, Vector, sine_cosine, tree_where
 from vrw_jax.wheel import (
     AbstractPhase,
@@ -37,8 +36,8 @@ from vrw_jax.wheel import (
 )
 
 SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
-"""A regular posture (theta, L1, L2 and rates) in place of a wheel whose step has already failed; it
-is never integrated."""
+"""A regular posture (theta, L1, L2 and rates) that replaces the state of a wheel whose step has
+failed; it is never integrated."""
 
 
 class PhaseResult(NamedTuple):
@@ -68,7 +67,7 @@ class PhaseSequenceResult(NamedTuple):
     ends: tuple[PhaseResult, ...]
     phases_happened: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
-    tilt: Elementwise | None = None  # by which the line ahead is steeper, rad; None: flat ground
+    tilt: Elementwise | None = None  # by which the next line is steeper, rad; None: flat ground
 
 
 def run_phases(
@@ -78,10 +77,10 @@ def run_phases(
     stop_at_lift_off: bool,
     land: Callable[..., Landing] = transitions.land,
 ) -> PhaseSequenceResult:
-    """One step from the section state `x`, its numbers one by one.
+    """Return all phases of one step from the section state `x`, given entry by entry.
 
-    All of it is in the frame of the line under both feet of its double support; on uneven ground
-    (see `split_slopes`) only the touchdown, and the section state after it, are those of the next.
+    The motion is in the frame of the line under both feet in double support. On uneven ground (see
+    `split_slopes`) the touchdown and the section state at it refer to the next line.
     """
     params, is_valid, tilt = select_line(params, x)
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
@@ -90,9 +89,8 @@ def run_phases(
     turn = () if tilt is None else sine_cosine(tilt)
     phases = make_phases(s, landing.distance, stop_at_lift_off, turn)
     theta, motion = landing.theta, landing.motion
-    is_active = (
-        is_valid & landing.keeps_rear_foot
-    )  # a landing that releases the rear foot continues in SLS-I
+    # A landing that releases the rear foot continues in SLS-I.
+    is_active = is_valid & landing.keeps_rear_foot
     outcome_code = jnp.where(is_valid, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
     starts, phases_happened = [], []
     ends: list[PhaseResult] = []
@@ -101,7 +99,11 @@ def run_phases(
             end_state = ends[-1].q[0], previous_phase.motion_at(ends[-1].q, ends[-1].v)
             theta, motion = tree_where(is_active, end_state, (theta, motion))
             is_active = outcome_code == Outcome.STEPPED
-            theta, motion = tree_where(is_active, (theta, motion), _safe_single_support(theta))
+            safe_theta, *safe_others = (
+                jnp.asarray(value, jnp.result_type(theta)) for value in SAFE_SINGLE_SUPPORT
+            )
+            safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_others)
+            theta, motion = tree_where(is_active, (theta, motion), safe_state)
             motion = previous_phase.reset_map(motion)
         start = phase.own_coordinates(theta, motion)
         end = run(phase, *start, is_active, ends[-1] if ends else None)
@@ -119,22 +121,16 @@ def run_phases(
     )
 
 
-def _safe_single_support(reference_array: Elementwise) -> tuple[Elementwise, Motion]:
-    """Return `SAFE_SINGLE_SUPPORT` as an angle and a motion, in the dtype of the argument."""
-    theta, *others = (
-        jnp.asarray(value, jnp.result_type(reference_array)) for value in SAFE_SINGLE_SUPPORT
-    )
-    return theta, Motion(*sine_cosine(theta), *others)
-
-
-def next_section(walked: PhaseSequenceResult) -> Vector:
-    """(theta-, dtheta-, dL1-) where the step ended, in the frame of the line that is reached."""
-    theta, rates = walked.ends[2].q[0], walked.ends[2].v
-    return (theta if walked.tilt is None else theta - walked.tilt), *rates
+def next_section(sequence: PhaseSequenceResult) -> Vector:
+    """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line that is
+    reached.
+    """
+    theta, rates = sequence.ends[2].q[0], sequence.ends[2].v
+    return (theta if sequence.tilt is None else theta - sequence.tilt), *rates
 
 
 def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """The lean result; its section state is zeros where there is none."""
+    """Return the minimal result; its section state is zero if the step failed."""
     theta, dtheta, dL1 = next_section(sequence)
     has_stepped = sequence.outcome == Outcome.STEPPED
     solver_steps = [end.n_solver_steps for end in sequence.ends]

@@ -1,5 +1,6 @@
 """Rigid model: all legs are rigid. A step has a closed form; nothing is integrated."""
 
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -10,7 +11,13 @@ from jaxtyping import Array, Float
 
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.section_states import SectionState, StateValues, replace_invalid
+from vrw_jax.models.step_inputs import (
+    SectionState,
+    StateValues,
+    replace_invalid,
+    select_line,
+    split_slopes,
+)
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -19,7 +26,6 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.models.uneven_slopes import select_line, split_slopes
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
@@ -34,9 +40,19 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-N_GRID_ANGLES = 33
-"""Number of angles in each zoom on the minimum of a force, chosen because forces are smooth over
-the 45 degrees of a step."""
+
+@dataclass(frozen=True)
+class ZoomOptions:
+    """Search for the minima of margins over the angle, by repeated zooming."""
+
+    n_angles: int = 33
+    """Number of angles in each round, chosen because forces are smooth over the 45 degrees of a
+    step."""
+    n_rounds: int = 5
+    """Number of rounds, chosen because the error of a minimum is then below round-off."""
+
+
+ZOOM_OPTIONS = ZoomOptions()
 
 
 class RigidWheel(AbstractWheel):
@@ -208,9 +224,9 @@ class RigidWheel(AbstractWheel):
     ) -> Trajectory:
         """Return the motion at equal angles instead of equal times."""
         result = self.take_step(params, x, options)
-        params, ahead = split_slopes(params)
-        s, half = params.symbols(), 0.5 * params.leg_angle
-        end = half if ahead is None else half + ahead - params.slope
+        params, next_slope = split_slopes(params)
+        s, half_angle = params.symbols(), 0.5 * params.leg_angle
+        end = half_angle if next_slope is None else half_angle + next_slope - params.slope
         rolling = RollingMotion(s, params.slope, result.post_impact[1])
         start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
         rolling_angles = jnp.where(
@@ -233,9 +249,8 @@ class RollingMotion(eqx.Module):
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at theta = -alpha/2, rad/s
-    end: Elementwise | None = (
-        None  # theta at the next landing, rad; None: alpha/2, as on flat ground
-    )
+    end: Elementwise | None = None
+    """Angle theta at the next landing, rad; None is alpha/2, as on flat ground."""
 
     def rate_squared(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta; negative where the wheel does not arrive."""
@@ -308,7 +323,7 @@ class RollingMotion(eqx.Module):
         required = dynamics.required_friction(self.foot_force(theta[1]))
         return jnp.stack([self.foot_force(theta[0]).normal, -required, *stoppers])
 
-    def margin_minima(self) -> Array:
+    def margin_minima(self, options: ZoomOptions = ZOOM_OPTIONS) -> Array:
         """Return the minima of `margins` from landing to landing, to round-off.
 
         Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
@@ -321,20 +336,18 @@ class RollingMotion(eqx.Module):
             center, width = bracket
 
             def compare(i: Array, lowest: tuple[Array, Array]) -> tuple[Array, Array]:
-                theta = jnp.clip(
-                    center + width * (i * (2.0 / (N_GRID_ANGLES - 1)) - 1.0), -half_angle, end
-                )
+                offset = width * (i * (2.0 / (options.n_angles - 1)) - 1.0)
+                theta = jnp.clip(center + offset, -half_angle, end)
                 value = self.margins(theta)
                 return tree_where(value < lowest[1], (theta, value), lowest)
 
             initial = center, jnp.full_like(center, jnp.inf)
-            return lax.fori_loop(0, N_GRID_ANGLES, compare, initial)[0], width * (
-                2.5 / N_GRID_ANGLES
-            )
+            lowest_theta, _ = lax.fori_loop(0, options.n_angles, compare, initial)
+            return lowest_theta, width * (2.5 / options.n_angles)
 
         start_angles = jnp.stack([middle] * (1 + self.s.n))
         width = half_angle if self.end is None else 0.5 * (half_angle + end)
-        theta, _ = lax.fori_loop(0, 5, zoom, (start_angles, width))
+        theta, _ = lax.fori_loop(0, options.n_rounds, zoom, (start_angles, width))
         return self.margins(lax.stop_gradient(theta))
 
 

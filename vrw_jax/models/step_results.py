@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES
-from vrw_jax.models.section_states import AnySectionState
+from vrw_jax.models.step_inputs import AnySectionState
 from vrw_jax.printing import (
     AbstractPrintable,
     TextRow,

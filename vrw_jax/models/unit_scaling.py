@@ -23,11 +23,10 @@ _INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE
 
 
 class UnitScaling(NamedTuple):
-    """A unit: its power in each number of (parameters, start, slope of the line ahead) and of
-    (section state, durations)."""
+    """Powers of one unit in the inputs and outputs of a step."""
 
-    input_powers: tuple[int, ...]
-    output_powers: tuple[int, ...]
+    input_powers: tuple[int, ...]  # in parameters, start, and slope of the next line
+    output_powers: tuple[int, ...]  # in section state and durations
 
     def subtract_columns(
         self, remainder: Array, inputs: Sequence[Array], columns: Mapping[int, Array]
@@ -79,8 +78,8 @@ def scaled_jacobian_columns(
 ) -> tuple:
     """Return `jacobian_columns` of a step's section state and durations for all inputs.
 
-    `lanes`: parameters, then the start, then on uneven ground the slope of the line ahead; `moved`:
-    all of them, in the order of the columns told.
+    - `inputs`: parameters, then the start, then on uneven ground the slope of the next line;
+    - `input_indices`: indices of all inputs, in the order of the returned columns.
     """
     computed_indices = [i for i in range(len(inputs)) if i not in SCALING_BY_PARAMETER]
     columns, outputs, aux = jacobian_columns(function, inputs, computed_indices)

@@ -34,7 +34,7 @@ from vrw_jax.models.phase_sequence import (
     make_trajectory,
     run_phases,
 )
-from vrw_jax.models.section_states import PAPER_START, SectionState
+from vrw_jax.models.step_inputs import PAPER_START, SectionState
 from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
 from vrw_jax.numerics import ForwardFunction, StepOptions, Vector, enable_all_ad_modes
 from vrw_jax.validation import check_bool
@@ -83,27 +83,6 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     )
 
 
-def _integrate_with_diffrax(
-    options: StepOptions,
-    records_margins: bool,
-    phase: AbstractPhase,
-    q: Vector,
-    v: Vector,
-    active: Array,
-    _previous_end: PhaseResult | None,
-) -> PhaseResult:
-    """Return the end of one phase, integrated by diffrax."""
-    diffrax_phase = make_diffrax_phase(phase, records_margins)
-    end = integrate_phase(
-        diffrax_phase.vector_field, diffrax_phase.guards, jnp.stack([*q, *v]), active, options
-    )
-    state = tuple(end.state)
-    return PhaseResult(
-        state[: phase.n_dof], state[phase.n_dof :], end.duration, end.guard, end.timed_out,
-        end.solver_steps, end.minima if records_margins else None,
-    )  # fmt: skip
-
-
 class ViscoelasticWheel(AbstractWheel):
     """The paper's model: fixed leg roles, no slip, no scuffing; margins are measured, not enforced.
 
@@ -147,7 +126,6 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
-        """Return the outputs of the compiled step."""
         leaves, structure = jax.tree.flatten((params, x, options))
         return eqx.combine(*_compile_step(self, structure, is_detailed)(*leaves))
 
@@ -166,10 +144,8 @@ class ViscoelasticWheel(AbstractWheel):
         params, x, options = jax.tree.unflatten(structure, leaves)
         sequence, samples = self._run_phases(params, x, options, records_margins=False), []
         for phase, start, end in zip(sequence.phases, sequence.starts, sequence.ends, strict=True):
-            vector_field, y = (
-                make_diffrax_phase(phase, records_margins=False).vector_field,
-                jnp.stack([*start[0], *start[1]]),
-            )
+            vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
+            y = jnp.stack([*start[0], *start[1]])
             samples.append(sample_phase(vector_field, y, end.duration, n_samples, options))
         return make_trajectory(sequence, samples)
 
@@ -177,8 +153,30 @@ class ViscoelasticWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
         """Return all phases of the step, integrated by diffrax."""
-        phase_runner = functools.partial(_integrate_with_diffrax, options, records_margins)
-        return run_phases(phase_runner, params, tuple(x), self.stop_at_lift_off)
+
+        def run_phase(
+            phase: AbstractPhase, q: Vector, v: Vector, active: Array, _: PhaseResult | None
+        ) -> PhaseResult:
+            diffrax_phase = make_diffrax_phase(phase, records_margins)
+            end = integrate_phase(
+                diffrax_phase.vector_field,
+                diffrax_phase.guards,
+                jnp.stack([*q, *v]),
+                active,
+                options,
+            )
+            state = tuple(end.state)
+            return PhaseResult(
+                state[: phase.n_dof],
+                state[phase.n_dof :],
+                end.duration,
+                end.guard,
+                end.timed_out,
+                end.solver_steps,
+                end.minima if records_margins else None,
+            )
+
+        return run_phases(run_phase, params, tuple(x), self.stop_at_lift_off)
 
 
 @functools.cache

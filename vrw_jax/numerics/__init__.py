@@ -1,5 +1,6 @@
 """Types, options, trigonometry, helpers for automatic differentiation and for batches."""
 
+from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.autodiff import (
     ExecutionWrapper,
     ForwardFunction,
@@ -42,7 +43,7 @@ from vrw_jax.numerics.cubic_minima import (
     find_cubic_minimum,
 )
 from vrw_jax.numerics.forward_only import refuse_reverse_mode
-from vrw_jax.numerics.options import EngineName, StepOptions
+from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector

@@ -66,9 +66,8 @@ def enable_all_ad_modes(
 
     def call_function(*arrays: Any) -> tuple:
         is_traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
-        return (
-            wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
-        )  # the custom rule costs as much as a solver step
+        # The custom rule costs as much as a solver step, so it is applied to tracers only.
+        return wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
 
     return call_function
 
@@ -101,7 +100,7 @@ def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> F
 def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tuple) -> PyTree:
     """Return Jacobians times tangents, leaf by leaf.
 
-    The products are sums, because products of small arrays are library calls.
+    Products are written as sums, because a matrix product of small arrays is a library call.
     """
 
     def apply_leaf(_: Array, *leaf_jacobians: Array) -> Array:
@@ -155,9 +154,7 @@ def implicit_jacobian(
     """
 
     def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
-        """Return the derivatives over a batch, one direction after another, which keeps the code
-        short.
-        """
+        """Return the derivatives over a batch, one direction after another, for short code."""
         n, (z, dz) = p.shape[0], z_and_jacobian
         units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
         return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (units, dz))

@@ -1,4 +1,4 @@
-"""A sentence instead of JAX's own error where reverse mode meets a loop of unknown length."""
+"""An error with one clear sentence for reverse mode through a loop of unknown length."""
 
 from typing import Any
 
@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 _FORWARD_ONLY = Primitive("forward_only")
-"""The identity, of which the transpose raises."""
+"""The identity, whose transpose raises an error."""
 
 
 def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
@@ -28,14 +28,11 @@ mlir.register_lowering(_FORWARD_ONLY, lambda _context, x, *, name: [x])
 
 
 def refuse_reverse_mode(name: str, tree: PyTree) -> PyTree:
-    """Return the results of `hybrid.<name>`, with a sentence in place of reverse mode."""
+    """Return the results of `hybrid.<name>`, which raise an error in reverse mode."""
 
     def mark(leaf: Any) -> Any:
-        marks = isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf)
-        return _mark(leaf, name) if marks else leaf
+        if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
+            return _FORWARD_ONLY.bind(leaf, name=name)
+        return leaf
 
     return jax.tree.map(mark, tree)
-
-
-def _mark(leaf: Array, name: str) -> Array:
-    return _FORWARD_ONLY.bind(leaf, name=name)

@@ -11,7 +11,8 @@ import numpy as np
 from vrw_jax.numerics.types import Elementwise
 
 MAX_EXACT_ANGLE = 1.6
-"""Angle up to which the polynomials are accurate to round-off, rad."""
+"""Angle up to which the polynomials are accurate to round-off, rad, chosen because gait angles are
+below it."""
 
 
 def _economize_series(offset: int) -> tuple[float, ...]:
@@ -62,9 +63,8 @@ def _evaluate_series(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
     )
 
 
-_differentiable_sine_cosine = jax.custom_jvp(
-    jax.jit(lambda angle: _evaluate_series(jnp, angle))
-)  # traced once
+# The jit makes JAX trace the polynomials once.
+_differentiable_sine_cosine = jax.custom_jvp(jax.jit(lambda angle: _evaluate_series(jnp, angle)))
 
 
 @_differentiable_sine_cosine.defjvp

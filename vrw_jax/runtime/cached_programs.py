@@ -63,27 +63,25 @@ def cached_lane_program(
     n_lanes_in: int,
     dtype: np.dtype,
     settings: Any,
-    max_unrolled: int = simd.MAX_UNROLLED,
+    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """Return `simd.compile_lane_program` of a function of this library, with a record on disk.
 
     `settings` is as for `compile_exported`.
     """
     key = (settings, store.describe_process())
-    return simd.compile_lane_program(
-        function, scalar_dtypes, n_lanes_in, dtype, key, store, max_unrolled
-    )
+    return simd.compile_lane_program(function, scalar_dtypes, n_lanes_in, dtype, key, store, limits)
 
 
 def cached_lane_function(
     function: Callable,
     shape_function: Callable,
     settings: object,
-    max_unrolled: int = simd.MAX_UNROLLED,
+    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS,
 ) -> Callable:
     """Return `simd.compile_lane_function` of a function of this library, with a record on disk."""
     return simd.compile_lane_function(
-        function, shape_function, (settings, store.describe_process()), store, max_unrolled
+        function, shape_function, (settings, store.describe_process()), store, limits
     )
 
 

@@ -1,7 +1,7 @@
 """Compilation of JAX traces to machine code with LLVM, for a few lanes per vector."""
 
 from vrw_jax.simd import code_cache, ffi_primitive, kernel, machine, program
-from vrw_jax.simd.array_emitter import MAX_UNROLLED
+from vrw_jax.simd.array_emitter import DEFAULT_LIMITS, RegisterLimits
 from vrw_jax.simd.code_cache import targets_machine_code
 from vrw_jax.simd.ffi_primitive import MACHINE_CODE_PRIMITIVE
 from vrw_jax.simd.lowering import noinline

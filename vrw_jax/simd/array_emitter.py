@@ -11,6 +11,7 @@ compiles fast. No operation may combine lanes, except to test whether any or all
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import llvmlite.ir as ir
@@ -30,14 +31,28 @@ from vrw_jax.simd.value_emitter import I64, NUMBER_TYPES, Value, ValueEmitter
 LANE_AXIS_SENTINEL = 1021
 """Length of the lane axis in the trace, by which the axis is recognized; machine code has any
 number of lanes."""
-MAX_UNROLLED = 8
-"""Most entries of a lazy array that are computed individually, and most terms of a sum that are
-unrolled."""
-MAX_REGISTERS = 32
-"""Most entries of an array that a loop carries in registers, and of a constant that needs no
-table."""
-MAX_REGISTERS_INNER = 64
-"""The same limit of carried entries for loops without inner loops, which are unrolled."""
+
+
+@dataclass(frozen=True)
+class RegisterLimits:
+    """Sizes up to which arrays are divided into entries in registers.
+
+    Larger sizes give faster code that takes longer to compile. The defaults are chosen because the
+    programs of this library then compile in seconds and run within a few percent of the fastest.
+    """
+
+    max_unrolled: int = 8
+    """Most entries of a lazy array that are computed individually."""
+    max_unrolled_terms: int = 8
+    """Most terms of a sum or a reduction that are written one after the other, without a loop."""
+    max_registers: int = 32
+    """Most entries of an array that a loop carries in registers, and of a constant without a
+    table."""
+    max_registers_inner: int = 64
+    """Most entries that a loop carries in registers if it contains no loop."""
+
+
+DEFAULT_LIMITS = RegisterLimits()
 
 
 class PrimitiveCall(NamedTuple):
@@ -53,9 +68,9 @@ class ArrayEmitter:
     """Emitter of operations on arrays, into the function of its value emitter."""
 
     def __init__(
-        self, emitter: ValueEmitter, is_unrolled: bool = False, max_unrolled: int = MAX_UNROLLED
+        self, emitter: ValueEmitter, limits: RegisterLimits, is_unrolled: bool = False
     ) -> None:
-        self.emitter, self.builder, self.max_unrolled = emitter, emitter.builder, max_unrolled
+        self.emitter, self.builder, self.limits = emitter, emitter.builder, limits
         self.kept_alive: list[Any] = []  # objects identified by `id`
         self.is_unrolled = is_unrolled  # within a loop without inner loops: constants need no table
 
@@ -69,9 +84,8 @@ class ArrayEmitter:
             raise lane_axis_error("A constant", aval)
         number = number_type(aval)
         entries = make_array(value.shape, [self.emitter.constant(number, x) for x in value.ravel()])
-        return (
-            entries if value.size <= MAX_REGISTERS or self.is_unrolled else self.make_table(entries)
-        )
+        fits_registers = self.is_unrolled or value.size <= self.limits.max_registers
+        return entries if fits_registers else self.make_table(entries)
 
     def get_entries(self, array: ArrayValue) -> np.ndarray:
         """Return all entries, one by one."""
@@ -200,7 +214,12 @@ class ArrayEmitter:
         """
         if isinstance(array, MemoryArray):
             return array
-        memory = self.allocate(array.shape, _entry_type(array))
+        if isinstance(array, LazyArray):
+            entry_type = array.entry_type
+        else:  # a vector if any entry is one
+            types = [x.type for x in array.ravel()]
+            entry_type = next((t for t in types if isinstance(t, ir.VectorType)), types[0])
+        memory = self.allocate(array.shape, entry_type)
         self.fill_memory(memory, array)
         return memory
 
@@ -251,7 +270,7 @@ class ArrayEmitter:
     def reshape_if_needed(
         self, array: ArrayValue, shape: tuple[int, ...], is_needed: bool
     ) -> ArrayValue:
-        """Return the array reshaped, if needed."""
+        """Return the array in another shape if `is_needed`, else the array itself."""
         return self.reshape_array(array, shape) if is_needed else array
 
     def broadcast_array(
@@ -348,14 +367,6 @@ class ArrayEmitter:
 _FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
-def _entry_type(array: ArrayValue) -> ir.Type:
-    """Return the type of entries: a vector if any entry is one."""
-    if isinstance(array, LazyArray):
-        return array.entry_type
-    kinds = [x.type for x in array.ravel()]
-    return next((kind for kind in kinds if isinstance(kind, ir.VectorType)), kinds[0])
-
-
 def has_lanes(aval: Any) -> bool:
     """Return whether an array of the trace has the axis of lanes."""
     return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
@@ -367,19 +378,19 @@ def shape_without_lanes(aval: Any) -> tuple[int, ...]:
 
 
 def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
-    """Return the error for an axis as long as the lanes' that is another, or is moved there."""
+    """Return the error for an axis with the length of the lane axis that is not the lane axis."""
     return NotImplementedError(
         f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
-        f"the lanes', which come "
-        "from arguments and stay the last; keep them there, and give other axes another length."
+        "the lanes', which come from arguments and stay the last; keep them there, and give other "
+        "axes another length."
     )
 
 
 def lane_mixing_error(name: str) -> NotImplementedError:
     """Return the error for a primitive that combines or moves lanes."""
     return NotImplementedError(
-        f"{name} moves, joins or picks lanes: do the same to each by itself; only `any` and `all` "
-        "may ask about all of them."
+        f"{name} moves, joins or selects lanes: do the same to each lane; only `any` and `all` "
+        "may combine them."
     )
 
 
@@ -387,8 +398,8 @@ def number_type(aval: Any) -> ir.Type:
     """Return the type of an entry for one lane."""
     if aval.dtype not in _TYPE_BY_DTYPE:
         raise NotImplementedError(
-            f"{aval.str_short()} has numbers that machine code does not know: convert them to one "
-            f"of {', '.join(NUMBER_TYPES)}."
+            f"{aval.str_short()} has numbers that machine code does not support: convert them to "
+            f"one of {', '.join(NUMBER_TYPES)}."
         )
     return _TYPE_BY_DTYPE[aval.dtype]
 

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from vrw_jax.simd.array_emitter import RegisterLimits
 from vrw_jax.simd.kernel import KERNEL_NAME, write_module
 from vrw_jax.simd.machine import compilation_key, compile_native, require_object
 
@@ -29,7 +30,7 @@ class CodeStore(Protocol):
     """Storage of code between processes; a module with these two functions is one."""
 
     def load_bytes(self, name: str) -> bytes | None:
-        """What was kept under that name; None if nothing, damaged, or kept under another name."""
+        """Return what was saved under that name; None if there is nothing or it is damaged."""
 
     def save_bytes(self, name: str, content: bytes) -> None:
         """Save `content` under that name."""
@@ -55,16 +56,16 @@ def get_machine_code(
     key: object,
     width: int,
     store: CodeStore | None,
-    max_unrolled: int,
+    limits: RegisterLimits,
 ) -> MachineCode:
-    """Return the machine code of a function, from the cache or newly compiled."""
-    key_parts = (key, shapes, width, max_unrolled, jax.__version__, compilation_key())
+    """Return the machine code of a function: from this process, from `store`, or newly compiled."""
+    key_parts = (key, shapes, width, limits, jax.__version__, compilation_key())
     index = f"lanes_index_{_digest(repr(key_parts).encode())}"
     if index not in _code_by_name:
         name = store.load_bytes(index) if store is not None else None
         code = load_machine_code(name.decode("ascii", "replace"), store) if name else None
         _code_by_name[index] = code or _trace_and_compile(
-            function, shapes, width, index, store, max_unrolled
+            function, shapes, width, index, store, limits
         )
     return _code_by_name[index]
 
@@ -75,12 +76,12 @@ def _trace_and_compile(
     width: int,
     index: str,
     store: CodeStore | None,
-    max_unrolled: int,
+    limits: RegisterLimits,
 ) -> MachineCode:
     """Trace a function; compile it in the background unless code of the same text exists."""
     with _tracing_lock, _pause_garbage_collection():
         closed_jaxpr = trace_for_machine_code(function, *shapes)
-        text = write_module(closed_jaxpr, width, max_unrolled)
+        text = write_module(closed_jaxpr, width, limits)
     result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
     )
@@ -101,7 +102,7 @@ def _trace_and_compile(
 def _compile_and_save(
     text: str, result_types: str, name: str, index: str, store: CodeStore | None
 ) -> bytes:
-    """Compile LLVM text, and save the code and its index entry."""
+    """Compile LLVM text, save the code and its index entry, and return the code."""
     code = compile_native(text)
     if store is not None:
         store.save_bytes(name, result_types.encode() + b"\n" + code)
@@ -119,7 +120,7 @@ def load_machine_code(name: str, store: CodeStore | None) -> MachineCode | None:
         try:
             results = _parse_result_types(result_types)
             require_object(code, KERNEL_NAME)
-        except (ValueError, TypeError) as error:  # LLVM would end the process over it
+        except (ValueError, TypeError) as error:  # LLVM would end the process on such a file
             warnings.warn(f"{name} holds no machine code ({error}): compiled again.", stacklevel=2)
             return None
         object_code: Future[bytes] = Future()

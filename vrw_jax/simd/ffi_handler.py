@@ -19,7 +19,7 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
     handler.attributes.add("nounwind")
     build = ir.IRBuilder(handler.append_basic_block("entry"))
     metadata_block, execute_block = (
-        handler.append_basic_block(name) for name in ("asked", "called")
+        handler.append_basic_block(name) for name in ("metadata", "execute")
     )
     frame, null = handler.args[0], ir.Constant(pointer, None)
 
@@ -31,9 +31,8 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
 
     extension = load_field(frame, 8)
     build.cbranch(build.icmp_unsigned("==", extension, null), execute_block, metadata_block)
-    build.position_at_end(
-        metadata_block
-    )  # XLA requests the version of the interface: return the caller's version
+    # XLA requests the version of the interface: return the caller's version.
+    build.position_at_end(metadata_block)
     metadata, version = load_field(extension, 24), field_address(load_field(frame, 16), 16)
     for field in (16, 20):
         build.store(load_field(version, field, I32), field_address(metadata, 8 + field))

@@ -7,10 +7,10 @@ import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.simd.array_emitter import (
+    DEFAULT_LIMITS,
     LANE_AXIS_SENTINEL,
-    MAX_REGISTERS,
-    MAX_UNROLLED,
     ArrayEmitter,
+    RegisterLimits,
     has_lanes,
     lane_axis_error,
 )
@@ -23,7 +23,9 @@ from vrw_jax.simd.value_emitter import I1, I8, I64, NUMBER_TYPES, Value, ValueEm
 KERNEL_NAME = "lanes"
 
 
-def write_module(closed_jaxpr: ClosedJaxpr, width: int, max_unrolled: int = MAX_UNROLLED) -> str:
+def write_module(
+    closed_jaxpr: ClosedJaxpr, width: int, limits: RegisterLimits = DEFAULT_LIMITS
+) -> str:
     """Return the LLVM text of the kernel, which computes a range of groups of lanes.
 
     Its signature is `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin,
@@ -38,7 +40,7 @@ def write_module(closed_jaxpr: ClosedJaxpr, width: int, max_unrolled: int = MAX_
     )
     kernel.attributes.add("nounwind")
     build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = ArrayEmitter(ValueEmitter(build, max(width, 2)), max_unrolled=max_unrolled)
+    arrays = ArrayEmitter(ValueEmitter(build, max(width, 2)), limits)
     input_table, output_table, n_lanes, begin, end = kernel.args
     inputs, outputs = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
@@ -90,12 +92,8 @@ class _RowAccess:
     def __init__(
         self, emitter: ArrayEmitter, is_single_lane: bool, n_lanes: Value, lane: Value
     ) -> None:
-        self.emitter, self.is_single_lane, self.n_lanes, self.lane = (
-            emitter,
-            is_single_lane,
-            n_lanes,
-            lane,
-        )
+        self.emitter, self.is_single_lane = emitter, is_single_lane
+        self.n_lanes, self.lane = n_lanes, lane
 
     def read_argument(self, base: Value, aval: Any) -> ArrayValue:
         """Return an argument; a number without axes is the same for all lanes."""
@@ -111,23 +109,20 @@ class _RowAccess:
             )
 
         field = LazyArray(aval.shape[:-1], self.emitter.entry_type_of(aval), load_entry)
-        return self.emitter.get_entries(field) if math.prod(field.shape) <= MAX_REGISTERS else field
+        fits_registers = math.prod(field.shape) <= self.emitter.limits.max_registers
+        return self.emitter.get_entries(field) if fits_registers else field
 
     def write_result(self, base: Value, aval: Any, value: ArrayValue) -> None:
-        """Store a result."""
+        """Store a result of the group in the memory that begins at `base`."""
         build = self.emitter.builder
 
         def store_entry(index: EntryIndex, _: Any) -> list[Value]:
             address, kind = self.row_address(base, aval, index)
             stored_value = self.emitter.emitter.splat(self.emitter.get_entry(value, index))
-            stored_value = (
-                build.extract_element(stored_value, ir.Constant(I64, 0))
-                if self.is_single_lane
-                else stored_value
-            )
-            stored_value = (
-                build.zext(stored_value, kind) if aval.dtype.kind == "b" else stored_value
-            )
+            if self.is_single_lane:
+                stored_value = build.extract_element(stored_value, ir.Constant(I64, 0))
+            if aval.dtype.kind == "b":
+                stored_value = build.zext(stored_value, kind)
             build.store(stored_value, address, align=aval.dtype.itemsize)
             return []
 

@@ -8,8 +8,6 @@ import llvmlite.ir as ir
 
 from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
-    MAX_REGISTERS,
-    MAX_REGISTERS_INNER,
     ArrayEmitter,
     shape_without_lanes,
     split_arrays,
@@ -29,15 +27,16 @@ def emit_while(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -
     """Emit a loop with a condition, of which each group of lanes has its own."""
     arrays, params = traces.emitter, equation.params
     n_condition_constants, n_body_constants = params["cond_nconsts"], params["body_nconsts"]
-    constants = list(
-        map(as_shared, values[: n_condition_constants + n_body_constants])
-    )  # in each iteration
+    # Each iteration reads the constants again.
+    constants = list(map(as_shared, values[: n_condition_constants + n_body_constants]))
     condition_constants, body_constants = (
         constants[:n_condition_constants],
         constants[n_condition_constants:],
     )
     initial_values = values[n_condition_constants + n_body_constants :]
-    carry = _LoopCarry(arrays, params["body_jaxpr"].out_avals, MAX_REGISTERS, initial_values)
+    carry = _LoopCarry(
+        arrays, params["body_jaxpr"].out_avals, arrays.limits.max_registers, initial_values
+    )
 
     def emit_condition(flat: list[Value]) -> Value:
         results = traces.lower_jaxpr(
@@ -58,14 +57,17 @@ def emit_while(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -
 def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
     """Emit a loop of known length, whose scanned inputs and stacked outputs are in memory."""
     arrays, params = traces.emitter, equation.params
-    n_constants, n_carry = _split_scan_counts(params)
+    if "ft_in" in params:  # JAX from 0.11 or 0.12 on
+        constants, carry, _ = params["ft_in"].unpack()
+        n_constants, n_carry = len(constants), len(carry)
+    else:
+        n_constants, n_carry = params["num_consts"], params["num_carry"]
     body_jaxpr, length = params["jaxpr"], params["length"]
     stacked_avals = [variable.aval for variable in equation.outvars[n_carry:]]
     if length == LANE_AXIS_SENTINEL and (stacked_avals or len(values) > n_constants + n_carry):
         raise NotImplementedError(
             f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': "
-            f"do the same to "
-            "each by itself, and give other axes another length."
+            "do the same to each lane, and give other axes another length."
         )
     scanned = values[n_constants + n_carry :]
     scanned_arrays = [
@@ -80,12 +82,13 @@ def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) ->
         list(map(as_shared, values[:n_constants])),
         values[n_constants : n_constants + n_carry],
     )
-    max_registers = MAX_REGISTERS_INNER if arrays.is_unrolled else MAX_REGISTERS
+    limits = arrays.limits
+    max_registers = limits.max_registers_inner if arrays.is_unrolled else limits.max_registers
     carry = _LoopCarry(arrays, body_jaxpr.out_avals[:n_carry], max_registers, initial_values)
 
     def get_slice(memory: MemoryArray | TransposedView, iteration: Value) -> ArrayValue:
         row = memory.get_row(iteration)
-        fits_registers = arrays.is_unrolled or math.prod(row.shape) <= MAX_REGISTERS
+        fits_registers = arrays.is_unrolled or math.prod(row.shape) <= limits.max_registers
         return arrays.get_entries(row) if fits_registers else row
 
     def body(iteration: Value, flat: list[Value]) -> list[Value]:
@@ -101,14 +104,6 @@ def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) ->
     final_values = carry.to_arrays(arrays.loop_n_times(length, body, initial_registers))
     arrays.is_unrolled = was_unrolled
     return [*final_values, *stacked_arrays]
-
-
-def _split_scan_counts(params: dict[str, Any]) -> tuple[int, int]:
-    """Return the number of constants of a scan, and the number of values that it carries."""
-    if "ft_in" in params:  # JAX from 0.11 or 0.12 on
-        constants, carry, _ = params["ft_in"].unpack()
-        return len(constants), len(carry)
-    return params["num_consts"], params["num_carry"]
 
 
 class _LoopCarry:

@@ -101,7 +101,7 @@ class JaxprLowering:
         if name not in self.rules:
             raise NotImplementedError(
                 f"{name} has no machine code: write it by primitives that `simd.list_primitives()` "
-                "lists, or give it a rule in RULES."
+                "lists, or give it a rule in `simd/rules.PRIMITIVE_RULES`."
             )
         for variable in equation.outvars:
             if LANE_AXIS_SENTINEL in variable.aval.shape[:-1]:
@@ -111,7 +111,7 @@ class JaxprLowering:
     def call_function(
         self, closed_jaxpr: ClosedJaxpr, values: Sequence[ArrayValue]
     ) -> list[ArrayValue]:
-        """Emit a call of a separate function, which is defined once."""
+        """Emit a call of a separate function, which is defined once, and return its results."""
         build = self.emitter.builder
         if id(closed_jaxpr) not in self.functions:
             self.functions[id(closed_jaxpr)] = (self._define_function(closed_jaxpr), closed_jaxpr)
@@ -142,7 +142,7 @@ class JaxprLowering:
         build = ir.IRBuilder(function.append_basic_block("entry"))
         caller = self.emitter
         emitter = ArrayEmitter(
-            ValueEmitter(build, caller.emitter.width), caller.is_unrolled, caller.max_unrolled
+            ValueEmitter(build, caller.emitter.width), caller.limits, caller.is_unrolled
         )
         results = JaxprLowering(emitter, self.rules, self.functions).lower_jaxpr(
             closed_jaxpr, split_arrays(function.args, closed_jaxpr.in_avals)

@@ -4,12 +4,14 @@ import ctypes
 import functools
 import struct
 import sys
+from enum import IntEnum
 from typing import Any
 
 import llvmlite.binding as llvm
 
 OPTIMIZATION_LEVEL = 2
-"""LLVM's optimization level for register allocation and instruction scheduling."""
+"""LLVM's level for register allocation and instruction scheduling, chosen because level 3 gives no
+faster code here."""
 LLVM_PASSES = (
     "global_dead_code_eliminate",
     "instruction_combine",
@@ -24,11 +26,18 @@ takes as long as all the rest, for code that is at most a twentieth faster.
 """
 
 ELF_64_BIT_LITTLE_ENDIAN = b"\x7fELF\x02\x01"
-"""How the object files begin that LLVM makes on Linux."""
-ELF_HEADER, ELF_SECTION = struct.Struct("<16sHHIQQQIHHHHHH"), struct.Struct("<IIQQQQIIQQ")
-"""The header of such a file, and an entry of its table of sections."""
-ELF_STRINGS, ELF_WITHOUT_DATA = 3, 8
-"""Kinds of sections: names, and memory that the file holds no bytes for."""
+"""First bytes of the object files that LLVM writes on Linux."""
+ELF_HEADER = struct.Struct("<16sHHIQQQIHHHHHH")
+"""Layout of the header of such a file."""
+ELF_SECTION = struct.Struct("<IIQQQQIIQQ")
+"""Layout of an entry of its table of sections."""
+
+
+class ElfSectionKind(IntEnum):
+    """Kinds of sections that the check of a file distinguishes."""
+
+    STRING_TABLE = 3
+    WITHOUT_DATA = 8  # memory for which the file contains no bytes
 
 
 @functools.cache
@@ -87,10 +96,10 @@ def _emit_object(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
 
 
 def require_object(code: bytes, name: str) -> None:
-    """Refuse, with a ValueError, what isn't whole object code with a function of that name.
+    """Raise a ValueError unless the code is a complete object file with a function of that name.
 
-    LLVM ends the process over a damaged file, so that its tables are looked at here. Only those of
-    ELF; of what other systems take, no more than the name.
+    LLVM ends the process if a file is damaged, so its tables are checked here. Only files in the
+    ELF format are checked completely; in other formats only the name is looked for.
     """
     if f"\0{name}\0".encode() not in code and f"\0_{name}\0".encode() not in code:
         raise ValueError(f"it has no function {name}")
@@ -103,9 +112,9 @@ def require_object(code: bytes, name: str) -> None:
         raise ValueError("its table of sections is cut off")
     sections = [ELF_SECTION.unpack_from(code, begin + i * size) for i in range(count)]
     for _, kind, _, _, offset, length, *_ in sections:
-        if kind != ELF_WITHOUT_DATA and offset + length > len(code):
+        if kind != ElfSectionKind.WITHOUT_DATA and offset + length > len(code):
             raise ValueError("a section is cut off")
-    if sections[names][1] != ELF_STRINGS:
+    if sections[names][1] != ElfSectionKind.STRING_TABLE:
         raise ValueError("it has no table of names")
 
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL, MAX_UNROLLED
+from vrw_jax.simd.array_emitter import DEFAULT_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
 from vrw_jax.simd.code_cache import (
     CodeStore,
     MachineCode,
@@ -32,7 +32,7 @@ from vrw_jax.simd.machine import LoadedCode, compile_wasm, has_512_bit_vectors
 LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 """Number of lanes in 256 bits, which is a vector, or half of one on processors with 512 bits."""
 GROUPS_PER_TASK = 64
-"""Number of groups in one task of a thread."""
+"""Number of groups in one task of a thread, chosen because starting a task then costs little."""
 
 
 def is_available() -> bool:
@@ -47,7 +47,7 @@ def compile_lane_program(
     dtype: np.dtype,
     key: object,
     store: CodeStore | None,
-    max_unrolled: int = MAX_UNROLLED,
+    limits: RegisterLimits = DEFAULT_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """Compile `function(scalars, lanes)`: scalars of `scalar_dtypes`, and arrays of the float
     `dtype`.
@@ -55,18 +55,17 @@ def compile_lane_program(
     The function must be elementwise over lanes, except for loops that end when no lane continues.
     It returns a flat tuple of arrays whose last axis are lanes. The `repr` of `key` identifies
     everything that its trace depends on except shapes: the values in its closure, and its source.
-    Code is saved in `store`, if given; parts of large arrays with up to `max_unrolled` entries are
-    kept in registers. The result takes numpy arrays of any equal length and gives bitwise the same
-    for a lane whatever the other lanes are; it uses all cores available to the process.
+    Code is saved in `store`, if given; `limits` decides what is kept in registers. The program
+    takes numpy arrays of any equal length. It returns bitwise the same results for a lane whatever
+    the other lanes are, and uses all cores available to the process.
     """
-    width = (
-        2 * LANES_PER_256_BITS[dtype]
-    )  # of two vectors of 256 bits, one computes during the latency of the other
+    # Of two vectors of 256 bits, one computes during the latency of the other.
+    width = 2 * LANES_PER_256_BITS[dtype]
     shapes = (
         tuple(jax.ShapeDtypeStruct((), kind) for kind in scalar_dtypes),
         (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), dtype),) * n_lanes_in,
     )
-    return _LaneProgram(get_machine_code(function, shapes, key, width, store, max_unrolled), width)
+    return _LaneProgram(get_machine_code(function, shapes, key, width, store, limits), width)
 
 
 def compile_wasm_object(
@@ -74,7 +73,7 @@ def compile_wasm_object(
     n_scalars: int,
     n_rows_by_array: Sequence[int],
     name: str,
-    max_unrolled: int = MAX_UNROLLED,
+    limits: RegisterLimits = DEFAULT_LIMITS,
 ) -> bytes:
     """Return `function(*scalars, *arrays)` as object code for WebAssembly, two lanes at a time.
 
@@ -86,7 +85,7 @@ def compile_wasm_object(
     lanes = [jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array]
     shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lanes
     return compile_wasm(
-        write_module(trace_for_machine_code(function, *shapes), 2, max_unrolled), KERNEL_NAME, name
+        write_module(trace_for_machine_code(function, *shapes), 2, limits), KERNEL_NAME, name
     )
 
 
@@ -95,7 +94,7 @@ def compile_lane_function(
     shape_function: Callable[..., Any],
     key: object,
     store: CodeStore | None,
-    max_unrolled: int = MAX_UNROLLED,
+    limits: RegisterLimits = DEFAULT_LIMITS,
 ) -> Callable[..., Any]:
     """Return `function` of trees of arrays, lanes on their last axis, as one call within JAX
     programs.
@@ -113,15 +112,14 @@ def compile_lane_function(
         for shape in (jnp.shape(x) for x in leaves):
             if shape and shape[-1] != n_lanes:
                 raise ValueError(
-                    f"An argument has the shape {shape}, but the first one {n_lanes} lanes: they "
-                    "are the last axis of every array; what has no axis is the same for all."
+                    f"An argument has the shape {shape}, but the first one has {n_lanes} lanes: "
+                    "give every array the same number on its last axis, or a number without axes."
                 )
         group_width = LANES_PER_256_BITS[np.dtype(leaves[0].dtype)] * (
             2 if has_512_bit_vectors() else 1
         )
-        width = (
-            1 if n_lanes == 1 else group_width
-        )  # a full group would compute lanes that are not needed
+        # A single lane has its own code: a full group would compute lanes that are not needed.
+        width = 1 if n_lanes == 1 else group_width
         n_missing = -n_lanes % width
         shapes = [
             jax.ShapeDtypeStruct(
@@ -132,9 +130,7 @@ def compile_lane_function(
         flat_function = lambda *leaves: jax.tree.leaves(
             function(*jax.tree.unflatten(structure, leaves))
         )
-        code = get_machine_code(
-            flat_function, shapes, (key, str(structure)), width, store, max_unrolled
-        )
+        code = get_machine_code(flat_function, shapes, (key, str(structure)), width, store, limits)
         if n_missing:
             pad_with_last = lambda x: jnp.concatenate(
                 [x, jnp.repeat(x[..., -1:], n_missing, -1)], -1
@@ -177,10 +173,8 @@ class _LaneProgram:
         results = [
             np.empty((*shape, groups * self.width), kind) for shape, kind in self.result_types
         ]
-        input_table, output_table = (
-            _pointer_table([*numbers, *padded_lanes]),
-            _pointer_table(results),
-        )
+        input_table = _pointer_table([*numbers, *padded_lanes])
+        output_table = _pointer_table(results)
         length = groups * self.width
         run_groups = lambda begin: self._run(
             input_table, output_table, length, begin, min(begin + GROUPS_PER_TASK, groups)

@@ -10,7 +10,6 @@ import numpy as np
 
 from vrw_jax.simd.arithmetic import emit_elementwise
 from vrw_jax.simd.array_emitter import (
-    MAX_UNROLLED,
     ArrayEmitter,
     PrimitiveCall,
     has_lanes,
@@ -60,7 +59,7 @@ def emit_dot_general(
 
     add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
     shape, kind = shape_without_lanes(call.out_aval), emitter.entry_type_of(call.out_aval)
-    if length <= MAX_UNROLLED or emitter.is_unrolled:
+    if length <= emitter.limits.max_unrolled_terms or emitter.is_unrolled:
         entry_at = lambda index: functools.reduce(
             add_values, [product(index, k) for k in range(length)]
         )
@@ -101,11 +100,11 @@ def reduction_rule(name: str) -> Callable[..., ArrayValue]:
 
         def reduce_entry(outer: EntryIndex) -> Value:
             entry_at = lambda inner: emitter.get_entry(array, index_of(outer, inner))
-            if isinstance(array, np.ndarray) or math.prod(lengths) <= MAX_UNROLLED:
+            n_terms = math.prod(lengths)
+            if isinstance(array, np.ndarray) or n_terms <= emitter.limits.max_unrolled_terms:
                 return functools.reduce(combine, map(entry_at, np.ndindex(*lengths)))
-            initial_value = entry_at(
-                (0,) * len(lengths)
-            )  # counted twice, which does not change these reductions
+            # A first entry that is counted twice does not change any reduction except a sum.
+            initial_value = entry_at((0,) * len(lengths))
             if name == "add":
                 initial_value = emitter.make_zero(array.entry_type)
             elif isinstance(array.entry_type, ir.VectorType):

@@ -38,7 +38,7 @@ def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
         )
         if (
             isinstance(result, LazyArray)
-            and math.prod(result.shape) <= lowering.emitter.max_unrolled
+            and math.prod(result.shape) <= lowering.emitter.limits.max_unrolled
         ):
             result = lowering.emitter.get_entries(result)
         return [result]

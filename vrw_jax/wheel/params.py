@@ -44,8 +44,10 @@ class ParameterDomain(NamedTuple):
         return f"{bracket}{self.lower:g}, {self.upper:g}){unit}"
 
 
-MIN_SI_VALUE, MAX_SI_VALUE = 1e-15, 1e9
-"""Bounds on the SI numbers of a wheel, chosen because products overflow beyond them."""
+MIN_SI_VALUE = 1e-15
+"""Least SI number of a positive parameter, chosen because products of smaller ones underflow."""
+MAX_SI_VALUE = 1e9
+"""Bound of the SI numbers of a wheel, chosen because products of larger ones overflow."""
 
 PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
     "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
@@ -185,15 +187,14 @@ class WheelParams(AbstractPrintable):
         )
         if leg_com is not None and locked_length is not None and not leg_com < locked_length:
             raise ValueError(
-                f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's "
-                f"mass sits "
-                "between foot and hub: give leg_com < locked_length."
+                f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's mass "
+                "is between foot and hub: give leg_com < locked_length."
             )
         shapes = {name: shape for name in PARAMETER_DOMAINS if (shape := getattr(self, name).shape)}
         if len({shape[0] for shape in shapes.values()}) > 1:
             raise ValueError(
-                f"the parameters have shapes {shapes}, but a batch has one wheel for each place of "
-                "its axis: give arrays of one length."
+                f"the parameters have shapes {shapes}, but a batch has one wheel for each entry "
+                "of its axis: give arrays of one length."
             )
 
     @property
@@ -360,8 +361,7 @@ def require_known_friction(value: Any) -> float:
     if convert_friction(value).ndim or isinstance(value, jax.core.Tracer):
         raise TypeError(
             f"friction is {format_value(value)}, but one known number is needed here: give a "
-            f"float; "
-            "several grounds, or a traced one, vrw.UnilateralWheel takes."
+            "float, or take vrw.UnilateralWheel, whose friction may be an array or traced."
         )
     return float(value)
 
@@ -372,11 +372,14 @@ def stack_parameters(params: WheelParams) -> Array:
 
 
 def wheel_from_parameters(
-    parameters: Array | tuple[Array, ...], n_legs: int, ahead: Elementwise | None = None
+    parameters: Array | tuple[Array, ...], n_legs: int, next_slope: Elementwise | None = None
 ) -> WheelParams:
-    """The inverse of `parameters_of`; on uneven ground with the slope of the line `ahead` of a
-    step, rad, beside its own."""
+    """Return the wheel with these float parameters, in the order of `PARAMETER_NAMES`.
+
+    - `next_slope`: on uneven ground the slope of the next line, rad, which joins the wheel's own
+      slope on a leading axis.
+    """
     wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
-    if ahead is None:
+    if next_slope is None:
         return wheel
-    return eqx.tree_at(lambda wheel: wheel.slope, wheel, jnp.stack([wheel.slope, ahead]))
+    return eqx.tree_at(lambda wheel: wheel.slope, wheel, jnp.stack([wheel.slope, next_slope]))

@@ -57,10 +57,10 @@ class AbstractPhase(abc.ABC):
     """A phase of the wheel `s`."""
 
     s: Symbols
-    constants: Vector  # what the phase holds constant: in double support the feet's distance, m
-    stop_at_lift_off: bool  # whether a ground that would have to pull ends it
+    constants: Vector  # constants of the phase: in double support the distance of the feet, m
+    stop_at_lift_off: bool  # whether the phase ends when the ground would have to pull
     turn: Vector = ()
-    """Sine and cosine of the angle by which the line ahead is steeper; empty on flat ground."""
+    """Sine and cosine of the angle by which the next line is steeper; empty on flat ground."""
 
     name: ClassVar[str]
     n_dof: ClassVar[int]
@@ -122,26 +122,27 @@ class AbstractPhase(abc.ABC):
         """Return the motion just after the phase's regular end."""
 
     def landing_height(self, motion: Motion) -> Elementwise:
-        """Height of the next leg's foot above the line on which it lands, m.
+        """Return the height of the next leg's foot above the line on which it lands, m.
 
-        That line begins at Leg 1's foot: in its frame the condition has the form of flat ground.
+        That line begins at the foot of Leg 1. In its frame the height has the form of flat ground.
         """
         return landing_foot_height(self.s, self._rotate(motion))
 
     def landing_rate(self, motion: Motion) -> Elementwise:
-        """The rate of `landing_height`, m/s."""
-        turned = self._rotate(motion)
-        lands = landing_direction(self.s, turned.sin, turned.cos)
-        across = self.s.L0 * lands.sin - turned.L1 * turned.sin
-        return turned.dL1 * turned.cos + across * turned.dtheta
+        """Return the rate of `landing_height`, m/s."""
+        rotated = self._rotate(motion)
+        landing_leg = landing_direction(self.s, rotated.sin, rotated.cos)
+        lever = self.s.L0 * landing_leg.sin - rotated.L1 * rotated.sin
+        return rotated.dL1 * rotated.cos + lever * rotated.dtheta
 
     def _rotate(self, motion: Motion) -> Motion:
-        """The motion in the frame of the line ahead."""
+        """Return the motion in the frame of the next line."""
         if not self.turn:
             return motion
-        sin, cos = self.turn
-        turned = motion.sin * cos - motion.cos * sin, motion.cos * cos + motion.sin * sin
-        return motion._replace(sin=turned[0], cos=turned[1])
+        turn_sin, turn_cos = self.turn
+        sin = motion.sin * turn_cos - motion.cos * turn_sin
+        cos = motion.cos * turn_cos + motion.sin * turn_sin
+        return motion._replace(sin=sin, cos=cos)
 
     def motion_at(self, q: Vector, v: Vector) -> Motion:
         """Return the full motion at the phase's own coordinates q and rates v."""
@@ -312,7 +313,9 @@ class SingleSupport1(AbstractPhase):
         return Acceleration(*own_acceleration)
 
     def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
-        return _residual(self.s, motion, Acceleration(*own_acceleration))
+        M, *forces = dynamics.equation_terms(self.s, motion)
+        inertial = M.multiply(Acceleration(*own_acceleration))
+        return tuple(n - f for n, f in zip(inertial, forces, strict=True))
 
     def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
         M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
@@ -351,9 +354,8 @@ class SingleSupport2(AbstractPhase):
 
     def dynamics_residual(self, motion: Motion, own_acceleration: Vector) -> Vector:
         M, f1, f2, _ = dynamics.equation_terms(self.s, motion)
-        return M.M11 * own_acceleration[0] - f1, M.M22 * own_acceleration[
-            1
-        ] - f2  # M12 is zero at L2 = L0
+        ddtheta, ddL1 = own_acceleration
+        return M.M11 * ddtheta - f1, M.M22 * ddL1 - f2  # M12 is zero at L2 = L0
 
     def solve_dynamics(self, motion: Motion, rows: Vector) -> Vector:
         M = dynamics.mass_matrix(self.s, motion.L1, motion.L2)
@@ -377,12 +379,6 @@ class SingleSupport2(AbstractPhase):
         return motion
 
 
-def _residual(s: Symbols, motion: Motion, acceleration: Acceleration) -> Vector:
-    """Return M q'' - f over (theta, L1, L2)."""
-    M, *forces = dynamics.equation_terms(s, motion)
-    return tuple(n - f for n, f in zip(M.multiply(acceleration), forces, strict=True))
-
-
 PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, SingleSupport2)
 """Phases of the paper's step, in order."""
 
@@ -390,8 +386,10 @@ PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, 
 def make_phases(
     s: Symbols, distance: Elementwise, stop_at_lift_off: bool, turn: Vector = ()
 ) -> tuple[AbstractPhase, ...]:
-    """The phases of a step that begins with the feet that far apart, m; `turn` of the line ahead,
-    see `AbstractPhase.turn`."""
+    """Return the phases of a step in which both feet are `distance` m apart at first.
+
+    - `turn`: see `AbstractPhase.turn`.
+    """
     phase_constants = ((distance,), (), ())
     return tuple(
         phase(s, constants, stop_at_lift_off, turn)

@@ -173,13 +173,13 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     )
 
 
-def stand_on_both(
+def start_on_both_feet(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, _dL1: Elementwise
 ) -> Landing:
-    """The motion after a landing that leaves both feet on the ground, by its rate `dtheta` just
-    after it, rad/s; impulses and losses, which need the motion before it, are zero.
+    """Return a landing that left both feet on the ground, from the rate `dtheta` just after it.
 
-    theta is the angle just before the landing, in the labels of the step that ends, as in `land`.
+    theta is the angle just before the landing, in the leg labels of the ending step, as in `land`.
+    Impulses and losses depend on the motion before the landing and are returned as zero.
     """
     before = motion_before_landing(s, theta, dtheta, 0.0 * dtheta)
     sin, cos = landing_direction(s, before.sin, before.cos)
@@ -187,14 +187,14 @@ def stand_on_both(
     circle = double_support_circle(s, distance, sin, cos)
     rates = dtheta, circle.G1 * dtheta, circle.G2 * dtheta
     zero = 0.0 * (theta + dtheta)
-    none = FootForce(zero, zero)
+    no_impulse = FootForce(zero, zero)
     return Landing(
         theta=theta - s.alpha,
         motion=Motion(sin, cos, s.L0 + zero, before.L1, *rates),
         distance=distance,
         keeps_rear_foot=zero == 0.0,
-        fore_impulse=none,
-        rear_impulse=none,
+        fore_impulse=no_impulse,
+        rear_impulse=no_impulse,
         energy_lost=zero,
         hub_jump=(zero, zero),
     )
