@@ -225,7 +225,7 @@ def test_results_are_new_arrays_and_arguments_are_not_modified(engine):
 
 def test_invalid_arguments_of_a_batch_are_refused_in_one_sentence():
     params = vrw.WheelParams()
-    with pytest.raises(ValueError, match=r"shape \(lanes, 3\)"):
+    with pytest.raises(ValueError, match=r"shape \(elements, 3\)"):
         vrw.step_batch(params, TABLE_1_SECTION_STATE)
     with pytest.raises(ValueError, match="at least 1"):
         vrw.step_batch(params, TABLE_1_SECTION_STATE[None], 0)

@@ -13,7 +13,7 @@ from vrw_jax.runtime import cached_lane_program
 
 STRAGGLER_DIVISOR = 8
 """Inverse share of running lanes below which a block by XLA stops; the rest is run again together.
-It is chosen because the last lanes of a block take as many iterations as all others."""
+It is chosen because a block with fewer running lanes wastes most of its work."""
 
 _program_cache: dict[Any, Callable] = {}
 """Compiled steps by everything that they depend on, see `run_compiled`."""

@@ -209,16 +209,6 @@ class _PassState(NamedTuple):
     v_tangents: LaneArray
 
 
-def _append_duration_tangent(pass_state: _PassState) -> _PassState:
-    """Append one zero tangent for the duration of the phase that begins."""
-    append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-    return pass_state._replace(
-        held_tangents=append_zero(pass_state.held_tangents),
-        q_tangents=append_zero(pass_state.q_tangents),
-        v_tangents=append_zero(pass_state.v_tangents),
-    )
-
-
 class _MeshInterval(NamedTuple):
     """One mesh interval of a phase."""
 
@@ -238,10 +228,8 @@ def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Ar
     v, q_tangents, v_tangents = pass_state.v, pass_state.q_tangents, pass_state.v_tangents
     c = GAUSS_NODES.astype(h.dtype)[:, None, None]
     duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)
-    rate_increments, position_increments = (
-        apply_matrix(INTEGRATION_MATRIX, a),
-        apply_matrix(DOUBLE_INTEGRATION_MATRIX, a),
-    )
+    rate_increments = apply_matrix(INTEGRATION_MATRIX, a)
+    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, a)
     Q = pass_state.q + h * (c * v + h * position_increments)
     V = v + h * rate_increments
     node_q_tangents = (
@@ -260,14 +248,11 @@ def _evaluate_end(
     fraction, h, a = interval
     _, q, v, _, q_tangents, v_tangents = pass_state
     duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
-    rate_increment, position_increment = (
-        weighted_sum(END_WEIGHTS, a),
-        weighted_sum(DOUBLE_END_WEIGHTS, a),
-    )
+    rate_increment = weighted_sum(END_WEIGHTS, a)
+    position_increment = weighted_sum(DOUBLE_END_WEIGHTS, a)
     rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
-    position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents).swapaxes(
-        0, 1
-    )
+    position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents)
+    position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
     q_tangents = (
         q_tangents
         + h * v_tangents
@@ -299,10 +284,8 @@ def _linearize_residual(
 
     def evaluate_residual(*arguments: Array) -> Vector:
         q, v, a = (arguments[i * dim : (i + 1) * dim] for i in range(3))
-        held_constants, parameters = (
-            arguments[3 * dim :][:n_held_constants],
-            arguments[3 * dim :][n_held_constants:],
-        )
+        held_constants = arguments[3 * dim :][:n_held_constants]
+        parameters = arguments[3 * dim :][n_held_constants:]
         constants = (
             context.constants_of(*parameters) if context.parameter_indices else context.constants
         )
@@ -374,10 +357,17 @@ def _linearize_phase(
     duration: LaneArray,
     accelerations: LaneArray,
 ) -> tuple[_PassState, LaneArray]:
-    """Propagate the state through all intervals of a phase.
+    """Return the state at the end of a phase, with one more tangent, and the tangents of its
+    accelerations.
 
-    Return the state at its end and the tangents of its accelerations.
+    The last tangent is that with respect to the duration of the phase.
     """
+    append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    pass_state = pass_state._replace(
+        held_tangents=append_zero(pass_state.held_tangents),
+        q_tangents=append_zero(pass_state.q_tangents),
+        v_tangents=append_zero(pass_state.v_tangents),
+    )
 
     def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:
         a, fraction = inputs
@@ -389,28 +379,24 @@ def _linearize_phase(
             _evaluate_nodes(start_state, interval)
         )
         linearization = _linearize_residual(context, phase, start_state, Q, V, a)
-        state_tangents = jnp.concatenate(
-            [node_q_tangents, node_v_tangents], 2
-        )  # (tangent, node, argument, batch)
+        # Axes: (tangent, node, argument, batch).
+        state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
         node_system = context.hold(
             _assemble_node_system(context, start_state, interval.h, linearization, state_tangents)
         )
-        acceleration_tangents = context.hold(
-            solve_node_equations(*node_system, context.parameters)
-        )  # (node, row, tangent, batch)
+        # Axes: (node, row, tangent, batch).
+        acceleration_tangents = context.hold(solve_node_equations(*node_system, context.parameters))
         end_state = _evaluate_end(start_state, interval, acceleration_tangents)
-        return tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS), jnp.moveaxis(
-            acceleration_tangents, 2, 0
-        )
+        next_state = tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS)
+        return next_state, jnp.moveaxis(acceleration_tangents, 2, 0)
 
     start_state = tuple(getattr(pass_state, name) for name in INTERVAL_STATE_FIELDS)
     fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
     end_state, acceleration_tangents = lax.scan(
         linearize_interval, start_state, (accelerations, fractions)
     )
-    return pass_state._replace(
-        **dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
-    ), acceleration_tangents
+    end_fields = dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
+    return pass_state._replace(**end_fields), acceleration_tangents
 
 
 INTERVAL_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
@@ -426,19 +412,16 @@ def _eliminate_duration(
 ) -> tuple[_PassState, LaneArray, Callable[[Array], Array]]:
     """Eliminate the duration of a phase by its event, and apply the reset.
 
-    Return the state of the next phase, the tangents of the duration, and the function that
-    eliminates the duration's tangent from other tangents. A phase that is not active has duration
-    zero.
+    Returns the state of the next phase, the tangents of the duration, and the function that
+    eliminates the duration's tangent from other tangents. An inactive phase has duration zero.
     """
 
     def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
         point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
         return phase.event(constants, point), _stack_point(phase.reset(constants, point), q)
 
-    point, point_tangents = (
-        (pass_state.held_constants, pass_state.q, pass_state.v),
-        (pass_state.held_tangents, pass_state.q_tangents, pass_state.v_tangents),
-    )
+    point = pass_state.held_constants, pass_state.q, pass_state.v
+    point_tangents = pass_state.held_tangents, pass_state.q_tangents, pass_state.v_tangents
     (event_value, next_point), (event_tangents, next_point_tangents) = context.value_and_tangents(
         evaluate_end, point, point_tangents
     )
@@ -482,17 +465,10 @@ def _linearize_step(
     duration_tangents, acceleration_tangents = [], []
     for i, phase in enumerate(sequence.phases):
         pass_state, phase_acceleration_tangents = _linearize_phase(
-            context,
-            phase,
-            meshes[i],
-            _append_duration_tangent(pass_state),
-            durations[i],
-            accelerations[i],
+            context, phase, meshes[i], pass_state, durations[i], accelerations[i]
         )
-        end_state, end_tangents = (
-            jnp.concatenate(x, -2)
-            for x in ((pass_state.q, pass_state.v), (pass_state.q_tangents, pass_state.v_tangents))
-        )
+        end_state = jnp.concatenate((pass_state.q, pass_state.v), -2)
+        end_tangents = jnp.concatenate((pass_state.q_tangents, pass_state.v_tangents), -2)
         pass_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
             context, phase, pass_state, durations[i], phase_active[i]
         )
@@ -599,10 +575,10 @@ def reconstruct_step(
     durations: Array,
     accelerations: tuple[Array, ...],
 ) -> tuple[Vector, tuple[PhasePassage, ...]]:
-    """Reconstruct one gait step from known durations and accelerations.
+    """Return the section state after a gait step of known durations and accelerations, and the
+    passages of its phases.
 
-    Return the section state after the step and the passages of its phases. No equation is solved;
-    any trailing axes are allowed.
+    No equation is solved. Any trailing axes are allowed.
     """
     point = sequence.start(constants, section_state)
     passages = []
@@ -626,16 +602,22 @@ def reconstruct_step(
 
 
 def estimate_mesh_error(
-    sequence: PhaseSequence, meshes: tuple[PhaseMesh, ...], solution: CollocationSolution
+    sequence: PhaseSequence,
+    meshes: tuple[PhaseMesh, ...],
+    solution: CollocationSolution,
+    error_per_jump: float = 0.05,
 ) -> LaneArray:
     """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
     period.
 
-    Each interval's accelerations are a separate polynomial, and at an interval boundary both differ
-    by what neither resolves. That jump times the longer interval squared is a displacement. Times
-    ERROR_PER_JUMP it bounds the error, except for some round-off, and is far above it in most
-    cases. This was found for 346 random gaits with periods to 10 s, on two meshes. Phases with
-    `is_smooth` False do not count, because their error in one interval hardly reaches the next.
+    The accelerations of each interval are a separate polynomial. At an interval boundary the two
+    polynomials differ by their errors. That jump times the longer interval squared is a
+    displacement, which is multiplied by `error_per_jump`. Phases with `is_smooth` False do not
+    count, because their error in one interval hardly affects the next.
+
+    - `error_per_jump`: chosen because the estimate then bounds the error except for round-off. It
+      was tested with 346 random gaits of periods to 10 s on two meshes; for most of them the
+      estimate is far above the error.
     """
     max_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
     for i, mesh in enumerate(meshes):
@@ -657,8 +639,4 @@ def estimate_mesh_error(
         )
         jump = jnp.abs(left_limits - right_limits) * length * length
         max_jump = jnp.maximum(max_jump, jnp.max(jump, axis=(0, 1, 2)))
-    return ERROR_PER_JUMP * max_jump
-
-
-ERROR_PER_JUMP = 0.05
-"""Ratio of the estimated error to the displacement of a jump at an interval boundary."""
+    return error_per_jump * max_jump

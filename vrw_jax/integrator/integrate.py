@@ -106,7 +106,7 @@ class IntegrationStatus(IntEnum):
 
 STRAGGLER_FACTOR = 2
 """Ratio of the iterations after which stragglers are cut off to the iterations after which half of
-the batch had finished. It is chosen because fewer iterations would cut off regular elements."""
+the batch had finished. It is chosen because a ratio near 1 would cut off regular elements."""
 
 
 BatchPhaseFn = Callable[[Any, Vector], BatchPhase]

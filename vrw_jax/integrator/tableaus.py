@@ -189,7 +189,9 @@ def earliest_dip_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -
 
 @dataclass(frozen=True)
 class StepSizeController:
-    """Parameters of the step-size controller, chosen because they are those of diffrax."""
+    """Parameters of the step-size controller, chosen because they are usual for explicit methods
+    (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, Section II.4).
+    """
 
     safety_factor: float = 0.9
     """Factor on the length that would meet the tolerance exactly."""

@@ -14,7 +14,7 @@ CONTACT_XLA_BATCH_SIZE = 2048
 UNEVEN_GROUND_BATCH_SIZES = (16, 256)
 """Walks with unilateral contact on uneven ground by the diffrax engine."""
 ATTRACTOR_BATCH_SIZE = 128
-"""Walks towards attractors, chosen because stragglers of a small batch cost little."""
+"""Walks toward attractors; stragglers are gathered in new batches after each round."""
 GAIT_BATCH_SIZES = (8, 64, 512, 4096)
 """Limit cycles of the paper's wheel, which one Newton iteration computes for all elements."""
 CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)

@@ -11,8 +11,8 @@ import numpy as np
 from vrw_jax.numerics.types import Elementwise
 
 MAX_EXACT_ANGLE = 1.6
-"""Angle up to which the polynomials are accurate to round-off, rad, chosen because gait angles are
-below it."""
+"""Angle up to which the polynomials are accurate to round-off, rad, chosen because it exceeds pi/2,
+the limit of the angle of a valid start."""
 
 
 def _economize_series(offset: int) -> tuple[float, ...]:

@@ -37,8 +37,7 @@ number of lanes."""
 class RegisterLimits:
     """Sizes up to which arrays are divided into entries in registers.
 
-    Larger sizes give faster code that takes longer to compile. The defaults are chosen because the
-    programs of this library then compile in seconds and run within a few percent of the fastest.
+    Larger sizes give longer code, which takes longer to compile.
     """
 
     max_unrolled: int = 8

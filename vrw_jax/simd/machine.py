@@ -10,8 +10,7 @@ from typing import Any
 import llvmlite.binding as llvm
 
 OPTIMIZATION_LEVEL = 2
-"""LLVM's level for register allocation and instruction scheduling, chosen because level 3 gives no
-faster code here."""
+"""LLVM's optimization level for register allocation and instruction scheduling."""
 LLVM_PASSES = (
     "global_dead_code_eliminate",
     "instruction_combine",

@@ -86,11 +86,15 @@ def basin(
         >>> basins.attractor.values.tolist()
         [0, 0]
     """
-    model, options = _validate_arguments(params, model, options)
+    check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
+    check_single_wheel(params, "compute one basin after the other")
+    model = check_model(model).fallback_model  # valid for any start
+    options = check_options(options)
+    options.check_tolerances(np.dtype(params.damping.dtype))
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
-    values = _parse_grid_values(grid)
+    values = _parse_grid(grid)
     names = tuple(values)
     axes = [name for name in names if np.ndim(grid[name]) > 0]
     shape = tuple(len(values[name]) for name in axes)
@@ -117,7 +121,14 @@ def basin(
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    labels = {name: _make_coordinate(name, values[name], name in axes) for name in names}
+    labels = {
+        name: xr.Variable(
+            (name,) if name in axes else (),
+            values[name] if name in axes else values[name][0],
+            dict(MEASURES[name].attrs),
+        )
+        for name in names
+    }
     orbits = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
     attrs = {
         "title": "Basins of attraction",
@@ -127,57 +138,36 @@ def basin(
     return xr.Dataset(data | orbits, labels, attrs | provenance(params, model, options))
 
 
-def _make_coordinate(name: str, values: np.ndarray, is_axis: bool) -> xr.Variable:
-    """Return the coordinate of a component of the starts."""
-    dims, coordinate_values = (name, values) if is_axis else ((), values[0])
-    return xr.Variable(dims, coordinate_values, dict(MEASURES[name].attrs))
+def _parse_grid(grid: StartGrid) -> dict[str, np.ndarray]:
+    """Return the values of each component as an array of one axis.
 
-
-def _validate_arguments(
-    params: WheelParams, model: ModelLike | None, options: StepOptions | None
-) -> tuple[AbstractWheel, StepOptions]:
-    """Return model and options with their defaults; raise if an argument is invalid."""
-    check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
-    check_single_wheel(params, "ask for one basin after the other")
-    checked_model, options = (
-        check_model(model).fallback_model,
-        check_options(options),
-    )  # valid for any start
-    options.check_tolerances(np.dtype(params.damping.dtype))
-    return checked_model, options
-
-
-def _parse_grid_values(grid: StartGrid) -> dict[str, np.ndarray]:
-    """Return the values of each component as an array of one axis; raise for other shapes."""
-    values = {
-        name: np.asarray(check_reals(name, grid[name]), float) for name in _find_grid_names(grid)
-    }
-    for name, value in values.items():
-        if value.ndim > 1 or not value.size:
-            raise ValueError(
-                f"{name} has shape {value.shape}, but it is a number, or a list of at least one: "
-                "give one axis of values."
-            )
-    return {name: np.atleast_1d(value) for name, value in values.items()}
-
-
-def _find_grid_names(grid: StartGrid) -> tuple[str, ...]:
-    """Return the names of the components; raise unless the grid names all of one kind."""
+    Raises a ValueError unless the grid contains all components of one kind, each a number or an
+    axis of numbers.
+    """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
     for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
         if set(grid) == set(names):
-            return names
-    raise ValueError(
-        f"the grid names {', '.join(grid) or 'nothing'}, but it must name all of "
-        f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
-        f"each a number or an axis."
-    )
+            break
+    else:
+        raise ValueError(
+            f"the grid contains {', '.join(grid) or 'nothing'}, but it must contain all of "
+            f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
+            "each a number or an axis."
+        )
+    values = {name: np.asarray(check_reals(name, grid[name]), float) for name in names}
+    for name, value in values.items():
+        if value.ndim > 1 or not value.size:
+            raise ValueError(
+                f"{name} has shape {value.shape}, but it must be a number, or a list of at least "
+                "one: give one axis of values."
+            )
+    return {name: np.atleast_1d(value) for name, value in values.items()}
 
 
 def _invert_landing(params: WheelParams, points: np.ndarray) -> np.ndarray:
     """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN.
 
-    The angular rate after the landing is proportional to that before the landing.
+    With dL1- = 0 the angular rate after the landing is proportional to that before it.
     """
     s = params.symbols()
 

@@ -73,10 +73,9 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
         )
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
         raise ValueError(
-            f"friction has shape {shape}, but this is about one ground: give one number, or vary "
-            "it in a design of vrw.scan; vrw.step_batch takes one for each lane, vrw.walk one "
-            "for each "
-            "of its steps."
+            f"friction has shape {shape}, but this call is for one ground: give one number, or "
+            "vary it in a design of vrw.scan; vrw.step_batch takes one for each element, vrw.walk "
+            "one for each of its steps."
         )
     return model
 
@@ -87,7 +86,7 @@ _make_default_model = functools.cache(ViscoelasticWheel)
 def check_single_wheel(params: Any, remedy: str) -> None:
     """Raise unless `params` is a single wheel; `remedy` completes the message."""
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_single(params, remedy)  # binding it takes as long as a step
+    WheelParams.require_single(params, remedy)  # to bind the method takes as long as a step
 
 
 def check_options(options: StepOptions | None) -> StepOptions:
@@ -96,7 +95,7 @@ def check_options(options: StepOptions | None) -> StepOptions:
         check_type(
             "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
         )
-        StepOptions.require_scalars(options)  # a bound method takes equinox 0.1 ms to make
+        StepOptions.require_scalars(options)  # to bind the method takes 0.1 ms
     return _make_default_options(jnp.result_type(float)) if options is None else options
 
 
@@ -222,7 +221,7 @@ def step(
     model, params, ground = read_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
     if ground is not None:
-        model, params = model.with_ground(params, _take_first(ground, state.dtype))
+        model, params = model.with_ground(params, _first_ground(ground, state.dtype))
     return model.take_step(params, state, options)
 
 
@@ -262,7 +261,7 @@ def return_map(
     model, params, ground = read_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
     if ground is not None:
-        model, params = model.with_ground(params, _take_first(ground, state.dtype))
+        model, params = model.with_ground(params, _first_ground(ground, state.dtype))
     return model.advance(params, state, options).section_state
 
 
@@ -356,13 +355,13 @@ def walk(
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome.
 
-    On uneven ground `params.slope` is an array over steps: straight lines of these slopes join the
-    footholds. Both feet of step k's double support are on line k, which ends at the foothold on
-    which the step begins; the step ends when the next foot meets line k + 1. So n steps use n + 1
-    slopes; of n given ones the last is used twice. A section state is in the frame of the line that
-    ends at its landing: the start in that of line 0. Forces are along and normal to line k. With
-    unilateral contact the model's friction may be such an array too: each foot keeps the friction
-    of its own landing.
+    On uneven ground `params.slope` is an array over steps. The ground then consists of straight
+    lines of these slopes, which join the footholds. In the double support of step k both feet are
+    on line k. The step begins at the foothold where this line ends, and it ends when the next foot
+    meets line k + 1. Therefore n steps use n + 1 slopes; of n given slopes the last is used twice.
+    A section state is in the frame of the line that ends at its landing; that of the start is line
+    0. Forces are along and normal to line k. With unilateral contact the friction of the model may
+    be such an array too. Each foot then keeps the friction of its own landing.
 
     Args:
         params: the wheel.
@@ -397,27 +396,35 @@ def walk(
 def read_ground(
     params: Any, model: ModelLike | None, n_steps: int
 ) -> tuple[AbstractWheel, Any, StepGround | None]:
-    """Rung, wheel and the ground of each step: None if flat, else both stand where it begins."""
-    rung = check_model(model, allows_arrays=True)
-    over_steps = rung.split_ground(params, n_steps) if isinstance(params, WheelParams) else None
-    if over_steps is None:
-        return rung, params, None
-    rung, _ = rung.with_ground(params, tuple(row[0] for row in over_steps))
-    first = jnp.reshape(params.slope, -1)[0]
-    return rung, eqx.tree_at(lambda wheel: wheel.slope, params, first), over_steps
+    """Return model and wheel on the ground of the first step, and the ground of each step.
+
+    On flat ground, the last result is None and model and wheel are unchanged.
+    """
+    checked_model = check_model(model, allows_arrays=True)
+    if not isinstance(params, WheelParams):
+        return checked_model, params, None
+    ground_per_step = checked_model.split_ground(params, n_steps)
+    if ground_per_step is None:
+        return checked_model, params, None
+    first_model, _ = checked_model.with_ground(params, tuple(row[0] for row in ground_per_step))
+    first_slope = jnp.reshape(params.slope, -1)[0]
+    first_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_slope)
+    return first_model, first_wheel, ground_per_step
 
 
-def _take_first(over_steps: StepGround, dtype: Any) -> StepGround:
-    return tuple(row[0].astype(dtype) for row in over_steps)
+def _first_ground(ground_per_step: StepGround, dtype: Any) -> StepGround:
+    """Return the ground of the first step."""
+    return tuple(row[0].astype(dtype) for row in ground_per_step)
 
 
-N_APPROACH_STEPS = 100
-"""Number of steps toward a gait, for a search that needs a state near the gait."""
+def walk_toward_gait(
+    model: AbstractWheel, params: WheelParams, options: StepOptions, n_steps: int = 100
+) -> Walk:
+    """Return a walk toward an attracting gait from the default start of the model.
 
-
-def walk_toward_gait(model: AbstractWheel, params: WheelParams, options: StepOptions) -> Walk:
-    """Return a walk toward an attracting gait from the default start of the model."""
-    return walk(params, model.default_start(params), N_APPROACH_STEPS, model=model, options=options)
+    - `n_steps`: number of steps; the search that follows needs only a state near the gait.
+    """
+    return walk(params, model.default_start(params), n_steps, model=model, options=options)
 
 
 def choose_model(

@@ -1,7 +1,7 @@
 """A walk as a labelled trajectory: motion, forces, energy and points, with units and provenance.
 
-Frame: x downhill along the slope, z normal to it, with the first foot at the origin. Angles and leg
-labels refer to the present step, so theta and the lengths jump at a landing.
+In the frame, x points downhill along the slope, z is normal to it, and the origin is the first
+foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a landing.
 """
 
 from __future__ import annotations
@@ -62,9 +62,10 @@ def simulate(
 ) -> xr.Dataset:
     """Return a walk from the section state `x` as a labelled trajectory over time.
 
-    Without `x` the walk begins at the rung's own start, near the gait of Table 1. Uneven ground is
-    given as in `vrw.walk`: places are then in the frame of line 0; angles and forces are those of
-    the line that the step stands on, whose slopes are the attribute `slopes`.
+    Without `x` the walk begins at the default start of the model, near the gait of Table 1. Uneven
+    ground is given as in `vrw.walk`. Positions are then in the frame of line 0. Angles and forces
+    of a step are in the frame of the line under both feet of its double support. The attribute
+    `slopes` holds the slopes of the lines.
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
@@ -95,18 +96,20 @@ def simulate(
     """
     check_not_traced("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
-    given = params
-    rung, params, ground = read_ground(params, model, n_steps)
+    params_with_lines = params
+    checked_model, params, ground_per_step = read_ground(params, model, n_steps)
     check_single_wheel(params, "simulate one at a time")
-    start = rung.default_start(params) if x is None else x
-    params, x, model, options = validate_arguments(params, start, rung, options, engine)
+    start = checked_model.default_start(params) if x is None else x
+    params, x, model, options = validate_arguments(params, start, checked_model, options, engine)
     make_spec = make_contact_spec if model.reports_contacts else make_phase_spec
     s, wheels, lines = jax.tree.map(float, params).symbols(), [(model, params)], None
-    if ground is not None:
-        rows = zip(*(row.astype(x.dtype) for row in ground), strict=True)
+    if ground_per_step is not None:
+        rows = zip(*(row.astype(x.dtype) for row in ground_per_step), strict=True)
         wheels = [model.with_ground(params, row) for row in rows]
-        slopes = given.slope if given.slope.ndim else jnp.full(n_steps, given.slope)
-        lines = Lines(np.asarray(complete_slopes(slopes, n_steps), float), float(s.Mt * s.g))
+        slopes = params_with_lines.slope
+        slopes = slopes if slopes.ndim else jnp.full(n_steps, slopes)
+        slopes = complete_slopes(slopes, n_steps)
+        lines = GroundLines(np.asarray(slopes, float), float(s.Mt * s.g))
     spec = make_spec(wheels, options, n_samples)
     sampled_walk = sample_walk(spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), lines)
     columns = sampled_walk.columns
@@ -122,7 +125,7 @@ def simulate(
     }
     provenance_attrs = spec.attrs | provenance(params, model, options)
     if lines is not None:
-        provenance_attrs |= {"frame": FRAME_ON_LINES, "slopes": lines.slopes.tolist()}
+        provenance_attrs |= {"frame": UNEVEN_GROUND_FRAME, "slopes": lines.slopes.tolist()}
         del provenance_attrs["parameter_slope"]
     coordinates = {name: data.pop(name) for name in ("step", "phase") if name in data}
     return xr.Dataset(data, spec.coordinates | coordinates, attrs | provenance_attrs)
@@ -136,17 +139,17 @@ class SampledStep(NamedTuple):
     outcome: Outcome
     next_section_state: Array  # section state at the end of the step
     period: float  # s
-    step_length: float  # from this step's landing to the next, along the line that it stands on, m
-    rise: float  # and normal to it: 0 on flat ground
+    step_length: float  # from this landing to the next, along the line of double support, m
+    rise: float  # the same normal to that line, m; 0 on flat ground
 
 
 class TrajectorySpec(NamedTuple):
     """Specification of a trajectory: how a model samples a step, and the variables."""
 
-    sample_step: Callable[[Array, int], SampledStep]  # of a step from a section state
-    variable_names: tuple[str, ...]  # measures that are told over time
-    slope_position_names: tuple[str, ...]  # of these, places along the slope
-    coordinates: dict[str, Any]  # coordinates beside those among the names
+    sample_step: Callable[[Array, int], SampledStep]  # from a section state and the step's number
+    variable_names: tuple[str, ...]  # measures over time
+    slope_position_names: tuple[str, ...]  # those that are positions along the slope
+    coordinates: dict[str, Any]  # coordinates that are not among the names
     attrs: dict[str, object]
 
 
@@ -162,34 +165,42 @@ HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
 """Energies that are measured relative to the height of the first foot of the walk."""
 
 
-FRAME_ON_LINES = (
-    "places: x downhill along line 0, z normal to it, first foot at the origin; angles and forces: "
-    "along and normal to the line under both feet of the step's double support"
+UNEVEN_GROUND_FRAME = (
+    "positions: x downhill along line 0, z normal to it, first foot at the origin; angles and "
+    "forces: along and normal to the line under both feet of the step's double support"
 )
+"""Attribute `frame` of a trajectory on uneven ground."""
 
 
-class Lines(NamedTuple):
-    """Uneven ground: slopes of its lines, rad, and the wheel's weight, N."""
+class GroundLines(NamedTuple):
+    """The lines of uneven ground, with the weight of the wheel."""
 
-    slopes: np.ndarray
-    weight: float
+    slopes: np.ndarray  # rad
+    weight: float  # N
 
-    def place(
-        self, part: dict[str, np.ndarray], along: Sequence[str], k: int, place: np.ndarray
+    def to_walk_frame(
+        self,
+        columns: dict[str, np.ndarray],
+        position_names: Sequence[str],
+        k: int,
+        foothold: np.ndarray,
     ) -> None:
-        """Step k's places in the frame of line 0 and its energies from the walk's first foot, where
-        its own first foot is at `place`."""
-        for name in along:
-            normal = f"{name[:-1]}z"
-            x, z = self.rotate(k, part[name], part[normal])
-            part[name], part[normal] = x + place[0], z + place[1]
-        first = self.slopes[0]
-        height = place[1] * np.cos(first) - place[0] * np.sin(first)
-        for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            part[name] = part[name] + self.weight * height
+        """Convert positions and energies of step k, in place, from its own frame to that of line 0.
+
+        - `position_names`: columns that are positions along the slope;
+        - `foothold`: position of the first foot of step k in the frame of line 0, m.
+        """
+        for name in position_names:
+            normal_name = f"{name[:-1]}z"
+            x, z = self.rotate(k, columns[name], columns[normal_name])
+            columns[name], columns[normal_name] = x + foothold[0], z + foothold[1]
+        slope = self.slopes[0]
+        height = foothold[1] * np.cos(slope) - foothold[0] * np.sin(slope)
+        for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            columns[name] = columns[name] + self.weight * height
 
     def rotate(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
-        """A vector of the frame of line k in that of line 0."""
+        """Return the components in the frame of line 0 of a vector in the frame of line k."""
         angle = self.slopes[k] - self.slopes[0]
         sin, cos = np.sin(angle), np.cos(angle)
         return x * cos + z * sin, z * cos - x * sin
@@ -200,12 +211,13 @@ def sample_walk(
     x: Array,
     n_steps: int,
     downslope_weight: float,
-    lines: Lines | None = None,
+    lines: GroundLines | None = None,
 ) -> SampledWalk:
-    """Steps from the section state x, as many as it can.
+    """Return the samples of a walk from the section state x, which ends at the first failure.
 
-    Places along the slope, m, count from the first landing; energies that are `FALLING`, J, lose
-    `weight_along`, N, times the way. On uneven ground see `Lines.place`.
+    Positions along the slope, m, are measured from the first landing. Energies of
+    `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight`, N, times the traveled distance. On
+    uneven ground `GroundLines.to_walk_frame` replaces both.
     """
     parts: list[dict[str, np.ndarray]] = []
     outcome, n_stepped, time, position = Outcome.STEPPED, 0, 0.0, 0.0
@@ -213,9 +225,8 @@ def sample_walk(
     while outcome == Outcome.STEPPED and n_stepped < n_steps:
         sampled_step = spec.sample_step(x, n_stepped)
         has_occurred, part = sampled_step.durations > 0.0, dict[str, np.ndarray]()
-        selection = (
-            slice(None) if has_occurred.all() else has_occurred
-        )  # a full slice copies nothing
+        # A full slice copies nothing.
+        selection = slice(None) if has_occurred.all() else has_occurred
         for name, values in sampled_step.columns.items():
             part[name] = values[selection].reshape(-1, *values.shape[2:])
         if lines is None:
@@ -224,20 +235,17 @@ def sample_walk(
             for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
                 part[name] = part[name] - downslope_weight * position
         else:
-            lines.place(part, spec.slope_position_names, n_stepped, foothold)
-            foothold = foothold + lines.rotate(
-                n_stepped, sampled_step.step_length, sampled_step.rise
-            )
+            lines.to_walk_frame(part, spec.slope_position_names, n_stepped, foothold)
+            displacement = lines.rotate(n_stepped, sampled_step.step_length, sampled_step.rise)
+            foothold = foothold + displacement
         part["time"] = part["time"] + time
         part["step"] = np.full(len(part["time"]), n_stepped)
         parts.append(part)
         outcome = sampled_step.outcome
         if outcome == Outcome.STEPPED:
-            n_stepped, time, position = (
-                n_stepped + 1,
-                time + sampled_step.period,
-                position + sampled_step.step_length,
-            )
+            n_stepped += 1
+            time += sampled_step.period
+            position += sampled_step.step_length
             x = sampled_step.next_section_state
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return SampledWalk(columns, n_stepped, outcome)
@@ -257,10 +265,10 @@ def _compile_trace(
 
 
 def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample), from Leg 1's
-    foot.
+    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
 
-    `ahead` and `above` are added: where the landing leg's foot is, m.
+    Positions are relative to the foot of Leg 1. The columns `landing_foot_x` and `landing_foot_z`
+    are added: the position of the foot of the leg that lands next, m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
     kinetic, gravitational, elastic = np.moveaxis(np.asarray(trajectory.energy), -1, 0)
@@ -268,7 +276,7 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     rear_leg = rear_direction(s, motion.sin, motion.cos)
     hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
-    lands = landing_direction(s, motion.sin, motion.cos)
+    landing_leg = landing_direction(s, motion.sin, motion.cos)
     return {
         "time": np.array(trajectory.time),
         "x": zero,
@@ -293,36 +301,44 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
         "foot_2_z": hub_z - L2 * rear_leg.cos,
         "hub_x": hub_x,
         "hub_z": hub_z,
-        "ahead": hub_x - s.L0 * lands.sin,
-        "above": hub_z - s.L0 * lands.cos,
+        "landing_foot_x": hub_x - s.L0 * landing_leg.sin,
+        "landing_foot_z": hub_z - s.L0 * landing_leg.cos,
     }
 
 
-Wheels = list[tuple[Any, WheelParams]]
-"""Rung and wheel of all steps, or of each."""
+StepWheels = list[tuple[Any, WheelParams]]
+"""Model and wheel of each step, or one pair for all steps."""
 
 
-def make_phase_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
-    """Of rungs that step through the paper's phases."""
+def make_phase_spec(wheels: StepWheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
+    """Return the specification of a model whose steps have the paper's phases."""
 
-    def prepared(model: AbstractWheel, params: WheelParams) -> tuple:
+    def prepare_step(model: AbstractWheel, params: WheelParams) -> tuple:
         leaves, structure = jax.tree.flatten((params, options))
         s = jax.tree.map(float, split_slopes(params)[0]).symbols()
         return s, _compile_trace(model, structure, n_samples), leaves
 
-    of_steps = [prepared(*wheel) for wheel in wheels]
+    prepared_steps = [prepare_step(*wheel) for wheel in wheels]
 
     def sample_step(x: Array, k: int) -> SampledStep:
-        s, trace, leaves = of_steps[k if len(of_steps) > 1 else 0]
+        s, trace, leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
         trajectory = trace(x, *leaves)
         columns, durations = _make_columns(s, trajectory), np.asarray(trajectory.durations)
-        landing_position, above = columns.pop("ahead"), columns.pop("above")
+        landing_foot = columns.pop("landing_foot_x"), columns.pop("landing_foot_z")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
         phases_occurred = np.flatnonzero(durations > 0.0)
-        place = (landing_position, above) if phases_occurred.size else ()
-        way = tuple(float(x[phases_occurred[-1], -1]) for x in place) or (0.0, 0.0)
-        outcome, period = Outcome(int(trajectory.outcome)), float(durations.sum())
-        return SampledStep(columns, durations, outcome, trajectory.section_state, period, *way)
+        step_length, rise = 0.0, 0.0
+        if phases_occurred.size:
+            step_length, rise = (float(x[phases_occurred[-1], -1]) for x in landing_foot)
+        return SampledStep(
+            columns,
+            durations,
+            Outcome(int(trajectory.outcome)),
+            trajectory.section_state,
+            float(durations.sum()),
+            step_length,
+            rise,
+        )
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
@@ -369,8 +385,8 @@ def _make_contact_columns(
     return trace, columns | {"tangential": trace.tangential, "normal": trace.normal}
 
 
-def make_contact_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
-    """Of rungs that walk on contacts, over time and leg; legs bear the labels of their step.
+def make_contact_spec(wheels: StepWheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
+    """Return the specification of a model with unilateral contact, over time and leg.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
     including both ends. For a `LadderWheel`, `rung` and `reason` give the model used at each time
@@ -392,8 +408,10 @@ def make_contact_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> T
             name: np.full(shape, int(value)) for name, value in trace.model_selection.items()
         }
         columns["on_stopper"] = repeat_over_samples(trace.locked)
-        happened = np.flatnonzero(trace.duration > 0.0)
-        foremost = columns["foot_z"][happened[-1], -1, -1] if happened.size else 0.0
+        intervals_occurred = np.flatnonzero(trace.duration > 0.0)
+        rise = 0.0
+        if intervals_occurred.size:  # height of the foremost foot, which has landed
+            rise = float(columns["foot_z"][intervals_occurred[-1], -1, -1])
         return SampledStep(
             columns,
             trace.duration,
@@ -401,7 +419,7 @@ def make_contact_spec(wheels: Wheels, options: StepOptions, n_samples: int) -> T
             jnp.asarray(trace.section_state),
             float(trace.duration.sum()),
             float(trace.step_length),
-            float(foremost),
+            rise,
         )
 
     attrs: dict[str, object] = {

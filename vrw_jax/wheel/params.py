@@ -45,7 +45,7 @@ class ParameterDomain(NamedTuple):
 
 
 MIN_SI_VALUE = 1e-15
-"""Least SI number of a positive parameter, chosen because products of smaller ones underflow."""
+"""Least SI number of a positive parameter, chosen because quotients of smaller ones overflow."""
 MAX_SI_VALUE = 1e9
 """Bound of the SI numbers of a wheel, chosen because products of larger ones overflow."""
 
