@@ -172,8 +172,8 @@ def _walk_with_diffrax(
     """Return `step_batch` on uneven ground by `walk` under `jax.vmap`, without derivatives."""
     if engine not in ("auto", "diffrax") or len(derivative_names):
         raise ValueError(
-            "uneven ground with restitution needs engine 'diffrax' and no derivatives: leave "
-            "engine and derivatives out, or map vrw.walk over the elements."
+            "uneven ground with restitution, or by engine 'diffrax', is available without "
+            "derivatives: leave engine and derivatives out, or map vrw.walk over the elements."
         )
     n_states = len(states)
     parameter_columns = (*parameters, np.asarray(model.friction, states.dtype))

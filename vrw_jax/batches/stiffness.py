@@ -49,7 +49,9 @@ SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
 
 
 def select_solver(
-    parameters: np.ndarray, options: StepOptions, selection: SolverSelectionOptions
+    parameters: np.ndarray,
+    options: StepOptions,
+    selection: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> np.ndarray:
     """Return the `SolverIndex` of the cheapest solver for each lane.
 
