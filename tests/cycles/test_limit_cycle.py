@@ -272,6 +272,14 @@ def test_causes_of_a_missing_gait_have_different_outcomes(changes, outcome, word
     assert cycle.why in repr(cycle)
 
 
+def test_a_batch_has_the_ending_of_each_wheel_alone():
+    slopes = [0.30, 0.5, 0.02]
+    batch = vrw.limit_cycles(vrw.WheelParams(slope=np.array(slopes)))
+    endings = [vrw.limit_cycle(vrw.WheelParams(slope=slope)).ending for slope in slopes]
+    assert batch.ending.tolist() == batch.why.tolist() == endings
+    assert len(set(endings)) == 3
+
+
 def test_a_missing_gait_is_nan_in_value_and_derivative_on_request():
     fraction = lambda c, **how: vrw.limit_cycle(vrw.WheelParams(damping=c), **how).dls_fraction
     both_values = jax.value_and_grad(lambda c: fraction(c, on_failure="nan"))

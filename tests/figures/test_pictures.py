@@ -7,10 +7,11 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import xarray as xr
+from PIL import Image
 
 from experiments.shared.eyes import simulate_color_vision
 from vrw_jax.figures import branch_figures as branch
-from vrw_jax.figures import indicators, style
+from vrw_jax.figures import indicators, save_animation, style
 from vrw_jax.figures.branch_figures import basin_figure
 from vrw_jax.wheel import Outcome
 
@@ -21,6 +22,23 @@ MIN_COLOR_DISTANCE = 0.12
 
 def perceive_color(colour: str) -> np.ndarray:
     return simulate_color_vision(np.array(mpl.colors.to_rgb(colour)))
+
+
+def test_figures_and_animations_are_written_to_paths_given_as_strings(tmp_path):
+    figure = mpl.figure.Figure()
+    paths = style.save(figure, f"{tmp_path}/figs", "empty")
+    assert paths == style.save(figure, tmp_path / "figs", "empty")
+    assert all(path.stat().st_size > 0 for path in paths)
+    black_and_white = np.repeat(np.array([[0, 255], [255, 0]], np.uint8), 4, axis=1)
+    frames = [Image.fromarray(np.tile(row, (8, 1))).convert("RGB") for row in black_and_white]
+    written = save_animation(frames, 40, f"{tmp_path}/gifs/blink.gif")
+    assert written == tmp_path / "gifs" / "blink.gif"
+    with Image.open(written) as animation:
+        assert (animation.format, animation.n_frames) == ("GIF", 2)
+    with pytest.raises(TypeError, match="give a folder"):
+        style.save(figure, 3, "empty")
+    with pytest.raises(TypeError, match="give a file"):
+        save_animation(frames, 40, 3)
 
 
 def test_colors_of_okabe_and_ito_stay_distinct_without_green_cones():

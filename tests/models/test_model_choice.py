@@ -56,6 +56,8 @@ def ladder_steps():
 
 def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
     *_, step = ladder_steps
+    reasons = [describe_reason(code) for code in step.choice.reason_code.tolist()]
+    assert step.choice.why.tolist() == reasons
     assert step.choice.model_code.tolist() == [
         ModelCode.VISCOELASTIC,
         ModelCode.UNILATERAL,

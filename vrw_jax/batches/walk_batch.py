@@ -64,8 +64,8 @@ class StepBatchResult(AbstractPrintable):
     derivatives: dict[str, StepSensitivity] = eqx.field(default_factory=dict)
 
     @property
-    def ending(self) -> str:
-        """Return how the walks ended, as a sentence; for a batch, each sentence with its count."""
+    def ending(self) -> Any:
+        """Return how the walks ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.hybrid import ReturnMap, Termination, find_program
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
-from vrw_jax.printing import format_numbers, format_quantity, format_text
+from vrw_jax.printing import describe_elements, format_numbers, format_quantity, format_text
 from vrw_jax.validation import (
     check_callable,
     check_int,
@@ -45,12 +45,9 @@ class FixedPointResult(NamedTuple):
     termination: Int[Array, ""] | None = None
 
     @property
-    def ending(self) -> str:
-        """Return whether Newton's method converged, as a sentence."""
-        iterations = f"after {int(self.n_iterations)} iterations"
-        if bool(self.converged):
-            return f"Newton's method converged {iterations}."
-        return f"Newton's method did not converge {iterations}: start nearer to the fixed point."
+    def ending(self) -> Any:
+        """Return whether Newton's method converged, as a sentence; a batch has an array of them."""
+        return describe_elements(_describe_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -66,6 +63,15 @@ class FixedPointResult(NamedTuple):
         if self.termination is not None:
             rows.append(("simulation", Termination(int(self.termination)).meaning))
         return format_text("FixedPointResult", rows)
+
+
+def _describe_convergence(converged: bool, n_iterations: int) -> str:
+    if converged:
+        return f"Newton's method converged after {n_iterations} iterations."
+    return (
+        f"Newton's method did not converge after {n_iterations} iterations: start nearer to the "
+        "fixed point."
+    )
 
 
 MAX_NEWTON_ITERATIONS = 30

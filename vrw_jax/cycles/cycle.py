@@ -109,12 +109,12 @@ class AbstractCycle(AbstractPrintable):
         return self.outcome == Outcome.STEPPED
 
     @property
-    def ending(self) -> str:
-        """Return how it ended, as a sentence; for a batch, each sentence with its count."""
+    def ending(self) -> Any:
+        """Return how the search ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     @property
-    def why(self) -> str:
+    def why(self) -> Any:
         """Return the reason why there is no cycle: the same as `ending`."""
         return self.ending
 

@@ -7,7 +7,7 @@ unstable cycles, in forward and reverse mode, and to any order.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ from vrw_jax.cycles.margin_defaults import gait_takeoff_acceleration
 from vrw_jax.cycles.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
-from vrw_jax.printing import TextRow, format_numbers
+from vrw_jax.printing import TextRow, describe_elements, format_numbers
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
@@ -158,16 +158,10 @@ class LimitCycle(AbstractCycle):
         return self._map_over_batch(margins_of_step)(self.parameters, self.section_state)
 
     @property
-    def ending(self) -> str:
-        if jnp.ndim(self.outcome) or self.outcome not in (
-            Outcome.EVENT_ORDER_MISMATCH,
-            Outcome.BRANCH_ENDS_BEFORE_TARGET,
-        ):
-            return super().ending
-        check = ADMISSIBILITY_CHECKS[
-            int(self.collocation_state.failed_check - 1) % len(ADMISSIBILITY_CHECKS)
-        ]
-        return f"{super().ending} Broken: {check}."
+    def ending(self) -> Any:
+        return describe_elements(
+            _describe_outcome, self.outcome, self.collocation_state.failed_check
+        )
 
     def model_rows(self) -> list[TextRow]:
         forces = self.indicators
@@ -176,6 +170,15 @@ class LimitCycle(AbstractCycle):
             ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
             ("indicators λ_I4, λ2⁺, λ4⁺", f"{forces_text}, {format_numbers(forces.lambda_4)} N"),
         ]
+
+
+def _describe_outcome(outcome: int, failed_check: float) -> str:
+    """Return the sentence of an outcome, with the failed check if that is the reason."""
+    sentence = Outcome(int(outcome)).meaning
+    if outcome not in (Outcome.EVENT_ORDER_MISMATCH, Outcome.BRANCH_ENDS_BEFORE_TARGET):
+        return sentence
+    check = ADMISSIBILITY_CHECKS[int(failed_check - 1) % len(ADMISSIBILITY_CHECKS)]
+    return f"{sentence} Broken: {check}."
 
 
 @functools.partial(jax.jit, static_argnums=0)

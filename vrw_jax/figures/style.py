@@ -134,7 +134,7 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """Write `figure` as SVG and PNG into `folder`, and return the paths.
 
     Args:
@@ -146,6 +146,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         list[Path]: the paths of `name`.svg and `name`.png.
 
     Raises:
+        TypeError: if `folder` is no path.
         OSError: if a file cannot be written.
 
     Examples:
@@ -154,6 +155,8 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         >>> [path.suffix for path in vrw.plot.save(figure, folder, "sticks")]
         ['.svg', '.png']
     """
+    check_type("folder", folder, (str, Path), 'give a folder, such as "figures"')
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with figure_style():

@@ -454,7 +454,7 @@ def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None
         )
 
 
-def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path) -> Path:
+def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str | Path) -> Path:
     """Write frames as a looping GIF with one shared palette of 32 colors.
 
     Args:
@@ -466,6 +466,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
         Path: the path of the GIF.
 
     Raises:
+        TypeError: if `frames` is no list, or `path` is no path.
         OSError: if the file cannot be written.
 
     Examples:
@@ -476,6 +477,8 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: Path)
         'walk.gif'
     """
     check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
+    check_type("path", path, (str, Path), 'give a file, such as "walk.gif"')
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[0].quantize(32)
     paletted_frames = [

@@ -91,8 +91,8 @@ class HybridSolution(NamedTuple):
     termination: Int[Array, ""]  # a Termination
 
     @property
-    def ending(self) -> str:
-        """Return why the simulation ended, as a sentence; for a batch, each with its count."""
+    def ending(self) -> Any:
+        """Return why the simulation ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.termination, Termination)
 
 

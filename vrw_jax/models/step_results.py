@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -147,8 +147,8 @@ class AbstractStep(AbstractPrintable):
     solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # attempted solver steps
 
     @property
-    def ending(self) -> str:
-        """Return how the step ended, as a sentence; for a batch, each sentence with its count."""
+    def ending(self) -> Any:
+        """Return how the step ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     @property

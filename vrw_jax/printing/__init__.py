@@ -3,6 +3,7 @@
 from vrw_jax.printing.text import (
     AbstractPrintable,
     TextRow,
+    describe_elements,
     describe_ending,
     format_html_table,
     format_markdown_table,

@@ -4,7 +4,7 @@ import abc
 import enum
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import Any
 
@@ -68,17 +68,14 @@ def format_outcome_counts(outcomes: Any, status_class: type[enum.IntEnum]) -> st
     return f"{n:,} in shape {shape}: {', '.join(count_texts)}"
 
 
-def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> str:
-    """Return the sentence of a status code; for a batch, each sentence with its count."""
-    values = np.asarray(codes)
-    if not values.ndim:
-        return status_class(int(values)).meaning  # type: ignore[attr-defined]
-    present_codes, counts = np.unique(values, return_counts=True)
-    sentences = (
-        f"{count:,} of {values.size:,}: {status_class(int(code)).meaning}"  # type: ignore[attr-defined]
-        for code, count in zip(present_codes, counts, strict=True)
-    )
-    return " ".join(sentences) or "There are no batch elements."
+def describe_elements(describe: Callable[..., str], *values: Any) -> Any:
+    """Return the text of numbers; for a batch, an array of the texts of its elements."""
+    return np.vectorize(describe, otypes=[object])(*values)[()]
+
+
+def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> Any:
+    """Return the sentence of a status code; for a batch, an array of one sentence per element."""
+    return describe_elements(lambda code: status_class(int(code)).meaning, codes)  # type: ignore[attr-defined]
 
 
 def format_text(title: str, rows: Iterable[TextRow]) -> str:

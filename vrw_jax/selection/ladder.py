@@ -40,7 +40,7 @@ from vrw_jax.models import (
     replace_invalid,
 )
 from vrw_jax.numerics import RealInput, Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, TextRow
+from vrw_jax.printing import AbstractPrintable, TextRow, describe_elements
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
 
 
@@ -143,9 +143,9 @@ class ModelChoice(AbstractPrintable):
         return UnilateralWheel(friction=self.friction)
 
     @property
-    def why(self) -> str:
-        """Reason of the choice as one sentence, for one wheel."""
-        return describe_reason(int(self.reason_code))
+    def why(self) -> Any:
+        """Reason of the choice as one sentence. A batch has an array of sentences."""
+        return describe_elements(describe_reason, self.reason_code)
 
 
 def describe_reason(reason: int) -> str:

@@ -291,8 +291,8 @@ class Walk(AbstractPrintable):
         )[..., 0]
 
     @property
-    def ending(self) -> str:
-        """Return how the walk ended, as a sentence; for a batch, each sentence with its count."""
+    def ending(self) -> Any:
+        """Return how the walk ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:

@@ -11,6 +11,7 @@ from vrw_jax.numerics import StatusCode
 from vrw_jax.printing import (
     AbstractPrintable,
     TextRow,
+    describe_elements,
     describe_ending,
     format_outcome_counts,
 )
@@ -118,16 +119,16 @@ class MeasureResult(AbstractPrintable):
         return (self.outcomes == Outcome.STEPPED)[()]
 
     @property
-    def ending(self) -> str:
-        """Return how the search for the gait ended, as a sentence; for a batch, each sentence with
-        its count."""
+    def ending(self) -> Any:
+        """Return how the search for the gait ended, as a sentence; a batch has an array of them."""
         return describe_ending(self.outcomes, Outcome)
 
     @property
     def why(self) -> Any:
         """Return why that model is selected, as a sentence. A batch has an array of them."""
-        explain = np.vectorize(_explain, otypes=[object])
-        return explain(self.models, self.statuses, self.n_steps, self.outcomes, self.n_gaits)[()]
+        return describe_elements(
+            _explain, self.models, self.statuses, self.n_steps, self.outcomes, self.n_gaits
+        )
 
     @property
     def title(self) -> str:
