@@ -63,6 +63,8 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "friction not positive": ("[model]\nfriction = 0", "must be positive"),
     "switch as number": ("[model]\nstop_at_lift_off = 1", "true or false"),
     # name: text of the config, what the sentence holds
+    "the paper's symbol": ("[wheel]\nc = 100.0", "c is called damping: write damping"),
+    "the paper's symbol swept": ("[grid]\nL0 = [1.0, 1.1]", "L0 is called locked_length"),
     "a table twice": ("[wheel]\n[wheel]", "not valid TOML"),
     "a value without quotes": ("[options]\nsolver = Dopri8", "not valid TOML"),
     "a number with a comma": ("[wheel]\ndamping = 1,5", "not valid TOML"),
@@ -259,6 +261,7 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "no assignment": (("gait", "--set", "damping"), "", "has no '='"),
     "an empty assignment": (("gait", "--set", "damping="), "", "must be a finite number"),
     "a nameless assignment": (("gait", "--set", "=3"), "", "unknown key ''"),
+    "the paper's symbol": (("gait", "--set", "c=100"), "", "c is called damping: write damping"),
     "unknown parameter": (("gait", "--set", "dampin=3"), "", "did you mean 'damping'"),
     "text for a parameter": (("gait", "--set", "damping=much"), "", "must be a finite number"),
     "a complex parameter": (("gait", "--set", "damping=1+2j"), "", "must be a finite number"),

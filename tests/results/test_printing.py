@@ -56,7 +56,9 @@ def test_a_result_prints_numbers_and_units(make, words):
 def test_a_batch_of_fixed_points_has_the_ending_of_each():
     """cos has a fixed point; x + 1 has none."""
     points = jax.vmap(
-        lambda a: vrw.solve_fixed_point(lambda x: a * jnp.cos(x) + (1.0 - a) * (x + 1.0), jnp.array([0.7]))
+        lambda a: vrw.solve_fixed_point(
+            lambda x: a * jnp.cos(x) + (1.0 - a) * (x + 1.0), jnp.array([0.7])
+        )
     )(jnp.array([1.0, 0.0]))
     assert points.ending[0].startswith("Newton's method converged after")
     assert points.ending[1].startswith("Newton's method did not converge after")

@@ -132,6 +132,28 @@ def test_float32_works_if_requested():
         np.testing.assert_allclose(batch_result.section_state[0], double, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: vrw.WheelParams(c=100), "c is called damping: write damping"),
+        (lambda: vrw.WheelParams(Ls=1.02), "Ls is called natural_length"),
+        (lambda: vrw.WheelParams(n=8), "n is called n_legs"),
+        (lambda: vrw.grid(c=[100.0, 150.0]), "c is called damping"),
+        (lambda: vrw.sobol({"mu": (0.5, 0.8)}, n=4), "mu is called friction"),
+        (lambda: vrw.continue_branch(vrw.WheelParams(), "k", (400.0, 600.0)), "k is called stiff"),
+        (
+            lambda: vrw.tune(vrw.WheelParams(), "speed", ("c",), {"c": (150.0, 200.0)}),
+            "c is called damping",
+        ),
+        (lambda: vrw.WheelParams(dampin=100.0), r"did you mean 'damping'.*n_legs\."),
+        (lambda: vrw.WheelParams(mu=0.7), "'mu' is no parameter of the wheel"),
+    ],
+)
+def test_a_symbol_of_the_paper_gets_the_name_of_its_parameter(call, sentence):
+    with pytest.raises((TypeError, ValueError), match=sentence):
+        call()
+
+
 def test_invalid_numbers_in_a_batch_have_outcomes():
     vectors = make_parameter_rows(damping=[200.0, -1.0, np.nan])
     outcomes = compute_full_steps(vectors, vrw.paper_start()).outcome

@@ -61,14 +61,13 @@ from vrw_jax.simulation import ModelLike, check_model, check_options, check_sing
 from vrw_jax.validation import (
     check_callable,
     check_int,
-    check_known_name,
     check_not_traced,
     check_range,
     check_real,
     check_reals,
     check_type,
 )
-from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams
+from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_name
 
 INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")
@@ -339,7 +338,7 @@ OMITTED_MEASURES = ("outcome", "solver_steps")
 
 def _check_continuation(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
     refuse_ladder(model, "followed")
-    check_known_name(name, model.parameter_names, "parameter")
+    check_parameter_name(name, model.parameter_names, "parameter")
     if period_n > 1 and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "

@@ -11,8 +11,8 @@ from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, Cur
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
 from vrw_jax.numerics import StepOptions
-from vrw_jax.validation import check_known_name, check_names, check_range, check_type
-from vrw_jax.wheel import PARAMETER_DOMAINS, wheel_from_parameters
+from vrw_jax.validation import check_names, check_range, check_type
+from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, wheel_from_parameters
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 
@@ -82,9 +82,9 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
     all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
     parameter_pair = check_names("parameters", parameters)
     for name in all_bounds:
-        check_known_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+        check_parameter_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
     for name in parameter_pair:
-        check_known_name(name, tuple(all_bounds), "parameter with bounds")
+        check_parameter_name(name, tuple(all_bounds), "parameter with bounds")
     if len(parameter_pair) != 2 or len(set(parameter_pair)) != 2:
         raise ValueError(
             f"parameters are {parameter_pair}, but a curve needs two different ones: write "

@@ -20,7 +20,14 @@ from vrw_jax.scans import CATALOGS, MAX_LISTED_SAMPLES, TOLERANCE_CATALOG, check
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import find_model_class, list_config_names
 from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    WheelParams,
+    check_parameter_name,
+    refuse_symbol,
+)
 
 RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
 DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
@@ -390,7 +397,7 @@ def _parse_branch(table: Mapping[str, object], names: tuple[str, ...]) -> Branch
     _refuse_renamed_keys(table, "[branch]")
     _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     parameter = table.get("parameter")
-    check_known_name(parameter, names, "parameter that a branch of this model runs along")
+    check_parameter_name(parameter, names, "parameter that a branch of this model runs along")
     assert isinstance(parameter, str)
     if "bounds" not in table:
         raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
@@ -508,6 +515,7 @@ def _require_known_keys(
     """Raise if a table has a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for key in table:
+        refuse_symbol(key, allowed_keys)
         if key not in allowed_keys:
             raise ValueError(
                 f"{location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "

@@ -11,13 +11,12 @@ import numpy as np
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import (
     check_int,
-    check_known_name,
     check_not_traced,
     check_range,
     check_type,
     format_value,
 )
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
 
 SampleColumns = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -378,7 +377,7 @@ def _require_sweepable(values: Mapping[str, object]) -> Mapping:
             f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
         )
     for name in values:
-        check_known_name(name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
+        check_parameter_name(name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
     return values
 
 

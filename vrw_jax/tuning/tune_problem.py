@@ -72,7 +72,13 @@ from vrw_jax.validation import (
     check_type,
     format_value,
 )
-from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, Outcome, WheelParams
+from vrw_jax.wheel import (
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    check_parameter_name,
+)
 
 ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
 
@@ -597,7 +603,7 @@ def _check_bounds(
             f"{', '.join(PARAMETER_NAMES)}."
         )
     for name in (*names, *bounds):
-        check_known_name(name, PARAMETER_NAMES, "parameter of the wheel")
+        check_parameter_name(name, PARAMETER_NAMES, "parameter of the wheel")
     for name in bounds:
         if name not in names:
             raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")

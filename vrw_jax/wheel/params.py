@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool
 
 from vrw_jax.numerics import Elementwise, RealInput, Scalar, sine_cosine
 from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
-from vrw_jax.validation import check_int, check_reals, format_value
+from vrw_jax.validation import check_int, check_known_name, check_reals, format_value
 
 
 class ParameterDomain(NamedTuple):
@@ -157,6 +158,15 @@ class WheelParams(AbstractPrintable):
     slope: Scalar = _parameter_field("slope", 0.30)
     gravity: Scalar = _parameter_field("gravity", 9.81)
     n_legs: int = eqx.field(static=True, converter=_convert_n_legs, default=8)
+
+    def __new__(cls, *_: Any, **named_values: Any) -> "WheelParams":
+        """Refuse names that no parameter has, before the wheel is made."""
+        for name in named_values:
+            try:
+                check_parameter_name(name, (*PARAMETER_DOMAINS, "n_legs"), "parameter of the wheel")
+            except ValueError as error:
+                raise TypeError(str(error)) from None
+        return super().__new__(cls)
 
     if TYPE_CHECKING:
 
@@ -336,6 +346,27 @@ def compute_symbols(
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
 FRICTION_NAME = "friction"
 """Name of the ground's coefficient of friction, which designs and branches may vary as well."""
+
+NAMES_OF_SYMBOLS: dict[str, str] = {
+    **{domain.symbol: name for name, domain in PARAMETER_DOMAINS.items()},
+    **{"mH": "hub_mass", "L0": "locked_length", "L_s": "natural_length", "Ls": "natural_length"},
+    **{"φ": "slope", "n": "n_legs", "mu": FRICTION_NAME, "μ": FRICTION_NAME},
+}
+"""Name of the parameter of each symbol of the paper, in its usual spellings."""
+
+
+def refuse_symbol(name: Any, allowed_names: Iterable[str]) -> None:
+    """Raise if `name` is the symbol of a parameter whose name is allowed."""
+    allowed_names = tuple(allowed_names)
+    parameter = NAMES_OF_SYMBOLS.get(name) if isinstance(name, str) else None
+    if name not in allowed_names and parameter in allowed_names:
+        raise ValueError(f"{name} is called {parameter}: write {parameter}.")
+
+
+def check_parameter_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
+    """Refuse a name that is no allowed parameter; for a symbol, give the parameter's name."""
+    refuse_symbol(name, allowed_names)
+    check_known_name(name, allowed_names, description)
 
 
 def convert_friction(value: object) -> Array:
