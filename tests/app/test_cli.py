@@ -3,6 +3,7 @@
 Scans here are computed by the stand-in of support.scanning; one gait is walked for real.
 """
 
+import os
 import signal
 import subprocess
 import sys
@@ -15,12 +16,14 @@ import xarray as xr
 from support.scanning import CountingEngine, evaluate_arithmetically
 from typer.testing import CliRunner, Result
 
+import vrw_jax as vrw
 from vrw_jax.branches.branch import Branch
 from vrw_jax.cli import commands as cli
 from vrw_jax.cli import scanning
 from vrw_jax.cli.commands import app
 from vrw_jax.cli.config import parse_config
 from vrw_jax.cli.console import make_scan_reporter
+from vrw_jax.cli.encoding import format_for_encoding
 from vrw_jax.scans import forecast
 from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.planning import ScanPlan
@@ -111,6 +114,53 @@ def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     assert result[2]["note"] == "200 per s, 10 % without a gait, 15 s left"
     assert result[2]["completed"] == 3000
     assert result[2]["total"] == 6_000
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words", "sentence"),
+    [
+        ("ascii", ["theta'-", "lambda4+", "N.s^2"], "vrw: phi >= 0 ... ?"),
+        ("cp1252", ["theta'-", "lambda4+", "N·s²"], "vrw: phi >= 0 … ?"),
+        ("utf-8", ["θ̇⁻", "λ4⁺", "N·s²"], "vrw: φ ≥ 0 … Ω"),
+    ],
+)
+def test_characters_that_a_terminal_lacks_are_spelled(
+    encoding: str, words: list[str], sentence: str
+) -> None:
+    code = (
+        "from vrw_jax.cli import console, encoding\n"
+        "encoding.spell_unencodable_characters()\n"
+        'headings = ("quantity", "symbol", "unit")\n'
+        'console.print_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
+        'console.print_error("φ ≥ 0 … Ω")'
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "80"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    heading, row = done.stdout.decode(encoding).splitlines()[-2:]
+    assert row.split() == words
+    assert done.stderr.decode(encoding).strip() == sentence
+    if encoding == "ascii":  # columns are as wide as the spelled text
+        assert heading.index("symbol") == row.index("lambda4+")
+        assert heading.index("unit") == row.index("N.s^2")
+
+
+def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
+    for measure in vrw.MEASURES.values():
+        for text in (measure.symbol, measure.long_name, measure.display_unit):
+            spelled = format_for_encoding(text, "ascii")
+            assert "?" not in spelled, (text, spelled)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "200"}
+    command = [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "lambda4+" in done.stdout
+    assert "stable: multipliers 0.32862, 0.02231" in done.stdout
+    assert done.stderr == ""
 
 
 def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> None:

@@ -22,10 +22,11 @@ from vrw_jax.cli.console import (
     ExitCode,
     print_error,
     report_errors,
+    show_stages,
     show_warnings_as_sentences,
-    stderr_console,
     stdout_console,
 )
+from vrw_jax.cli.encoding import spell_unencodable_characters
 
 if TYPE_CHECKING:
     from vrw_jax.cli.config import Config
@@ -57,6 +58,7 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _interrupt_command)
     show_warnings_as_sentences()
+    spell_unencodable_characters()
     with printing.report_output_errors():
         app()
 
@@ -162,7 +164,7 @@ def gait(
         state = model.default_start(params) if start is None else jnp.asarray(start)
         state = model.embed_section(params, state)
         n_walked, n_steps = 0, steps or settings.gait.steps
-        with stderr_console.status("walking (the first time compiles for a while)"):
+        with show_stages("walking (the first time compiles for a while)"):
             while True:
                 result: Any = step(params, state, model=model, options=options)
                 has_stepped = int(result.outcome) == Outcome.STEPPED
@@ -327,9 +329,7 @@ def scan(
         from vrw_jax.scans import forecast_scan
 
         if explain:
-            with stderr_console.status(
-                "measuring some samples (the first time compiles for a while)"
-            ):
+            with show_stages("measuring some samples (the first time compiles for a while)"):
                 forecast = forecast_scan(plan, store) | {"store": str(store)}
             printing.print_table("What this scan would do", forecast.items())
             return
@@ -367,7 +367,7 @@ def map_special_points(
 
     with (
         report_errors(),
-        stderr_console.status("following special points (the first time compiles for minutes)"),
+        show_stages("following special points (the first time compiles for minutes)"),
     ):
         printing.print_written_paths(write_map(dataset, settings, folder))
 
@@ -402,7 +402,7 @@ def tune(
         from vrw_jax.cli.reports import write_tuning
         from vrw_jax.tuning import tune as run
 
-        with stderr_console.status("tuning (the first time compiles for a while)"):
+        with show_stages("tuning (the first time compiles for a while)"):
             result = run(
                 settings.make_wheel(),
                 tune_config.objective,
@@ -452,7 +452,7 @@ def continue_(
         if branch_config.max_ds is not None:
             initial_ds = min(options.initial_ds, branch_config.max_ds)
             options = ArclengthOptions(initial_ds=initial_ds, max_ds=branch_config.max_ds)
-        with stderr_console.status("following the branch (the first time compiles for a while)"):
+        with show_stages("following the branch (the first time compiles for a while)"):
             branch = continue_branch(
                 settings.make_wheel(),
                 branch_config.parameter,

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from vrw_jax.cli.encoding import format_for_encoding
+
 if TYPE_CHECKING:
     import xarray as xr
     from jax.typing import ArrayLike
@@ -112,6 +114,20 @@ def _format_system_error(error: OSError) -> str:
     return f"{location}{str(error.strerror or error).rstrip('.')}."
 
 
+@contextlib.contextmanager
+def show_stages(first_stage: str) -> Iterator[Callable[[str], None]]:
+    """Show the stage of a computation and its duration, and yield the callback of the next stage.
+
+    If stderr is no terminal, each stage that is passed to the callback is printed as one line.
+    """
+    if not stderr_console.is_terminal:
+        yield lambda stage: stderr_console.print(f"{stage} ...", highlight=False, soft_wrap=True)
+        return
+    with make_progress_bar("stages") as bar:
+        task = bar.add_task(first_stage, total=None)
+        yield lambda stage: bar.update(task, description=stage)
+
+
 def print_written_paths(paths: Iterable[Path]) -> None:
     """Print the paths of files that were written."""
     for path in paths:
@@ -132,9 +148,10 @@ def print_table(
     for heading in headings or ("name", "text"):
         table.add_column(heading, justify="right" if heading in right_aligned else "left")
     for row in rows:
+        texts = [format_for_encoding(text, stdout_console.encoding) for text in row]
         cells = [
             text if heading == "" else escape(text)
-            for heading, text in zip(headings or ("name", "text"), row, strict=True)
+            for heading, text in zip(headings or ("name", "text"), texts, strict=True)
         ]
         table.add_row(*(cells if headings else (f"[bold]{cells[0]}[/]", *cells[1:])))
     stdout_console.print(table)
