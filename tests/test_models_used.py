@@ -50,6 +50,9 @@ FRICTION = {
     "continue_branches": lambda m: first_fore_friction(
         vrw.continue_branches(make_batch(GAIT), "damping", (149.9, 150.1), model=m)
     ),
+    "map_special_points": lambda m: vrw.map_special_points(
+        vrw.grid(damping=[150.0, 150.1], stiffness=[500.0, 500.1]), model=m
+    ).scan.friction_fore.values.ravel()[0],
     "tune": lambda m: (
         vrw.tune(
             GAIT, "speed", ["damping"], {"damping": (149.9, 150.1)}, {}, model=m, max_evaluations=1
@@ -57,7 +60,14 @@ FRICTION = {
     ),
 }
 """By function: the margin to the friction needed at the fore foot that it tells."""
-SLOW_FUNCTIONS = {"sensitivities", "continue_branch", "continue_branches", "tune", "basin"}
+SLOW_FUNCTIONS = {
+    "sensitivities",
+    "continue_branch",
+    "continue_branches",
+    "tune",
+    "basin",
+    "map_special_points",
+}
 """Those that compile for minutes where nothing is kept."""
 
 
@@ -152,6 +162,11 @@ GAITS = {
     ),
     "continue_branches": lambda m: is_branch_found(
         vrw.continue_branches(make_batch(PULLED_WHEEL), "stiffness", STIFFNESS_BOUNDS, model=m)[0]
+    ),
+    "map_special_points": lambda m: is_successful(
+        lambda: vrw.map_special_points(
+            vrw.grid(damping=[41.2, 41.201], stiffness=[684.0, 684.01]), base=PULLED_WHEEL, model=m
+        )
     ),
     "tune": lambda m: is_successful(
         lambda: vrw.tune(

@@ -37,7 +37,18 @@ from vrw_jax.models import (
 )
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import start_jax
-from vrw_jax.scans import grid, open_scan, saltelli, samples, scan, sobol, sobol_indices, uniform
+from vrw_jax.scans import (
+    SpecialPointMap,
+    grid,
+    map_special_points,
+    open_scan,
+    saltelli,
+    samples,
+    scan,
+    sobol,
+    sobol_indices,
+    uniform,
+)
 from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
 from vrw_jax.simulation import (
     Walk,
@@ -81,6 +92,7 @@ __all__ = (
     "RigidWheel",
     "SpecialPoint",
     "SpecialPointCurve",
+    "SpecialPointMap",
     "StepBatchResult",
     "StepOptions",
     "StepResult",
@@ -101,6 +113,7 @@ __all__ = (
     "grid",
     "limit_cycle",
     "limit_cycles",
+    "map_special_points",
     "measure_to_tolerance",
     "multifidelity_mean",
     "open_scan",

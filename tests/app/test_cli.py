@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from vrw_jax.cli.commands import app
 from vrw_jax.cli.config import parse_config
 from vrw_jax.cli.console import make_scan_reporter
 from vrw_jax.cli.encoding import format_for_encoding
-from vrw_jax.scans import forecast
+from vrw_jax.scans import SpecialPointMap, forecast
 from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.planning import ScanPlan
 from vrw_jax.scans.store import open_scan
@@ -161,6 +162,31 @@ def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) ->
     assert "lambda4+" in done.stdout
     assert "stable: multipliers 0.32862, 0.02231" in done.stdout
     assert done.stderr == ""
+
+
+def test_a_map_prints_its_stages_after_the_scan(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config.write_text("[grid]\ndamping = [100.0, 150.0]\nslope = [0.28, 0.3]\n")
+    evaluate = lambda columns: {
+        **evaluate_arithmetically(columns),
+        "lambda_4_plus": columns["slope"],
+    }
+    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate)
+
+    def follow(
+        scan: xr.Dataset, base: object, model: object, on_stage: Callable
+    ) -> SpecialPointMap:
+        on_stage("following special points: fold")
+        return SpecialPointMap(scan, (), ())
+
+    monkeypatch.setattr("vrw_jax.scans.follow_special_points", follow)
+    result = run_command("map", config)
+    assert result.exit_code == 0, result.output
+    stages = [line for line in result.stderr.splitlines() if line.endswith(" ...")]
+    assert stages == ["following special points: fold ...", "drawing the map ..."]
+    folder = config.parent / "results" / "small"
+    assert (folder / "map.md").read_text().startswith("0 changes of sign")
 
 
 def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> None:

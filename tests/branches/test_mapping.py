@@ -9,9 +9,9 @@ from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
     find_sign_change_cells,
     find_unexplained_changes,
-    map_special_points,
 )
 from vrw_jax.measures import MARGIN_MEASURES
+from vrw_jax.scans import follow_special_points
 
 MAP_PARAMETERS = ("damping", "stiffness")
 C, K = np.linspace(50.0, 150.0, 11), np.linspace(400.0, 600.0, 9)
@@ -72,10 +72,55 @@ def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
 def test_each_sign_change_of_a_scan_is_near_a_curve():
     grid = vrw.grid(damping=np.linspace(4.0, 240.0, 60), stiffness=np.linspace(350.0, 700.0, 36))
     scan = vrw.scan(grid, ["dls_fraction", *SPECIAL_POINT_MEASURES])
-    curves, left_part = map_special_points(scan, vrw.WheelParams(), vrw.ViscoelasticWheel())
+    stages = []
+    _, curves, left_part = follow_special_points(
+        scan, vrw.WheelParams(), vrw.ViscoelasticWheel(), stages.append
+    )
     assert not left_part
+    assert stages[0] == "following 5 branches along damping"
+    assert any(stage.startswith("following special points: ") for stage in stages)
     (doubling,) = [curve.values for curve in curves if curve.name == "period_doubling"]
     # A branch along the stiffness meets it there.
     assert np.interp(141.66, *doubling[np.argsort(doubling[:, 0])].T) == pytest.approx(
         571.4737, abs=1e-3
     )
+
+
+def test_a_map_needs_a_grid_over_two_ascending_parameters_and_the_papers_model():
+    wrong_grids = (
+        vrw.grid(damping=[150.0]),
+        vrw.grid(damping=[150.0, 160.0], slope=[0.3]),
+        vrw.grid(damping=[160.0, 150.0], slope=[0.28, 0.3]),
+    )
+    for grid, sentence in zip(
+        wrong_grids, ("grid over two", "slope has", "damping has"), strict=True
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            vrw.map_special_points(grid)
+    grid = vrw.grid(damping=[150.0, 160.0], slope=[0.28, 0.3])
+    with pytest.raises(ValueError, match=r"mapped for vrw\.ViscoelasticWheel"):
+        vrw.map_special_points(grid, model=vrw.RigidWheel())
+
+
+def test_a_map_scans_what_the_curves_need_and_follows_them(monkeypatch):
+    """Curves are stand-ins: the slow test above follows real ones."""
+    curve = make_line("fold", np.array([150.0, 160.0]), np.array([495.0, 505.0]))
+    followed = {}
+
+    def trace(scan, base, model, on_stage):
+        on_stage("following special points: fold")
+        followed.update(scan=scan, base=base, model=model)
+        return (curve,), ()
+
+    monkeypatch.setattr("vrw_jax.scans.special_point_map.trace_special_points", trace)
+    stages, base = [], vrw.WheelParams(slope=0.29)
+    grid = vrw.grid(damping=[150.0, 160.0], stiffness=[495.0, 505.0])
+    special_points = vrw.map_special_points(grid, "speed", base=base, on_stage=stages.append)
+    assert {"speed", *SPECIAL_POINT_MEASURES, *MARGIN_MEASURES} <= set(special_points.scan)
+    alone = vrw.scan(grid, ["speed"], base=base).speed  # another program: rounded differently
+    np.testing.assert_allclose(special_points.scan.speed, alone, rtol=1e-14)
+    assert followed["base"] is base
+    assert stages == ["following special points: fold"]
+    assert special_points.ending.startswith("0 changes")
+    assert str(curve) in str(special_points)
+    assert vrw.plot.map_figure(special_points.scan, "speed", special_points.curves).axes

@@ -6,5 +6,5 @@ from vrw_jax.branches.special_point_curves import continue_special_point
 from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
     UnexplainedChange,
-    map_special_points,
+    trace_special_points,
 )

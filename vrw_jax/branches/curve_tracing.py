@@ -4,7 +4,7 @@ A special point is solved for together with the gait, so that a point of a curve
 the gait. Where a curve meets another special point, a new curve starts.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -179,6 +179,12 @@ class CurveTracer(NamedTuple):
     model: ViscoelasticWheel
     options: ArclengthOptions
     step_options: StepOptions
+    on_stage: Callable[[str], None] | None = None
+
+    def report_stage(self, stage: str) -> None:
+        """Call `on_stage`, if it is given, with a description of the next stage."""
+        if self.on_stage is not None:
+            self.on_stage(stage)
 
     def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
         for name, value in values.items():
@@ -194,6 +200,7 @@ class CurveTracer(NamedTuple):
         parameters."""
         name, seeds = self.parameters[axis], []
         lower, upper = self.parameter_ranges[axis]
+        self.report_stage(f"following {len(params.damping)} branches along {name}")
         for branch in continue_branches(params, name, (lower, upper), model=self.model):
             for special_point in branch.special_points:
                 if can_continue(special_point.name):
@@ -268,6 +275,8 @@ class CurveTracer(NamedTuple):
     def _trace_batch(self, group: tuple[str, ...], seeds: list[CurveSeed]) -> list[TracedCurve]:
         """Return a curve through each seed that has one, on a sufficiently fine mesh."""
         curves: list[TracedCurve] = []
+        names = ", ".join(sorted({seed.name for seed in seeds}))
+        self.report_stage(f"following special points: {names}")
         for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
             is_finest = refinement == MAX_BRANCH_REFINEMENTS
             branches = self._continue_batch(group, seeds, is_finest)

@@ -6,7 +6,7 @@ between them. If no traced curve does, branches through these samples find it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -69,20 +69,28 @@ class UnexplainedChange(NamedTuple):
     cell_position: tuple[float, float]  # in cells of the scan
 
 
-def map_special_points(
-    scan: xr.Dataset, params: WheelParams, model: ViscoelasticWheel
-) -> tuple[tuple[SpecialPointCurve, ...], list[UnexplainedChange]]:
+def trace_special_points(
+    scan: xr.Dataset,
+    params: WheelParams,
+    model: ViscoelasticWheel,
+    on_stage: Callable[[str], None] | None = None,
+) -> tuple[tuple[SpecialPointCurve, ...], tuple[UnexplainedChange, ...]]:
     """Return all curves of special points over the two parameters of a scan.
 
     The scan contains `SPECIAL_POINT_MEASURES` and margins. Return also the changes between its
-    samples that no curve explains.
+    samples that no curve explains. `on_stage` is called with a description of each stage.
     """
     names = tuple(map(str, scan.outcome.dims))
     parameter_ranges = np.array(
         [(scan[name].values[0], scan[name].values[-1]) for name in names], float
     )
     tracer = CurveTracer(
-        (names[0], names[1]), parameter_ranges, model, DEFAULT_CURVE_OPTIONS, StepOptions.tight()
+        (names[0], names[1]),
+        parameter_ranges,
+        model,
+        DEFAULT_CURVE_OPTIONS,
+        StepOptions.tight(),
+        on_stage,
     )
     curves = _trace_all(tracer, find_seeds_on_middle_lines(tracer, params), [])
     changes = find_sign_change_cells(scan, tracer.parameters)
@@ -98,7 +106,7 @@ def map_special_points(
         curves = _trace_all(
             tracer, _find_seeds_at_changes(tracer, params, scan, new_changes), curves
         )
-    return tuple(curve.curve for curve in curves), remaining_changes()
+    return tuple(curve.curve for curve in curves), tuple(remaining_changes())
 
 
 def _trace_all(

@@ -357,19 +357,25 @@ def map_special_points(
     with report_errors():
         settings, folder = _load_config_for(config, folder, "design", "map")
         from vrw_jax.branches import SPECIAL_POINT_MEASURES
-        from vrw_jax.cli.reports import require_map, write_map
+        from vrw_jax.cli.reports import write_map
+        from vrw_jax.scans import follow_special_points, require_map_grid
 
         plan = scanning.plan_config_scan(settings, None, SPECIAL_POINT_MEASURES)
-        require_map(plan.design)
+        require_map_grid(plan.design)
         _require_writable(folder)
         _require_pictures(True)
     dataset = scanning.compute_scan(plan, folder / "scan.zarr", None)
 
     with (
         report_errors(),
-        show_stages("following special points (the first time compiles for minutes)"),
+        show_stages("following special points (the first time compiles for minutes)") as on_stage,
     ):
-        printing.print_written_paths(write_map(dataset, settings, folder))
+        special_points = follow_special_points(
+            dataset, settings.make_wheel(), settings.make_model(), on_stage
+        )
+        on_stage("drawing the map")
+        paths = write_map(special_points, folder)
+    printing.print_written_paths(paths)
 
 
 @app.command()

@@ -2,21 +2,19 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from vrw_jax import figures
-from vrw_jax.branches import Branch, UnexplainedChange, map_special_points
-from vrw_jax.cli.config import Config
+from vrw_jax.branches import Branch
 from vrw_jax.measures import MEASURES, describe_violation, get_measure
 from vrw_jax.printing import format_markdown_table
-from vrw_jax.scans import DIFFERENTIABLE_MEASURES, design
+from vrw_jax.scans import DIFFERENTIABLE_MEASURES, SpecialPointMap
 from vrw_jax.tuning import TuneResult
-from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, Outcome
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 
 def write_scan(scan: xr.Dataset, folder: Path) -> list[Path]:
@@ -51,44 +49,20 @@ def write_branch(branch: Branch, folder: Path, draws_figure: bool = True) -> lis
     )
 
 
-def require_map(samples: design.AbstractDesign) -> None:
-    """Raise unless the design is a grid over two parameters."""
-    if len(samples.shape) != 2:
-        raise ValueError(
-            f"the design sweeps {', '.join(samples.names)}, but a map is a grid over two "
-            "parameters: sweep two below [grid]."
-        )
-
-
-def write_map(scan: xr.Dataset, settings: Config, folder: Path) -> list[Path]:
-    """Write every curve of special points over the two parameters of a scan; return the paths."""
+def write_map(special_points: SpecialPointMap, folder: Path) -> list[Path]:
+    """Write a map of special points into `folder`: text, table and figure; return the paths."""
+    scan, curves, _ = special_points
     parameter_names = tuple(map(str, scan.outcome.dims))
-    if not np.any(scan.outcome.values == Outcome.STEPPED):
-        raise ValueError("no gait was found on the grid: choose another.")
-    model: Any = settings.make_model()
-    curves, unexplained_changes = map_special_points(scan, settings.make_wheel(), model)
     rows = [
         [curve.name, *map("{:.12g}".format, point)] for curve in curves for point in curve.values
     ]
     text = "\n".join(",".join(row) for row in [["border", *parameter_names], *rows])
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "map.csv").write_text(text + "\n", encoding="utf-8")
-    texts = [*map(str, curves), _format_unexplained_changes(unexplained_changes, scan)]
-    (folder / "map.md").write_text("\n\n".join(texts) + "\n", encoding="utf-8")
+    (folder / "map.md").write_text(f"{special_points}\n", encoding="utf-8")
     measure = next(name for name in scan if name in DIFFERENTIABLE_MEASURES)
     figure_paths = figures.save(figures.map_figure(scan, str(measure), curves), folder, "map")
     return [folder / "map.csv", folder / "map.md", *figure_paths]
-
-
-def _format_unexplained_changes(changes: Sequence[UnexplainedChange], scan: xr.Dataset) -> str:
-    """Return a list of neighboring samples that differ in a sign without a curve between them."""
-    lines = [f"Changes between neighbouring samples beside which no curve runs: {len(changes)}"]
-    for change in changes:
-        parameter_values = [
-            float(scan[n][i]) for n, i in zip(scan.outcome.dims, change.sample, strict=True)
-        ]
-        lines.append(f"    {change.name} at ({parameter_values[0]:.6g}, {parameter_values[1]:.6g})")
-    return "\n".join(lines)
 
 
 def _write_files(

@@ -29,4 +29,10 @@ from vrw_jax.scans.measure_catalog import (
 )
 from vrw_jax.scans.planning import ScanPlan, plan_scan
 from vrw_jax.scans.sensitivity_indices import sobol_indices
+from vrw_jax.scans.special_point_map import (
+    SpecialPointMap,
+    follow_special_points,
+    map_special_points,
+    require_map_grid,
+)
 from vrw_jax.scans.store import open_scan

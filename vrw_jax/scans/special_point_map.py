@@ -1,0 +1,148 @@
+"""Map of special points of gaits over two parameters: a scan, and curves between its samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vrw_jax.branches import (
+    SPECIAL_POINT_MEASURES,
+    SpecialPointCurve,
+    UnexplainedChange,
+    trace_special_points,
+)
+from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import xarray as xr
+from vrw_jax.scans.design import AbstractDesign
+from vrw_jax.scans.execution import ProgressCallback, scan
+from vrw_jax.selection import describe_models
+from vrw_jax.simulation import ModelLike, check_model
+from vrw_jax.validation import check_callable, check_names, check_type
+from vrw_jax.wheel import Outcome, WheelParams
+
+
+class SpecialPointMap(NamedTuple):
+    """Gaits of a grid over two parameters, and all curves of special points between them.
+
+    - `scan`: the samples, as `vrw.scan` returns them;
+    - `curves`: every curve, as `vrw.continue_special_point` returns it;
+    - `unexplained_changes`: changes of sign between neighboring samples without a curve nearby.
+    """
+
+    scan: xr.Dataset
+    curves: tuple[SpecialPointCurve, ...]
+    unexplained_changes: tuple[UnexplainedChange, ...]
+
+    @property
+    def ending(self) -> str:
+        """Return how many changes between samples no curve explains, as a sentence."""
+        n_changes = len(self.unexplained_changes)
+        return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
+
+    def __str__(self) -> str:
+        lines = [self.ending]
+        for change in self.unexplained_changes:
+            values = [
+                float(self.scan[name][i])
+                for name, i in zip(self.scan.outcome.dims, change.sample, strict=True)
+            ]
+            lines.append(f"    {change.name} at ({values[0]:.6g}, {values[1]:.6g})")
+        return "\n\n".join([*map(str, self.curves), "\n".join(lines)])
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def map_special_points(
+    design: AbstractDesign,
+    measures: str | Iterable[str] = ("dls_fraction",),
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    store: str | Path | None = None,
+    on_progress: ProgressCallback | None = None,
+    on_stage: Callable[[str], None] | None = None,
+) -> SpecialPointMap:
+    """Scan a grid over two parameters, and follow all special points of its gaits.
+
+    It is the function behind `vrw map`. Curves start on branches across the grid. If a quantity has
+    different signs at neighboring samples and no curve runs between them, branches through these
+    samples are searched for further curves.
+
+    Args:
+        design: a `vrw.grid` over two parameters with ascending values.
+        measures: names of the measures of the scan, besides those that the curves need.
+        base: the wheel whose parameters are not swept; Table 1 by default.
+        model: a `ViscoelasticWheel`, which is the default.
+        options: numerical options of the steps that check the gaits of the scan.
+        store: folder that holds the scan.
+        on_progress: function that is called with the `ScanProgress` after each chunk.
+        on_stage: function that is called with a description of each stage after the scan.
+
+    Returns:
+        A `SpecialPointMap`. `vrw.plot.map_figure` draws its scan and curves.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if no sample has a gait.
+
+    Examples:
+        >>> grid = vrw.grid(damping=[150.0, 180.0, 210.0], slope=[0.28, 0.29, 0.30])
+        >>> special_points = vrw.map_special_points(grid, "speed")  # doctest: +SKIP
+        >>> figure = vrw.plot.map_figure(
+        ...     special_points.scan, "speed", special_points.curves
+        ... )  # doctest: +SKIP
+    """
+    check_type("design", design, AbstractDesign, "give vrw.grid(damping=[...], slope=[...])")
+    require_map_grid(design)
+    if on_stage is not None:
+        check_callable("on_stage", on_stage, "that takes a sentence")
+    wheel_model: Any = check_model(model)
+    if "map" not in wheel_model.capabilities.commands:
+        raise ValueError(
+            f"model is {type(wheel_model).__name__}, but special points are mapped for "
+            f"{describe_models('map')}: give that."
+        )
+    samples = scan(
+        design,
+        tuple(dict.fromkeys((*check_names("measures", measures), *SPECIAL_POINT_MEASURES))),
+        base=base,
+        model=wheel_model,
+        options=options,
+        store=store,
+        on_progress=on_progress,
+    )
+    return follow_special_points(
+        samples, WheelParams() if base is None else base, wheel_model, on_stage
+    )
+
+
+def follow_special_points(
+    samples: xr.Dataset,
+    base: WheelParams,
+    model: Any,
+    on_stage: Callable[[str], None] | None = None,
+) -> SpecialPointMap:
+    """Return the map of special points over the two parameters of a scan with their measures."""
+    if not np.any(samples.outcome.values == Outcome.STEPPED):
+        raise ValueError("no gait was found on the grid: choose another.")
+    return SpecialPointMap(samples, *trace_special_points(samples, base, model, on_stage))
+
+
+def require_map_grid(design: AbstractDesign) -> None:
+    """Raise unless the design is a grid over two parameters, each with ascending values."""
+    if len(design.shape) != 2:
+        raise ValueError(
+            f"the design sweeps {', '.join(design.names)}, but a map is a grid over two "
+            "parameters: sweep two below [grid], or in vrw.grid."
+        )
+    for name in design.names:
+        values = design.values[name]
+        if len(values) < 2 or not np.all(np.diff(values) > 0.0):
+            raise ValueError(
+                f"{name} has the values {values.tolist()}, but each side of a map has at least two "
+                "ascending ones: sort them, or give more."
+            )
