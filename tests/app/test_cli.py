@@ -117,6 +117,23 @@ def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     assert result[2]["total"] == 6_000
 
 
+def test_the_bar_of_a_resumed_scan_includes_the_earlier_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of 10,000 samples 4,000 are from an earlier run; rate and time left are those of this run."""
+    clock = iter([0.0, 100.0, 110.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    result: list[dict] = []
+    report = make_scan_reporter(lambda _, **shown_values: result.append(shown_values), 0)
+    for done in (0, 1000, 3000):
+        report(ScanProgress(n_samples=6_000, n_done=done, n_failed=0, n_reused=4_000))
+    assert [(shown["completed"], shown["total"]) for shown in result] == [
+        (4_000, 10_000), (5_000, 10_000), (7_000, 10_000),
+    ]  # fmt: skip
+    assert result[0]["note"] == "4,000 from an earlier run"
+    assert result[2]["note"] == "200 per s, 0 % without a gait, 15 s left"
+
+
 @pytest.mark.parametrize(
     ("encoding", "words", "sentence"),
     [

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -649,3 +651,67 @@ def test_an_address_without_a_scheduler_gets_one_sentence(
     for address in ("nonsense://there", "tcp://127.0.0.1:9"):
         with pytest.raises(ValueError, match="no dask scheduler answers"), connect_workers(address):
             pass
+
+
+def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(dask, "MAX_SILENT_SECONDS", 0.5)
+    monkeypatch.setattr(dask, "_make_engine_once", lambda _: evaluate_arithmetically)
+    run_plan(make_plan(), tmp_path / "alone.zarr", evaluate=evaluate_arithmetically)
+    with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster:
+        messages: list[str] = []
+
+        def show(message: Warning | str, *_: object, **__: object) -> None:
+            messages.append(str(message))
+            cluster.scale(1)
+
+        with connect_workers(cluster.scheduler_address) as executor, warnings.catch_warnings():
+            warnings.simplefilter("always")
+            monkeypatch.setattr("warnings.showwarning", show)
+            run_plan(make_plan(), tmp_path / "s.zarr", executor=executor)
+    assert len([text for text in messages if "has no workers" in text]) == 1
+    assert list_files(tmp_path / "s.zarr") == list_files(tmp_path / "alone.zarr")
+
+
+def test_a_lost_cluster_gets_one_sentence_and_the_scan_continues_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(dask, "_make_engine_once", lambda _: evaluate_arithmetically)
+    cluster = LocalCluster(n_workers=1, processes=False, dashboard_address=None)
+    n_done_at_loss: list[int] = []
+
+    def close_cluster(progress: ScanProgress) -> None:
+        if progress.n_done and not n_done_at_loss:
+            n_done_at_loss.append(progress.n_done)
+            cluster.close()
+
+    with (
+        pytest.raises(ValueError, match=r"the dask cluster at .* is gone: start it again"),
+        connect_workers(cluster.scheduler_address) as executor,
+    ):
+        run_plan(make_plan(1), tmp_path / "s.zarr", on_progress=close_cluster, executor=executor)
+    n_kept = np.count_nonzero(open_scan(tmp_path / "s.zarr").outcome.values != -1)
+    assert n_done_at_loss[0] <= n_kept < SMALL_GRID.size
+    run_plan(make_plan(1), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)
+    run_plan(make_plan(1), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
+    assert list_files(tmp_path / "s.zarr") == list_files(tmp_path / "whole.zarr")
+
+
+def test_an_interrupted_scan_names_the_kept_chunks_without_a_traceback_of_zarr(
+    tmp_path: Path,
+) -> None:
+    store = tmp_path / "s.zarr"
+    with pytest.raises(KeyboardInterrupt, match=r"stopped: 1 of \d+ chunks are kept") as caught:
+        run_plan(make_plan(), store, evaluate=CountingEngine(2))
+    assert "run the same again, it goes on from there" in str(caught.value)
+    assert str(store) in str(caught.value)
+    text = "".join(traceback.format_exception(caught.value))
+    assert "zarr/" not in text
+    assert "During handling" not in text
+    with pytest.raises(KeyboardInterrupt, match="nothing is kept: give store="):
+        run_plan(make_plan(), evaluate=CountingEngine(2))

@@ -187,7 +187,8 @@ def make_progress_bar(task: str) -> "Bar":
 def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"], None]:
     """Return the callback that shows rate, share without a gait and remaining time.
 
-    The rate is measured from the second chunk on, because the first one includes compilation.
+    The rate is measured from the second chunk on, because the first one includes compilation. The
+    bar includes the samples of an earlier run; rate and share are those of this run.
     """
     import time
 
@@ -198,7 +199,7 @@ def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"]
     def report(progress: "ScanProgress") -> None:
         """Update the bar."""
         time_now, n_done = time.monotonic(), progress.n_done
-        note = ""
+        note = f"{progress.n_reused:,} from an earlier run" if progress.n_reused else ""
         if n_done:
             first_report.append((time_now, n_done))
             first_time, n_before = first_report[0]
@@ -209,8 +210,8 @@ def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"]
                 note = f"{rate:,.0f} per s, {note}, {format_seconds(seconds_left)} left"
         update(
             task,
-            total=progress.n_samples,
-            completed=n_done,
+            total=progress.n_reused + progress.n_samples,
+            completed=progress.n_reused + n_done,
             description="scanning" if n_done else "compiling",
             note=note,
         )

@@ -9,9 +9,12 @@ import asyncio
 import contextlib
 import functools
 import itertools
+import logging
 import pickle
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,13 +33,17 @@ from vrw_jax.scans.planning import (
 )
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 QUEUED_CHUNKS_PER_THREAD = 2
 """Number of submitted chunks per thread, chosen to keep a thread busy with little memory."""
 
 SCHEDULER_TIMEOUT = "10s"
 """Longest time until a scheduler responds."""
+
+MAX_SILENT_SECONDS = 10.0
+"""Longest time without a result until the workers are counted, chosen because workers that were
+just started are connected by then."""
 
 
 @contextlib.contextmanager
@@ -50,6 +57,7 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
             "run pip install 'vrw-jax[dask]'."
         ) from error
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_hide_cancelled_tasks())
         if address == "local":
             cluster = LocalCluster(
                 n_workers=count_cores(), threads_per_worker=1, dashboard_address=None
@@ -65,7 +73,23 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
                     "when it started, such as tcp://host:8786, or 'local'."
                 ) from error
         stack.enter_context(client)
-        yield functools.partial(_compute_chunks, client)
+        yield functools.partial(_compute_chunks, client, address)
+
+
+@contextlib.contextmanager
+def _hide_cancelled_tasks() -> Iterator[None]:
+    """Keep tasks that are cancelled with a lost scheduler out of the log of distributed."""
+    log = logging.getLogger("distributed.client")
+
+    def is_shown(record: logging.LogRecord) -> bool:
+        error_type = record.exc_info[0] if record.exc_info else None
+        return error_type is None or not issubclass(error_type, asyncio.CancelledError)
+
+    log.addFilter(is_shown)
+    try:
+        yield
+    finally:
+        log.removeFilter(is_shown)
 
 
 def _require_response(address: str) -> None:
@@ -85,15 +109,13 @@ def _require_response(address: str) -> None:
 
 
 def _compute_chunks(
-    client: "Client", plan: ScanPlan, missing: Sequence[int]
+    client: "Client", address: str, plan: ScanPlan, missing: Sequence[int]
 ) -> Iterator[ChunkResult]:
     """Yield the results of the missing chunks in the order of completion."""
-    from distributed import Future, KilledWorker, as_completed
-
     pickled_request = pickle.dumps(plan.request)
     local_environment, remaining_chunks = describe_environment(), iter(missing)
     chunk_of_future: dict[Future, int] = {}
-    completed_futures = as_completed(loop=client.loop)
+    completed_futures: SimpleQueue[Future] = SimpleQueue()
 
     def submit_chunks() -> None:
         """Submit chunks until every thread of the cluster has enough."""
@@ -104,18 +126,16 @@ def _compute_chunks(
             columns = plan.design.sample_block(plan.layout.chunk_region(index))
             future = client.submit(_compute_in_worker, pickled_request, columns, pure=False)
             chunk_of_future[future] = index
-            completed_futures.add(future)
+            future.add_done_callback(completed_futures.put)
 
     try:
-        submit_chunks()
-        for future in completed_futures:
-            try:
+        with _explain_loss(address, OSError):
+            submit_chunks()
+        while chunk_of_future:
+            with _explain_loss(address, OSError):
+                future = _wait_for_future(client, address, completed_futures)
+            with _explain_loss(address):
                 worker_environment, results = future.result()
-            except KilledWorker as error:
-                raise ValueError(
-                    "a chunk was given up because each worker that had it died: see to the "
-                    "workers (their memory, say) and run the same again, it goes on from there."
-                ) from error
             environment_difference = describe_difference(local_environment, worker_environment)
             if environment_difference:
                 raise ValueError(
@@ -125,9 +145,55 @@ def _compute_chunks(
                 )
             yield chunk_of_future.pop(future), results
             del future  # lets the cluster release its result
-            submit_chunks()
+            with _explain_loss(address, OSError):
+                submit_chunks()
     finally:
-        client.cancel(list(chunk_of_future))
+        if client.status == "running":
+            client.cancel(list(chunk_of_future))
+
+
+def _wait_for_future(
+    client: "Client", address: str, completed_futures: "SimpleQueue[Future]"
+) -> "Future":
+    """Return the next completed future; warn once if the cluster has no workers."""
+    is_warned = False
+    while True:
+        try:
+            return completed_futures.get(timeout=MAX_SILENT_SECONDS)
+        except Empty:
+            pass
+        if not is_warned and not client.nthreads():
+            warnings.warn(
+                f"the dask cluster at {address} has no workers, so that nothing is computed: start "
+                f"some, as with `dask worker {address}`; the scan continues as soon as there is "
+                "one.",
+                stacklevel=1,
+            )
+            is_warned = True
+
+
+@contextlib.contextmanager
+def _explain_loss(address: str, *other_errors: type[Exception]) -> Iterator[None]:
+    """Replace the errors of lost workers or of a lost scheduler by one sentence with a remedy.
+
+    `other_errors` have the same cause where a chunk itself cannot raise them.
+    """
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
+
+    loss_errors: tuple[type[BaseException], ...] = (CancelledError, CommClosedError, *other_errors)
+    try:
+        yield
+    except KilledWorker as error:
+        raise ValueError(
+            "a chunk was given up because each worker that had it died: see to the "
+            "workers (their memory, say) and run the same again, it goes on from there."
+        ) from error
+    except loss_errors as error:
+        raise ValueError(
+            f"the dask cluster at {address} is gone: start it again and run the same again, it goes"
+            " on with the chunks that its store lacks."
+        ) from error
 
 
 def _compute_in_worker(

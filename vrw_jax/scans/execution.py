@@ -182,17 +182,33 @@ def _compute_chunks(
     n_samples, n_done, n_failed = sum(map(math.prod, shapes.values())), 0, 0
     if on_progress is not None:
         on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
-    for index, results in executor(scan_plan, missing):
-        shape = shapes[index]
-        block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
-        with _explain_full_disk(storage, scan_plan.layout.n_chunks):
-            storage.write_chunk(index, block)
-        n_done += math.prod(shape)
-        n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
-        if on_progress is not None:
-            on_progress(
-                ScanProgress(n_samples, n_done, n_failed, scan_plan.design.size - n_samples)
-            )
+    try:
+        for index, results in executor(scan_plan, missing):
+            shape = shapes[index]
+            block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
+            with _explain_full_disk(storage, scan_plan.layout.n_chunks):
+                storage.write_chunk(index, block)
+            n_done += math.prod(shape)
+            n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+            if on_progress is not None:
+                on_progress(
+                    ScanProgress(n_samples, n_done, n_failed, scan_plan.design.size - n_samples)
+                )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            _describe_interruption(storage, scan_plan.layout.n_chunks)
+        ) from None
+
+
+def _describe_interruption(storage: AbstractStore, n_chunks: int) -> str:
+    """Return a sentence about the chunks that an interrupted scan keeps."""
+    if isinstance(storage, MemoryStore):
+        return "stopped, and nothing is kept: give store=, a folder, to continue another time."
+    n_done = n_chunks - len(storage.find_missing_chunks())
+    return (
+        f"stopped: {n_done} of {n_chunks} chunks are kept in {storage.location}; run the same "
+        "again, it goes on from there."
+    )
 
 
 def _compute_in_process(scan_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
