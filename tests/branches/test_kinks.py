@@ -8,6 +8,7 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax.branches.branch_location import continue_and_locate
 from vrw_jax.branches.continuation import MapContinuation
+from vrw_jax.branches.jumps import find_jumps
 from vrw_jax.continuation import AbstractContinuationProblem, ArclengthOptions, NewtonStep
 
 TAN = float(np.tan(0.3))
@@ -111,3 +112,29 @@ def test_the_shipped_branch_on_unilateral_contact_reaches_both_ends_of_its_range
     )
     period = np.interp(0.51, branch.values, branch.dataset.period)
     assert period == pytest.approx(float(known.period), rel=1e-3)
+
+
+def test_only_a_state_that_departs_from_both_tangents_jumps():
+    """Neighbors on the unit circle do not jump, nor do points on both sides of a fold."""
+    angles = np.linspace(0.3, 2.9, 9)
+    states, shares = np.cos(angles)[:, None], np.sin(angles)
+    pairs = [(i, i + 1) for i in range(8)]
+    assert find_jumps(states, shares, np.cos(angles), pairs) == []
+    across_fold = np.array([[0.1], [-0.1]]), np.array([0.995, 0.995]), np.array([0.1, -0.1])
+    assert find_jumps(*across_fold, [(0, 1)]) == []
+    across_jump = np.array([[0.0], [0.1]]), np.array([0.0, 1e-4]), np.array([0.6, 0.6])
+    assert find_jumps(*across_jump, [(0, 1)]) == [(0, 1)]
+
+
+@pytest.mark.slow
+def test_a_fold_with_unilateral_contact_is_located_with_long_steps_too():
+    """At c = 205 the slow gait needs friction 0.852084: docs/figures/ground_atlas_branches.csv."""
+    branch = vrw.continue_branch(
+        vrw.WheelParams(damping=205.0),
+        "friction",
+        (0.8, 1.0),
+        model=vrw.UnilateralWheel(friction=1.0),
+        options=ArclengthOptions(initial_ds=0.02, max_ds=0.06),
+    )
+    (fold,) = [point for point in branch.special_points if point.kind == "fold"]
+    assert fold.value == pytest.approx(0.85208448, abs=1e-7)

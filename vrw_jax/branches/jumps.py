@@ -21,8 +21,9 @@ JUMP_SHARES = (1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3)
 chosen because two impacts change places within a share of 1e-4 on unilateral contact."""
 
 JUMP_FACTOR = 5.0
-"""Times that a state must change more than its tangents say for a jump; chosen because they agree
-to some tenths where the longest step may turn by 0.2 rad, and at a kink either side bounds it."""
+"""Factor by which the chord between two points must be steeper than both tangents for a jump,
+chosen because the slope of a chord is between those of the tangents to some tenths if a
+continuation step turns by at most 0.2 rad, also at a kink."""
 
 
 def follow_beyond_jumps(
@@ -91,8 +92,13 @@ def find_jumps(
 
     `shares` are the parameter's as shares of its range, `share_slopes` theirs along the branch.
     """
-    with np.errstate(divide="ignore"):
-        steep = np.sqrt(np.maximum(1.0 / share_slopes**2 - 1.0, 0.0))
-    rise = lambda i, j: float(np.linalg.norm(states[j] - states[i]))
-    most = lambda i, j: JUMP_FACTOR * max(steep[i], steep[j]) * abs(shares[j] - shares[i])
-    return [pair for pair in pairs if rise(*pair) > most(*pair)]
+
+    def has_jump(i: int, j: int) -> bool:
+        change = shares[j] - shares[i]
+        chord = np.hypot(np.linalg.norm(states[j] - states[i]), change)
+        smallest_change = min(abs(share_slopes[i]), abs(share_slopes[j])) * chord
+        # Across a fold the slopes differ in sign, and the two ends may have the same parameter.
+        is_one_way = share_slopes[i] * share_slopes[j] > 0.0
+        return bool(is_one_way and JUMP_FACTOR * abs(change) < smallest_change)
+
+    return [pair for pair in pairs if has_jump(*pair)]
