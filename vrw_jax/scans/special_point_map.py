@@ -30,6 +30,11 @@ class SpecialPointMap(NamedTuple):
     - `scan`: the samples, as `vrw.scan` returns them;
     - `curves`: every curve, as `vrw.continue_special_point` returns it;
     - `unexplained_changes`: changes of sign between neighboring samples without a curve nearby.
+
+    Examples:
+        >>> grid = vrw.grid(damping=[150.0, 180.0, 210.0], slope=[0.28, 0.29, 0.30])
+        >>> special_points = vrw.map_special_points(grid)  # doctest: +SKIP
+        >>> [curve.name for curve in special_points.curves]  # doctest: +SKIP
     """
 
     scan: xr.Dataset
