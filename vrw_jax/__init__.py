@@ -69,7 +69,7 @@ from vrw_jax.tolerance import (
 from vrw_jax.tuning import TuneResult, tune
 from vrw_jax.validation import RENAMED_IN_PACKAGE, describe_renamed, suggest_name
 from vrw_jax.web import explore
-from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wheel import Outcome, ParameterSet, WheelParams, parameter_sets
 
 __all__ = (
     "MEASURES",
@@ -88,6 +88,7 @@ __all__ = (
     "ModelChoice",
     "MultifidelityMean",
     "Outcome",
+    "ParameterSet",
     "ReturnMapCycle",
     "RigidWheel",
     "SpecialPoint",
@@ -118,6 +119,7 @@ __all__ = (
     "multifidelity_mean",
     "open_scan",
     "paper_start",
+    "parameter_sets",
     "plot",
     "return_map",
     "saltelli",

@@ -49,7 +49,7 @@ STACK = 1 << 20
 
 SLIDERS = {
     "damping": (0.0, 600.0),
-    "stiffness": (200.0, 2000.0),
+    "stiffness": (200.0, 3000.0),
     "natural_length": (0.95, 1.15),
     "slope": (0.0, 0.6),
     "hub_mass": (0.0, 40.0),

@@ -26,6 +26,7 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     WheelParams,
     check_parameter_name,
+    parameter_sets,
     refuse_symbol,
 )
 
@@ -33,6 +34,8 @@ RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli"
 DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
 TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
+PARAMETER_SET_KEY = "parameter_set"
+"""Key of `[wheel]` that names a set of parameters, which the other keys of the table replace."""
 _AXIS_KEYS = ("from", "to", "count")
 
 MAX_CONFIG_INTEGER = 2**53
@@ -212,7 +215,9 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
         else None
     )
     wheel = _parse_wheel(_get_table(tables, "wheel"))
-    doubly_given = [key for key in wheel if design is not None and key in design.names]
+    doubly_given = [
+        key for key in _get_table(tables, "wheel") if design is not None and key in design.names
+    ]
     if doubly_given:
         raise ValueError(
             f"{doubly_given[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can "
@@ -260,9 +265,15 @@ def parse_assignment(text: str) -> tuple[str, float | int]:
 
 def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
     """Return the parameters of `[wheel]`."""
-    _require_known_keys(table, (*PARAMETER_NAMES, "n_legs"), "[wheel]", "parameters")
+    known = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
+    _require_known_keys(table, known, "[wheel]", "parameters")
     values: dict[str, float | int] = {}
+    if (set_name := table.get(PARAMETER_SET_KEY)) is not None:
+        check_known_name(set_name, tuple(parameter_sets), "parameter set")
+        values |= parameter_sets[str(set_name)].values
     for name, value in table.items():
+        if name == PARAMETER_SET_KEY:
+            continue
         if name == "n_legs":
             values[name] = _parse_int(value, name, 5)
             if values[name] > MAX_CONFIG_LEGS:

@@ -11,6 +11,7 @@ from vrw_jax.wheel.geometry import (
     rear_foot_height,
 )
 from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     MAX_SI_VALUE,

@@ -14,6 +14,7 @@ const MAPPED = [...ALIKE, ...INDICATORS, ...Object.keys(facts.margins)];
 const MAPPED_ON_GROUND = [...ALIKE, "slip", "energy_lost_friction", "duration_flight", ...facts.stoppers];
 const PRESETS = {
   "Table 1": {},
+  "two peaks": { damping: 100, slope: 0.075, stiffness: 2500, natural_length: 1 },
   "foot scuffs": { damping: 40 },
   "hardly stable": { damping: 242, slope: 0.25, stiffness: 955, natural_length: 1.07, hub_mass: 22.1 },
   "unstable": { damping: 228, slope: 0.288, stiffness: 642, natural_length: 1.03, hub_mass: 11.1 },
