@@ -62,7 +62,7 @@ class UnilateralEngine:
 
         finder: Any = make_finder(model, base.n_legs, step_options=options)
         self._finder = dataclasses.replace(finder, batch_sizes=(GAITS_PER_READ,))
-        read = type(finder).read
+        read = type(finder).read_measure
         self._measure_reader, self._derivatives = MeasureReader(read, measure_names), derivatives
         self._derivative_reader = MeasureReader(
             read, tuple(dict.fromkeys(d.measure for d in derivatives))
