@@ -386,7 +386,7 @@ def test_derivatives_of_a_batch_element_do_not_depend_on_the_others(unilateral_b
 def test_integration_by_xla_agrees_with_machine_code(unilateral_batch, monkeypatch):
     *_, walk_result = unilateral_batch
     solution = walk_result(slice(None))
-    monkeypatch.setattr(simd, "serves", lambda: False)
+    monkeypatch.setattr(simd, "is_available", lambda: False)
     ground_lanes._compile_walk.cache_clear()
     by_xla = walk_result(slice(None))
     ground_lanes._compile_walk.cache_clear()
@@ -492,7 +492,7 @@ def test_a_batched_step_has_measures_and_derivatives_of_a_single_wheel(scene, st
 
     def result(c, mu, rate):
         wheel, model = vrw.WheelParams(damping=c), eqx.tree_at(lambda m: m.friction, ground, mu)
-        single_result = model.step(wheel, jnp.asarray(x).at[1].set(rate), definition)
+        single_result = model.take_step(wheel, jnp.asarray(x).at[1].set(rate), definition)
         return jnp.concatenate(
             [single_result.section_state[:20], times(single_result.durations)]
         ), single_result

@@ -596,7 +596,7 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
         )
 
     *solution, outcome, passes = jax.jit(told)(rows)
-    monkeypatch.setattr(simd, "serves", lambda: False)
+    monkeypatch.setattr(simd, "is_available", lambda: False)
     *by_xla, code, n = jax.jit(lambda vectors: told(vectors))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)

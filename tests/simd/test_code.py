@@ -165,8 +165,9 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
             sums = jax.tree.map(lambda y: y + jnp.sum(x * table[:, None], 0), f(2.0) | f(0.5))
             turn = lambda i, z: z + table[i] * sums["beta"]
             return {"loop": jax.lax.fori_loop(0, 9, turn, x[1]), **sums}
+        table = jnp.arange(9.0, dtype=jnp.float32)
         shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
-        closed = code_cache.trace_for_machine_code(lambda x: step(x, jnp.arange(9.0)), shape)
+        closed = code_cache.trace_for_machine_code(lambda x: step(x, table), shape)
         print(code_cache._digest(kernel.write_module(closed, 8).encode()))
     """
     lines = "\n".join(line[8:] for line in result.splitlines())
