@@ -1,11 +1,12 @@
 """Attractors: many starts, each walked until its motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. Starts without a result after a round are packed together
-for the next round, so that long transients cost little.
+Starts may belong to different wheels. Starts without a result after a round are gathered for the
+next round, so that long transients cost little.
 """
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -21,24 +22,29 @@ from vrw_jax.contact import (
     walk_batch,
 )
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
 from vrw_jax.simulation.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
 
-STEPS_PER_ROUND = 10
-"""Number of steps between two tests for periodic motion."""
 
-STARTS_PER_BLOCK = 128
-"""Number of starts per compiled call; one shape is compiled once."""
+@dataclass(frozen=True)
+class AttractorOptions:
+    """Tests by which walks are found periodic; distances are those of section states."""
 
-PERIODICITY_TOLERANCE = 1e-7
-"""Largest change of the section states over one period in periodic motion."""
+    steps_per_round: int = 10
+    """Number of steps between two tests for periodic motion."""
+    periodicity_tolerance: float = 1e-7
+    """Largest change of the section states over one period in periodic motion."""
+    arrival_distance: float = 1e-3
+    """Distance from its orbit below which a walk has reached the orbit."""
+    same_orbit_distance: float = 1e-4
+    """Distance below which two orbits are the same.
 
-ORBIT_ARRIVAL_DISTANCE = 1e-3
-"""Distance from its orbit below which a walk has reached the orbit."""
+    It is chosen because it is far above the periodicity tolerance.
+    """
 
-SAME_ORBIT_DISTANCE = 1e-4
-"""Distance below which two orbits are the same."""
+
+ATTRACTOR_OPTIONS = AttractorOptions()
 
 
 class WalkEnds(NamedTuple):
@@ -47,29 +53,30 @@ class WalkEnds(NamedTuple):
     outcome: np.ndarray  # STEPPED if it still walks
     period: np.ndarray  # of its orbit, in steps; 0 if the motion is not periodic
     n_steps: np.ndarray  # until it reached its orbit, or fell
-    orbit_states: (
-        np.ndarray
-    )  # (start, max_period, m): section states, lowest dtheta- first, then NaN
+    orbit_states: np.ndarray
+    """Section states of the orbit, (start, max_period, m): lowest dtheta- first, then NaN."""
 
 
 @eqx.filter_jit
 def _walk_block(
-    model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
+    model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
     """Return section states and outcomes of one round of steps from a block of starts."""
-    walk_round = lambda params, x: walk(params, x, STEPS_PER_ROUND, model=model, options=options)
+    walk_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
     walks = jax.vmap(walk_round)(params, x)
     return walks.steps.section_state, walks.steps.outcome
 
 
 def _walk_round_batched(
-    model: Any, options: StepOptions, params: WheelParams, x: np.ndarray
+    model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same for unilateral contact and any number of wheels, by the batch kernel."""
+    """Return `_walk_block` with unilateral contact for any number of starts, by the batch
+    kernel.
+    """
     n, columns = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
     x = embed_section_states(columns, np.asarray(x), n)
     states, codes = list[np.ndarray](), list[np.ndarray]()
-    for _ in range(STEPS_PER_ROUND):
+    for _ in range(n_steps):
         x, _, outcome, *_ = walk_batch(columns, x, 1, model, options, n)
         # A wheel that fell has no section state, so its outcome is kept.
         outcome = outcome if not codes else np.where(codes[-1] > 0, codes[-1], outcome)
@@ -85,31 +92,37 @@ def walk_until_periodic(
     options: StepOptions,
     max_steps: int,
     max_period: int,
+    attractor_options: AttractorOptions = ATTRACTOR_OPTIONS,
 ) -> WalkEnds:
     """Return how each walk ends; `params` is one wheel or has the leading axis of the starts."""
     n = len(starts)
     broadcast = lambda x: np.broadcast_to(np.asarray(x), n)
     wheels = jax.tree.map(broadcast, params)
-    n_rounds = -(-max_steps // STEPS_PER_ROUND)
-    history = np.full((n, 1 + n_rounds * STEPS_PER_ROUND, starts.shape[1]), np.nan)
+    n_round_steps = attractor_options.steps_per_round
+    n_rounds = -(-max_steps // n_round_steps)
+    history = np.full((n, 1 + n_rounds * n_round_steps, starts.shape[1]), np.nan)
     history[:, 0] = starts
     outcome = np.full(n, int(Outcome.STEPPED))
     period, n_walked = np.zeros(n, int), np.zeros(n, int)
     unsettled = np.arange(n)
     walk_round: Callable[..., tuple]
     if model.batch_kernel == "legs":
-        walk_round = functools.partial(_walk_round_batched, model, options)
+        walk_round = functools.partial(_walk_round_batched, model, options, n_round_steps)
     else:
-        walk_block = functools.partial(_walk_block, model, options)
-        walk_round = functools.partial(map_in_batches, walk_block, (STARTS_PER_BLOCK,))
+        walk_block = functools.partial(_walk_block, model, options, n_round_steps)
+        walk_round = functools.partial(
+            map_in_batches, walk_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
+        )
     for k in range(n_rounds):
-        round_rows = slice(1 + k * STEPS_PER_ROUND, 1 + (k + 1) * STEPS_PER_ROUND)
-        unsettled_starts = take_rows(wheels, unsettled), history[unsettled, k * STEPS_PER_ROUND]
+        round_rows = slice(1 + k * n_round_steps, 1 + (k + 1) * n_round_steps)
+        unsettled_starts = take_rows(wheels, unsettled), history[unsettled, k * n_round_steps]
         states, codes = map(np.asarray, walk_round(*unsettled_starts))
         history[unsettled, round_rows], outcome[unsettled] = states, codes[:, -1]
-        n_walked[unsettled] = k * STEPS_PER_ROUND + np.sum(codes == Outcome.STEPPED, 1)
-        n_known = (k + 1) * STEPS_PER_ROUND
-        period[unsettled] = _detect_periods(history[unsettled, : n_known + 1], max_period)
+        n_walked[unsettled] = k * n_round_steps + np.sum(codes == Outcome.STEPPED, 1)
+        n_known = (k + 1) * n_round_steps
+        period[unsettled] = _detect_periods(
+            history[unsettled, : n_known + 1], max_period, attractor_options.periodicity_tolerance
+        )
         period[outcome != Outcome.STEPPED] = 0
         unsettled = unsettled[(outcome[unsettled] == Outcome.STEPPED) & (period[unsettled] == 0)]
         if not len(unsettled):
@@ -121,12 +134,12 @@ def walk_until_periodic(
         distances = np.linalg.norm(
             history[i, : n_walked[i] + 1, None] - last_states[None], axis=-1
         ).min(1)
-        distant_steps = np.flatnonzero(distances > ORBIT_ARRIVAL_DISTANCE)
+        distant_steps = np.flatnonzero(distances > attractor_options.arrival_distance)
         n_walked[i] = distant_steps[-1] + 1 if len(distant_steps) else 0
     return WalkEnds(outcome, period, n_walked, orbit)
 
 
-def _detect_periods(history: np.ndarray, max_period: int) -> np.ndarray:
+def _detect_periods(history: np.ndarray, max_period: int, tolerance: float) -> np.ndarray:
     """Return the shortest period, in steps, that the last two periods confirm, or 0."""
     periods = np.zeros(len(history), int)
     n_states = history.shape[1]
@@ -135,7 +148,7 @@ def _detect_periods(history: np.ndarray, max_period: int) -> np.ndarray:
             history[:, n_states - 2 * period :]
             - history[:, n_states - 3 * period : n_states - period]
         )
-        periods[change.max((1, 2)) < PERIODICITY_TOLERANCE] = period
+        periods[change.max((1, 2)) < tolerance] = period
     return periods
 
 
@@ -146,7 +159,9 @@ class Attractors(NamedTuple):
     orbits: list[np.ndarray]  # (period, m) each
 
 
-def find_distinct_orbits(walk_ends: WalkEnds) -> Attractors:
+def find_distinct_orbits(
+    walk_ends: WalkEnds, options: AttractorOptions = ATTRACTOR_OPTIONS
+) -> Attractors:
     """Return the distinct orbits, compared without regard to their first step."""
     index = np.full(len(walk_ends.period), -1)
     orbits: list[np.ndarray] = []
@@ -155,7 +170,7 @@ def find_distinct_orbits(walk_ends: WalkEnds) -> Attractors:
         for j, known_orbit in enumerate(orbits):
             if (
                 len(known_orbit) == len(orbit)
-                and np.abs(known_orbit - orbit).max() < SAME_ORBIT_DISTANCE
+                and np.abs(known_orbit - orbit).max() < options.same_orbit_distance
             ):
                 index[i] = j
                 break
@@ -184,15 +199,14 @@ def measure_orbits(
     n = len(states)
     wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
     if model.batch_kernel == "legs":
-        columns, unilateral_model = (
-            np.asarray(jax.vmap(model.parameter_values)(wheels)).T,
-            cast(UnilateralWheel, model),
-        )
+        columns = np.asarray(jax.vmap(model.parameter_values)(wheels)).T
+        unilateral_model = cast(UnilateralWheel, model)
         step_results, _ = step_batch_with_jacobian(
             columns, states, unilateral_model, options, params.n_legs, ()
         )
         return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
     measure_block = functools.partial(_measure_block, model, options)
     return jax.tree.map(
-        np.asarray, map_in_batches(measure_block, (STARTS_PER_BLOCK,), wheels, states)
+        np.asarray,
+        map_in_batches(measure_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,), wheels, states),
     )

@@ -33,9 +33,6 @@ POST_LANDING_NAMES = ("theta_post_impact", "dtheta_post_impact")
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """Values of each component of a start, by name; a single number is not an axis."""
 
-NO_ATTRACTOR = -1
-"""Index of a start that reaches no attractor."""
-
 
 @refuse_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
@@ -112,7 +109,7 @@ def basin(
         "attractor": xr.Variable(
             axes,
             attractors.orbit_index.reshape(shape),
-            {"long_name": "orbit that the walk settles on", "flag_none": NO_ATTRACTOR},
+            {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
         "outcome": xr.Variable(axes, walk_ends.outcome.reshape(shape), measure_attrs("outcome")),
         "steps": xr.Variable(
