@@ -22,24 +22,28 @@ class MonitoredFunctions(NamedTuple):
     """Functions monitored along a phase: guards that end it, then margins whose minimum is
     searched.
 
-    `values` returns the `n_guards` guards followed by the monitors. A monitor's minimum is sought
-    at every interior local minimum and at the phase's end; at its start too (`count_start`), unless
-    the quantity is zero there by construction, like the height of a foot that leaves the ground.
-    `sizes`: what guards are differences of. One within some roundings of it is at zero: in a dip
-    of microseconds no time brings it closer.
-    `on_start`: guards that the caller takes for zero at the start, whatever rounding makes of them;
-    without it those that read exactly zero there, or rounding of their `sizes`.
+    - `values`: returns the guards, then the margins;
+    - `includes_start`: whether each margin counts at the start of the phase. A margin that is zero
+      there by construction does not count, like the height of a foot that leaves the ground. All
+      margins count at interior minima and at the end;
+    - `guard_scales`: magnitude of the terms whose difference a guard is. A guard within some
+      round-offs of it counts as zero, because in a dip of microseconds no time brings it closer;
+    - `is_zero_at_start`: guards that count as zero at the start in spite of round-off. None: those
+      that are exactly zero, or within round-off of their scales.
     """
 
     values: MonitorFn
     n_guards: int
     includes_start: tuple[bool, ...] = ()
     guard_scales: Array | None = None
-    on_start: Bool[Array, " n_guards"] | None = None
+    is_zero_at_start: Bool[Array, " n_guards"] | None = None
 
 
 GUARD_ROUNDOFF_EPS = 32.0
-"""Round-off of a guard's value, in units of round-off of its scale."""
+"""Round-off of a guard's value, in units of round-off of its scale.
+
+It is chosen because a guard is a sum of several terms, each with its own round-off.
+"""
 
 
 def is_at_roundoff(
@@ -66,19 +70,17 @@ def guards_met_at_start(
 ) -> tuple[Bool[Array, " n_guards"], Bool[Array, " n_guards"]]:
     """Return which guards end the phase at its start, and which of them fall through zero there.
 
-    The others are past zero or at rest on it: when they were met does not follow from the start.
+    The others are below zero or at rest on it: their event time does not follow from the start.
     """
-    met = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
-    on = guards == 0.0
+    is_met = (guards < 0.0) | ((guards == 0.0) & (rates <= 0.0))
+    is_zero = guards == 0.0
     if monitored_functions.guard_scales is not None:
-        on = on | (
-            guards
-            >= -GUARD_ROUNDOFF_EPS * jnp.finfo(guards.dtype).eps * monitored_functions.guard_scales
-        )
-    if monitored_functions.on_start is not None:
-        on = monitored_functions.on_start
-        met = jnp.where(on, rates <= 0.0, met)
-    return met, met & on & (rates < 0.0)
+        roundoff = GUARD_ROUNDOFF_EPS * jnp.finfo(guards.dtype).eps
+        is_zero = is_zero | (guards >= -roundoff * monitored_functions.guard_scales)
+    if monitored_functions.is_zero_at_start is not None:
+        is_zero = monitored_functions.is_zero_at_start
+        is_met = jnp.where(is_zero, rates <= 0.0, is_met)
+    return is_met, is_met & is_zero & (rates < 0.0)
 
 
 class AcceptedPhaseStep(NamedTuple):
@@ -174,18 +176,18 @@ def refine_minimum(
     is_starting: Bool[Array, ""],
     is_phase_end: Bool[Array, ""],
     max_iterations: int,
+    min_tries: int = 3,
 ) -> tuple[MinimumRefinement, Bool[Array, ""], Scalar]:
-    """Locate each margin's minimum at the integrator's accuracy, by steps after the integration
-    ends.
+    """Return the next state of the refinement, whether another step is needed, and its length.
 
-    At most `max_iterations` secant steps on the rate are taken, each a step of `length` from the
-    start of the step that holds the minimum. Return the state of the refinement, whether another
-    step is needed (this one was a refinement if `is_refining`), and its length.
+    After the integration, secant steps on the rate locate each margin's minimum at the integrator's
+    accuracy, in at most `max_iterations` steps. Each is a solver step of `length` from the start of
+    the step that holds the minimum. `is_refining`: whether `step` was such a step. `min_tries`:
+    least number of them, chosen because each makes the location's derivatives accurate to more
+    digits.
     """
-    values, rates = (
-        step.values[monitored_functions.n_guards :],
-        step.rates[monitored_functions.n_guards :],
-    )
+    values = step.values[monitored_functions.n_guards :]
+    rates = step.rates[monitored_functions.n_guards :]
     monitor, n_iterations = refinement.monitor, refinement.n_iterations + is_refining
     value, rate, step_length = (
         select_row(monitor, x) for x in (values, rates, minimum.step_length)
@@ -200,7 +202,7 @@ def refine_minimum(
     secant = jnp.clip(secant, 0.0, lax.stop_gradient(step_length))
     has_converged = jnp.abs(secant - length) <= MINIMUM_LOCATION_TOLERANCE * step_length
     is_done = is_refining & (
-        (n_iterations == max_iterations) | (has_converged & (n_iterations >= MIN_REFINEMENT_TRIES))
+        (n_iterations == max_iterations) | (has_converged & (n_iterations >= min_tries))
     )
     is_better = jnp.abs(constant_rate) < jnp.abs(refinement.best_rate)
 
@@ -233,8 +235,3 @@ def refine_minimum(
         jnp.where(takes_next, jnp.any(is_remaining), is_refining),
         jnp.where(takes_next, offset, secant),
     )
-
-
-MIN_REFINEMENT_TRIES = 3
-"""Least number of tries at a minimum, chosen because each makes the location's derivatives accurate
-to more digits."""

@@ -1,4 +1,4 @@
-"""Integration of one phase from its start to its earliest event; the only module that uses diffrax.
+"""Integration of one phase from its start to its earliest event by diffrax.
 
 diffrax's solvers and step-size controller are called step by step, so that an event's state has the
 accuracy of the integrator and not of an interpolant. An accepted step that brackets an event is
@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -62,9 +64,48 @@ class PhaseEnd(NamedTuple):
     minima: Float[Array, " n_monitors"]  # of the margins, empty if there are none
 
 
-STARTING_MODE, INTEGRATING_MODE, EVENT_SEARCH_MODE, REFINEMENT_MODE, DONE_MODE = range(5)
-"""Purposes of the next solver step, in order: to evaluate the start; to integrate; to locate a
-bracketed event; to find the minimum of a margin; none."""
+class StepPurpose(IntEnum):
+    """Purpose of the next solver step."""
+
+    START = 0  # to evaluate the start, by a step of length zero
+    INTEGRATION = 1
+    EVENT_SEARCH = 2  # to locate a bracketed event
+    REFINEMENT = 3  # to find the minimum of a margin
+    DONE = 4  # no further step
+
+
+@dataclass(frozen=True)
+class EventSearchOptions:
+    """Search for an event within a solver step, and the growth of steps that precede it."""
+
+    max_step_growth: float = 2.0
+    """Largest ratio of successive solver steps.
+
+    It is chosen because the error estimate of a step far shorter than needed is round-off, and so
+    would be a length grown from it without bound. A batch element would then differ from the same
+    element alone by 1e-12, more than a hundred times its round-off.
+    """
+    n_confirmations: int = 3
+    """Number of tries at the located event before it counts.
+
+    It is chosen because the first try makes the event's time accurate to first order in its
+    derivatives and the second to third order. The last try evaluates the state there.
+    """
+    max_settled_change: float = 1e-4
+    """Largest change of the event's time by a try that counts, over the duration of the phase.
+
+    It is chosen because Newton's method squares the change in each of the next two tries: 1e-16 at
+    the last.
+    """
+    min_stalled_ratio: float = 0.9
+    """Ratio of successive changes of the event's time from which on the change is round-off.
+
+    It is chosen because Newton's method at least halves changes, and takes two thirds at a triple
+    root.
+    """
+
+
+EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class _EventSearch(NamedTuple):
@@ -82,7 +123,7 @@ class _EventSearch(NamedTuple):
 class _PhaseState(NamedTuple):
     """State of the integration of a phase."""
 
-    mode: Int[Array, ""]
+    purpose: Int[Array, ""]  # a StepPurpose
     accepted_step: AcceptedPhaseStep  # the last accepted step
     next_length: Scalar  # of the next step to try, s
     controller_state: Any
@@ -132,7 +173,10 @@ class _SolverStepper(NamedTuple):
             self.term, zero, length, state, None, solver_state, jnp.asarray(False)
         )
         if error is None:
-            raise ValueError(f"{type(self.solver).__name__} gives no error estimate.")
+            raise ValueError(
+                f"{type(self.solver).__name__} gives no error estimate, but the step size is "
+                "controlled by one: take 'Dopri8', 'Tsit5' or 'Kvaerno5'."
+            )
         error = jnp.where(result == diffrax.RESULTS.successful, error, jnp.inf)
         return end, error, solver_state
 
@@ -146,7 +190,7 @@ class _SolverStepper(NamedTuple):
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
         """Return whether the step is kept, the length of the next step, and the controller's state.
 
-        Nothing here is differentiated: derivatives are those of the steps taken.
+        No result is differentiated: derivatives are those of the steps taken.
         """
         start, end, error = lax.stop_gradient((start, end, error))
         is_finite = jnp.all(jnp.isfinite(end))
@@ -183,12 +227,13 @@ def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolv
     return solver_class(**keywords)
 
 
-def _make_stepper(field: VectorField, options: StepOptions) -> _SolverStepper:
+def _make_stepper(field: VectorField, options: StepOptions, max_growth: float) -> _SolverStepper:
+    """Return the solver of the options for a vector field."""
     return _SolverStepper(
         field=field,
         solver=make_solver(options.solver, options),
         controller=diffrax.PIDController(
-            rtol=options.rtol, atol=options.atol, factormax=MAX_STEP_GROWTH_FACTOR
+            rtol=options.rtol, atol=options.atol, factormax=max_growth
         ),
         term=diffrax.ODETerm(lambda t, y, args: field(y)),
     )
@@ -200,20 +245,23 @@ def integrate_phase(
     start: StateVector,
     active: Bool[Array, ""],
     options: StepOptions,
+    event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
-    """Integrate `field` from `start` until the earliest guard reaches zero from above.
+    """Return the end of a phase: `field` integrated from `start` until the earliest guard reaches
+    zero from above.
 
-    A guard that is negative at the start, or zero and not rising, ends the phase at once with
-    duration 0; one that is zero and rising does not fire. The event time of one that falls through
-    zero there has its derivative, minus the guard's by the start over its rate. A guard that dips
-    below zero and comes back within one step is found: where the step's cubic through values and
-    rates dips, the step is retried up to the dip. With `active` False nothing is integrated. Two
-    guards at once: the first in the list wins. Errors are those of the solver at `options`'
-    tolerances.
+    A guard that is negative at the start, or zero and not rising, ends the phase immediately with
+    duration 0. A guard that is zero and rising does not end it. The event time of a guard that
+    falls through zero at the start has its derivative: minus the guard's derivative by the start
+    over its rate. A guard that dips below zero and returns within one step is found: if the cubic
+    through values and rates dips, the step is retried up to the dip. Of two guards at the same
+    time, the first in the list ends the phase. With `active` False nothing is integrated. Errors
+    are those of the solver at the tolerances of `options`.
     """
-    context = _PhaseContext(_make_stepper(field, options), monitored_functions, options)
+    stepper = _make_stepper(field, options, event_options.max_step_growth)
+    context = _PhaseContext(stepper, monitored_functions, options, event_options)
     loop = lax.while_loop(
-        lambda loop: opaque_condition(loop.mode != DONE_MODE, loop.n_tried_steps),
+        lambda loop: opaque_condition(loop.purpose != StepPurpose.DONE, loop.n_tried_steps),
         functools.partial(_advance_phase, context),
         _init_phase(context, start, active),
     )
@@ -237,15 +285,16 @@ class _PhaseContext(NamedTuple):
     stepper: _SolverStepper
     monitored_functions: MonitoredFunctions
     options: StepOptions
+    event_options: EventSearchOptions
 
 
 def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, ""]) -> _PhaseState:
     """Return the state of the loop before the first step.
 
-    Every number of the loop's state is batched, and perturbed where it will be, from the start.
+    Every number that the loop will batch or perturb is batched or perturbed from the start.
     Otherwise JAX would trace the loop again for each round in which these properties spread.
     """
-    stepper, monitored_functions, options = context
+    stepper, monitored_functions, options, _ = context
     zero_time = 0.0 * start[0]
     zero_count = jnp.where(active, 0, 0).astype(jnp.int32)
     zero_values = (
@@ -256,7 +305,7 @@ def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, 
     solver_state, controller_state = stepper.init_states(start, options)
     is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false
     return _PhaseState(
-        mode=jnp.where(active, STARTING_MODE, DONE_MODE).astype(jnp.int32),
+        purpose=jnp.where(active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
         accepted_step=AcceptedPhaseStep(zero_time, start, solver_state, zero_values, zero_values),
         next_length=zero_time,  # the first step has length zero: it evaluates the start
         controller_state=jax.tree.map(lambda x: x + constant_zero, controller_state),
@@ -286,28 +335,36 @@ def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, 
 
 def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
     """Take one solver step, and update the search for the event and for minima."""
-    _, monitored_functions, options = context
-    n, previous_step, length, search = (
-        monitored_functions.n_guards,
-        loop.accepted_step,
-        loop.next_length,
-        loop.search,
+    _, monitored_functions, options, event_options = context
+    n, search = monitored_functions.n_guards, loop.search
+    previous_step, length = loop.accepted_step, loop.next_length
+    is_starting, is_searching = (
+        loop.purpose == StepPurpose.START,
+        loop.purpose == StepPurpose.EVENT_SEARCH,
     )
-    is_starting, is_searching = loop.mode == STARTING_MODE, loop.mode == EVENT_SEARCH_MODE
     step, error = _try_step(context, loop)
     guards, rates = step.values[:n], step.rates[:n]
-    met, falls = guards_met_at_start(monitored_functions, guards, rates)
-    first_met = jnp.argmax(met).astype(jnp.int32)
-    # An event at time zero is searched for like any other: its time moves with the start.
-    searched_at_start = is_starting & falls[first_met]
-    has_immediate_event = is_starting & jnp.any(met) & ~falls[first_met]
+    is_met, is_falling = guards_met_at_start(monitored_functions, guards, rates)
+    first_met = jnp.argmax(is_met).astype(jnp.int32)
+    # An event at time zero is searched for like any other, because its time depends on the start.
+    searched_at_start = is_starting & is_falling[first_met]
+    has_immediate_event = is_starting & jnp.any(is_met) & ~is_falling[first_met]
     assessment = _assess_step(context, loop, step, error)
     proposal = _propose_event(search, guards, rates, length)
-    is_close, change = _close(search, proposal.length, previous_step.time, length)
+    # A try counts if it changes the event's time by little compared with the step. For an event
+    # much earlier than the step's end, the change is also compared with the time since the phase
+    # began, unless round-off of the guard leaves nothing to gain.
+    constant_proposal, constant_length, start_time = lax.stop_gradient(
+        (proposal.length, length, previous_step.time)
+    )
+    change = jnp.abs(constant_proposal - constant_length)
+    is_small = change <= event_options.max_settled_change * (start_time + constant_proposal)
+    is_stalled = change >= event_options.min_stalled_ratio * search.change
+    is_close = (change <= search.time_tolerance) & (is_small | is_stalled)
     is_at_zero, lowest_guard = is_at_roundoff(monitored_functions, search.is_crossing, guards)
     proposal = proposal._replace(guard=jnp.where(is_at_zero, lowest_guard, proposal.guard))
     n_confirmed = search.n_confirmed + (is_searching & (is_close | is_at_zero))
-    has_arrived = is_searching & (n_confirmed >= N_EVENT_CONFIRMATIONS)
+    has_arrived = is_searching & (n_confirmed >= event_options.n_confirmations)
 
     timed_out = assessment.is_accepted & (step.time >= options.max_phase_time)
     timed_out = timed_out | (has_arrived & (step.time > options.max_phase_time))
@@ -316,23 +373,22 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
     )
     is_phase_end = has_immediate_event | has_arrived | timed_out | is_stuck
     begins_search = assessment.has_crossed | searched_at_start
-    mode = jnp.where(is_starting, INTEGRATING_MODE, loop.mode)
-    mode = jnp.where(
-        is_phase_end, DONE_MODE, jnp.where(begins_search, EVENT_SEARCH_MODE, mode)
-    ).astype(jnp.int32)
+    purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, loop.purpose)
+    purpose = jnp.where(begins_search, StepPurpose.EVENT_SEARCH, purpose)
+    purpose = jnp.where(is_phase_end, StepPurpose.DONE, purpose).astype(jnp.int32)
     following_length = jnp.where(
         searched_at_start, 0.0, lax.stop_gradient(assessment.following_length)
     )
     following_length = jnp.where(is_searching, proposal.length, following_length)
-    crossing = jnp.where(assessment.has_crossed, assessment.is_crossing, search.is_crossing)
-    at_start = searched_at_start & (jnp.arange(n) == first_met)
+    is_crossing = jnp.where(assessment.has_crossed, assessment.is_crossing, search.is_crossing)
+    is_first_met = searched_at_start & (jnp.arange(n) == first_met)
     is_counted = (assessment.is_accepted & ~is_starting) | has_arrived
     minimum = update_minimum(
         monitored_functions, loop.minimum, previous_step, step, length, is_counted
     )
     refinement = loop.refinement
     if monitored_functions.includes_start:
-        was_refining = loop.mode == REFINEMENT_MODE
+        was_refining = loop.purpose == StepPurpose.REFINEMENT
         refinement, is_refining, length_to_minimum = refine_minimum(
             refinement,
             monitored_functions,
@@ -344,15 +400,16 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
             is_phase_end,
             options.max_margin_search_iterations,
         )
-        mode = jnp.where(is_refining, REFINEMENT_MODE, jnp.where(was_refining, DONE_MODE, mode))
+        purpose = jnp.where(was_refining, StepPurpose.DONE, purpose)
+        purpose = jnp.where(is_refining, StepPurpose.REFINEMENT, purpose)
         following_length = jnp.where(is_refining, length_to_minimum, following_length)
     return _PhaseState(
-        mode=mode,
+        purpose=purpose,
         accepted_step=tree_where(assessment.is_accepted | has_arrived, step, previous_step),
         next_length=following_length,
         controller_state=assessment.controller_state,
         search=_EventSearch(
-            is_crossing=jnp.where(searched_at_start, at_start, crossing),
+            is_crossing=jnp.where(searched_at_start, is_first_met, is_crossing),
             lower_bound=jnp.where(begins_search, 0.0, proposal.lower_bound),
             upper_bound=jnp.where(begins_search, lax.stop_gradient(length), proposal.upper_bound),
             time_tolerance=jnp.where(
@@ -381,18 +438,19 @@ def _try_step(context: _PhaseContext, loop: _PhaseState) -> tuple[AcceptedPhaseS
     One call of the solver and of the monitored functions serves every mode, so that the code is
     compiled once.
     """
-    stepper, monitored_functions, options = context
+    stepper, monitored_functions, options, _ = context
     start = loop.accepted_step.state, loop.accepted_step.solver_state
     if monitored_functions.includes_start:
         minimum_start = select_row(loop.refinement.monitor, loop.minimum.start_state)
         restart = minimum_start, stepper.init_solver_state(minimum_start, options)
-        start = tree_where(loop.mode == REFINEMENT_MODE, restart, start)
+        start = tree_where(loop.purpose == StepPurpose.REFINEMENT, restart, start)
     end, error, solver_state = stepper.advance_state(*start, loop.next_length)
     values, rates = jax.jvp(monitored_functions.values, (end,), (stepper.field(end),))
     error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
     limit = lax.stop_gradient(options.max_phase_time)
-    last = (loop.mode == INTEGRATING_MODE) & (loop.next_length >= limit - loop.accepted_step.time)
-    time = jnp.where(last, limit, loop.accepted_step.time + loop.next_length)
+    start_time, is_integrating = loop.accepted_step.time, loop.purpose == StepPurpose.INTEGRATION
+    is_last = is_integrating & (loop.next_length >= limit - start_time)
+    time = jnp.where(is_last, limit, start_time + loop.next_length)
     return AcceptedPhaseStep(time, end, solver_state, values, rates), error
 
 
@@ -400,8 +458,8 @@ class _StepAssessment(NamedTuple):
     """Assessment of a tried solver step."""
 
     is_accepted: Bool[Array, ""]  # the start counts as accepted
-    has_crossed: Bool[Array, ""]  # it brackets an event
-    is_crossing: Bool[Array, " n_guards"]  # of which guards
+    has_crossed: Bool[Array, ""]  # whether the step brackets an event
+    is_crossing: Bool[Array, " n_guards"]  # guards that are not positive at its end
     is_stuck: Bool[Array, ""]
     following_length: Scalar  # length of the next step, s
     time_tolerance: Scalar  # of the event's time, s
@@ -413,9 +471,12 @@ def _assess_step(
     context: _PhaseContext, loop: _PhaseState, step: AcceptedPhaseStep, error: Array
 ) -> _StepAssessment:
     """Accept or reject the step, and detect crossings and dips within it."""
-    stepper, monitored_functions, options = context
+    stepper, monitored_functions, options, _ = context
     n, previous_step, length = monitored_functions.n_guards, loop.accepted_step, loop.next_length
-    is_starting, is_integrating = loop.mode == STARTING_MODE, loop.mode == INTEGRATING_MODE
+    is_starting, is_integrating = (
+        loop.purpose == StepPurpose.START,
+        loop.purpose == StepPurpose.INTEGRATION,
+    )
     nominal_length = jnp.where(is_starting, options.dt0, length)
     is_kept, next_length, controller_state = stepper.control_step(
         previous_step.state, step.state, error, nominal_length, loop.controller_state
@@ -426,22 +487,21 @@ def _assess_step(
     length_to_dip = length * jnp.min(jnp.where(has_dip & ~is_crossing, dip_fractions, 1.0))
     must_retry = is_kept & (length_to_dip < length)
     has_crossed = is_kept & jnp.any(is_crossing) & ~must_retry
-    n_tried_steps = loop.n_tried_steps + (loop.mode != REFINEMENT_MODE)
+    n_tried_steps = loop.n_tried_steps + (loop.purpose != StepPurpose.REFINEMENT)
     cannot_continue = (n_tried_steps >= options.max_solver_steps) | (
         previous_step.time + next_length == previous_step.time
     )
     following_length = jnp.where(is_starting, options.dt0, next_length)
     following_length = jnp.where(must_retry, length_to_dip, following_length)
-    accepted = is_starting | (is_kept & ~has_crossed & ~must_retry)
-    reached = jnp.where(accepted, step.time, previous_step.time)
+    is_accepted = is_starting | (is_kept & ~has_crossed & ~must_retry)
+    reached_time = jnp.where(is_accepted, step.time, previous_step.time)
     # The last step ends at the time limit.
-    following_length = jnp.minimum(
-        following_length, lax.stop_gradient(options.max_phase_time - reached)
-    )
+    time_left = lax.stop_gradient(options.max_phase_time - reached_time)
+    following_length = jnp.minimum(following_length, time_left)
     guess = _guess_event_length(previous_step, step.values, step.rates, length, n, is_crossing)
     resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
     return _StepAssessment(
-        is_accepted=accepted,
+        is_accepted=is_accepted,
         has_crossed=has_crossed,
         is_crossing=is_crossing,
         is_stuck=is_integrating & ~has_crossed & cannot_continue,
@@ -454,26 +514,10 @@ def _assess_step(
     )
 
 
-MAX_STEP_GROWTH_FACTOR = 2.0
-"""Largest factor by which a step may exceed the one before it.
-
-It is chosen because the error estimate of a step far shorter than needed is round-off, and so would
-be a length grown from it without bound. A batch element would then differ from the same element
-alone by 1e-12, more than a hundred times its round-off.
-"""
-N_EVENT_CONFIRMATIONS = 3
-"""Number of tries at the located event before it counts.
-
-It is chosen because the first try makes the event's time accurate to first order in its derivatives
-and the second to third order; the last evaluates the state there.
-"""
-
-
 def _find_dips(
     previous_step: AcceptedPhaseStep, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
-    """Return fractions in (0, 1) to step to first for guards that may dip, and whether they may
-    dip.
+    """Return, for each guard, the fraction of the step to try first, and whether it may dip.
 
     The cubic through values and rates does not fall below the least of its Bernstein coefficients,
     so a guard with positive coefficients does not dip. Otherwise the step is repeated up to the
@@ -486,9 +530,8 @@ def _find_dips(
     first_coefficient, second_coefficient = v0 + r0 * length / 3.0, v1 - r1 * length / 3.0
     dip_fractions = jnp.clip(find_cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
     advances_time = previous_step.time + dip_fractions * length > previous_step.time
-    return dip_fractions, (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (
-        r1 >= 0.0
-    ) & advances_time
+    may_dip = (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (r1 >= 0.0)
+    return dip_fractions, may_dip & advances_time
 
 
 def _guess_event_length(
@@ -499,8 +542,9 @@ def _guess_event_length(
     n_guards: int,
     is_crossing: Array,
 ) -> Scalar:
-    """Return the length to the earliest crossing of the guards' cubics: secant, then Newton's
-    method.
+    """Return the length to the earliest crossing of the guards' cubics.
+
+    It is found by the secant, then by Newton's method.
     """
     v0, r0, v1, r1 = lax.stop_gradient(
         (previous_step.values, previous_step.rates * length, values, rates * length)
@@ -526,29 +570,6 @@ def _guess_event_length(
             is_crossing & is_falling, jnp.clip(fraction - change, 0.0, 1.0), fraction
         )
     return lax.stop_gradient(length) * jnp.min(jnp.where(is_crossing, fraction, 1.0))
-
-
-MAX_SETTLED_CHANGE = 1e-4
-"""Most that a try that counts may change the event's time, over the duration of the phase. Chosen
-because Newton's method squares it in each of the next two tries: 1e-16 at the last."""
-MIN_STALLED_RATIO = 0.9
-"""A change of the event's time that is not less than this times the one before is rounding. Chosen
-because Newton's method at least halves changes, and takes two thirds at a triple root."""
-
-
-def _close(
-    search: _EventSearch, following: Scalar, time: Scalar, length: Scalar
-) -> tuple[Bool[Array, ""], Scalar]:
-    """Return whether the next try changes the event's time by little, and by how much, s.
-
-    Little compared with the step and, for an event much earlier than the step's end, with the time
-    since the phase began, unless rounding of the guard leaves no more to gain.
-    """
-    fixed, fixed_length, begin = lax.stop_gradient((following, length, time))
-    change = jnp.abs(fixed - fixed_length)
-    small = change <= MAX_SETTLED_CHANGE * (begin + fixed)
-    stalled = change >= MIN_STALLED_RATIO * search.change
-    return (change <= search.time_tolerance) & (small | stalled), change
 
 
 class _EventProposal(NamedTuple):
@@ -598,7 +619,7 @@ def sample_phase(
     """Return the states at `n_samples` equal times of a phase, both ends included, at solver
     accuracy.
     """
-    stepper = _make_stepper(field, options)
+    stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
     interval = duration / (n_samples - 1)
 
     def integrate_to_next(state: StateVector, _sample: None) -> tuple[StateVector, StateVector]:

@@ -263,7 +263,7 @@ def _integrate_mode(
     guard_offset = jnp.where(is_rising, jnp.finfo(state.dtype).tiny, guard_offset)
     on = (values <= 0.0) & is_near_zero & ~is_rising
     monitored_functions = MonitoredFunctions(
-        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), on_start=on
+        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), is_zero_at_start=on
     )
     return integrate_phase(
         mode.field, monitored_functions, state, ~is_violated, options
