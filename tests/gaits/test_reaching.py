@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cycles.gait_search import REFINE_ABOVE_MESH_ERROR
+from vrw_jax.cycles.gait_search import FALLBACK_OPTIONS
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
     damping=[224.5, 214.0, 119.3, 200.0],
@@ -26,7 +26,7 @@ def cycles():
 def test_gaits_outside_the_fitted_box_are_found_on_a_refined_mesh(cycles):
     assert np.asarray(cycles.found).tolist() == [True, True, True, False]
     np.testing.assert_allclose(cycles.durations[:3], REFERENCE_DURATIONS, atol=2e-3)
-    assert np.all(cycles.mesh_error <= REFINE_ABOVE_MESH_ERROR)
+    assert np.all(cycles.mesh_error <= FALLBACK_OPTIONS.refine_above)
     assert cycles.system.options.mesh_intervals > vrw.CycleOptions().mesh_intervals
 
 

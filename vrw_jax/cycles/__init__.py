@@ -37,7 +37,6 @@ from vrw_jax.cycles.finder_selection import (
     resolve_model_with_reason,
 )
 from vrw_jax.cycles.gait_search import (
-    GAIT_BATCH_SIZES,
     GaitChoice,
     limit_cycle,
     limit_cycles,

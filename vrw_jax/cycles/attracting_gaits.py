@@ -3,6 +3,7 @@ method."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,13 +15,27 @@ from vrw_jax.contact import embed_section_states, walk_batch
 from vrw_jax.numerics import StepOptions, concat_rows, take_rows
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
-WALK_ROUND_STEPS = (8, 12, 30, 50, 100)
-"""Numbers of steps towards a gait. After each round, settled walks stop and walks to the same gait
-are merged."""
 
-WALK_SETTLED_TOLERANCE = 1e-3
-"""Largest difference between a settled walk's state and its state one period ago, rad, rad/s and
-m/s."""
+@dataclass(frozen=True)
+class AttractingGaitOptions:
+    """Walks toward attracting gaits. Distances are those of section states, rad, rad/s, m/s."""
+
+    round_steps: tuple[int, ...] = (8, 12, 30, 50, 100)
+    """Numbers of steps toward a gait. After each round, settled walks stop and walks to the same
+    gait are merged."""
+    step_tolerance: float = 1e-8
+    """Tolerance of the Tsit5 steps toward a gait, independent of the tolerance of the gait."""
+    settled_defect: float = 1e-3
+    """Largest distance of a settled walk's state from its state one period earlier."""
+    start_defect: float = 0.1
+    """The same distance for an unsettled walk that is used as a start of Newton's method."""
+    merge_distance: float = 0.02
+    """Distance up to which two walks are taken to reach the same gait."""
+    duplicate_distance: float = 1e-5
+    """Distance below which two gaits are the same one."""
+
+
+ATTRACTING_GAIT_OPTIONS = AttractingGaitOptions()
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
 """Starts of walks: the share of Leg 1's static contraction at touchdown, and the rate of the hub as
@@ -28,23 +43,14 @@ a share of the rigid rolling gait's rate. Of 4,800 random wheels with 5 to 16 le
 one of these starts or from a grid of 78. From these starts alone, 1,175 walk (ranges:
 experiments/gaits/off_the_box.py)."""
 
-FALLBACK_STARTS = ((0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1),
-(0.2, 0.8),
-           (0.35, 1.0), (0.35, 1.1))  # fmt: skip
+FALLBACK_STARTS = (
+    (0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
+    (0.35, 1.0), (0.35, 1.1),
+)  # fmt: skip
 """Starts of walks of the paper's model that are tried if none of WALK_STARTS leads to a gait. The
 first number is Leg 1's angle to the slope's normal at touchdown as a share of the angle between
 legs. The second number is the rate, as in WALK_STARTS. These starts reach the other 65 wheels. With
 many legs, gaits roll from double support into double support, with an angle near 0."""
-
-START_DISTANCE = 0.1
-"""Largest period defect of an unsettled walk that is used as a start, rad, rad/s and m/s."""
-
-MERGE_DISTANCE, DUPLICATE_DISTANCE = 0.02, 1e-5
-"""Distance above which walks have reached different gaits, and distance below which two gaits are
-the same one."""
-
-APPROACH_TOLERANCE = 1e-8
-"""Tolerance of the Tsit5 steps towards a gait, independent of the tolerance of the gait itself."""
 
 
 def compute_walk_starts(params: WheelParams) -> np.ndarray:
@@ -81,14 +87,14 @@ def _section_states(
 
 
 def _walk_and_measure_defect(
-    finder: Any, columns: np.ndarray, x: np.ndarray, n_steps: int
+    finder: Any, columns: np.ndarray, x: np.ndarray, n_steps: int, step_tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Walk `n_steps` from each state and measure the defect of one more period.
 
-    Return the states after the walk, whether each walk still continues, and the largest change of
-    the state over the next period. The defect is infinite where a walk ended early.
+    Returns the states after the walk, whether each walk continues, and the period defect: the
+    largest change of the state over the next period. It is infinite if a walk ended early.
     """
-    loose_options = StepOptions(solver="Tsit5", rtol=APPROACH_TOLERANCE, atol=APPROACH_TOLERANCE)
+    loose_options = StepOptions(solver="Tsit5", rtol=step_tolerance, atol=step_tolerance)
     settings = finder.model, loose_options, finder.n_legs
     states, _, outcome, *_ = walk_batch(columns, x, n_steps, *settings)
     next_states, _, next_outcome, *_ = walk_batch(columns, states, finder.period_n, *settings)
@@ -102,7 +108,10 @@ def _walk_and_measure_defect(
 
 
 def find_attracting_gaits(
-    finder: Any, values: Any, n_starts: int = len(WALK_STARTS)
+    finder: Any,
+    values: Any,
+    n_starts: int = len(WALK_STARTS),
+    options: AttractingGaitOptions = ATTRACTING_GAIT_OPTIONS,
 ) -> tuple[np.ndarray, Any]:
     """Return the attracting gaits of each wheel, slowest first.
 
@@ -112,12 +121,13 @@ def find_attracting_gaits(
         finder: finds gaits with unilateral contact.
         values: of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
         n_starts: number of WALK_STARTS to use, slow ones first.
+        options: options of the walks and of the comparison of gaits.
 
     Returns:
         Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.
     """
     n_wheels = len(values)
-    wheel_index, x = _walk_to_distinct_states(finder, np.asarray(values), n_starts)
+    wheel_index, x = _walk_to_distinct_states(finder, np.asarray(values), n_starts, options)
     candidates = finder.find_cycles_near(np.asarray(values)[wheel_index], x)
     # Numpy is used because JAX compiles each operation for every number of wheels.
     is_attracting = np.abs(np.linalg.eigvals(candidates.monodromy_value)).max(-1) < 1.0
@@ -128,9 +138,9 @@ def find_attracting_gaits(
         is_valid, sum_over_steps(candidates.durations), 1.0
     )
     coordinates = states[:, :, : _count_section_coordinates(finder)]
-    is_valid &= ~(
-        np.abs(coordinates[:, :-1] - coordinates[:, -1:]).max(-1) < DUPLICATE_DISTANCE
-    ).any(1)  # shorter period
+    # A gait that repeats earlier has a shorter period.
+    step_distances = np.abs(coordinates[:, :-1] - coordinates[:, -1:]).max(-1)
+    is_valid &= ~(step_distances < options.duplicate_distance).any(1)
     selected: list[int] = []
     for candidate_indices in np.split(
         np.arange(len(wheel_index)), find_slowest_indices(wheel_index, n_wheels)[1:]
@@ -138,7 +148,7 @@ def find_attracting_gaits(
         n_before = len(selected)
         for i in sorted(candidate_indices[is_valid[candidate_indices]], key=lambda i: speed[i]):
             is_duplicate = (
-                np.abs(coordinates[j] - coordinates[i, -1]).max(-1) < DUPLICATE_DISTANCE
+                np.abs(coordinates[j] - coordinates[i, -1]).max(-1) < options.duplicate_distance
                 for j in selected[n_before:]
             )
             if not any(same.any() for same in is_duplicate):
@@ -167,12 +177,15 @@ def find_slow_gaits(finder: Any, values: Any) -> Any:
 
 
 def find_slowest_indices(wheel_index: np.ndarray, n_wheels: int) -> np.ndarray:
+    """Return the index of the first, slowest gait of each wheel."""
     return np.searchsorted(wheel_index, np.arange(n_wheels))
 
 
 def _mark_missing_gaits(is_missing: np.ndarray, cycle: Any) -> Any:
-    """Mark the cycles where `is_missing` as not found: they repeat sooner, do not attract, or do
-    not exist."""
+    """Return the cycles with those of `is_missing` marked as not found.
+
+    Such a cycle has a shorter period, does not attract, or does not exist.
+    """
     broadcast_mask = lambda leaf: is_missing.reshape(-1, *[1] * (leaf.ndim - 1))
     masked_cycle = jax.tree.map(
         lambda leaf: np.where(broadcast_mask(leaf), np.zeros_like(leaf), leaf), cycle
@@ -188,47 +201,42 @@ def _count_section_coordinates(finder: Any) -> int:
 
 
 def _walk_to_distinct_states(
-    finder: Any, values: np.ndarray, n_starts: int
+    finder: Any, values: np.ndarray, n_starts: int, options: AttractingGaitOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Walk from the starts and return the distinct end states.
+    """Return the index of a wheel and the section state of each distinct end of a walk.
 
-    Return the index of the wheel of each state, in order, and section states. Each wheel has at
-    least one state. Of equivalent walks, the one with the smallest period defect is returned.
+    The states are in the order of the wheels, and each wheel has at least one. Of equivalent walks,
+    the one with the smallest period defect is returned.
     """
     rows = jax.device_put(list(values.T[: len(PARAMETER_NAMES)]))
     starts = compute_walk_starts(wheel_from_parameters(tuple(rows), finder.n_legs))[:n_starts]
-    n_wheels, n_coordinates, wheel_index = (
-        len(values),
-        _count_section_coordinates(finder),
-        np.tile(np.arange(len(values)), len(starts)),
-    )
+    n_wheels, n_coordinates = len(values), _count_section_coordinates(finder)
+    wheel_index = np.tile(np.arange(len(values)), len(starts))
     columns = values.T[:, wheel_index]
     start_states = embed_section_states(columns, np.concatenate(starts), finder.n_legs)
-    x, period_defect, active = (
-        np.array(start_states),
-        np.full(len(wheel_index), np.inf),
-        np.arange(len(wheel_index)),
-    )
+    x, period_defect = np.array(start_states), np.full(len(wheel_index), np.inf)
+    active = np.arange(len(wheel_index))
     is_walking, is_duplicate = np.ones(len(wheel_index), bool), np.zeros(len(wheel_index), bool)
     with ThreadPoolExecutor(1) as pool:
         pool.submit(finder.precompile_newton, values[:1], start_states[:1])
-        for n_steps in WALK_ROUND_STEPS:
-            walk_result = _walk_and_measure_defect(finder, columns[:, active], x[active], n_steps)
+        for n_steps in options.round_steps:
+            walk_result = _walk_and_measure_defect(
+                finder, columns[:, active], x[active], n_steps, options.step_tolerance
+            )
             x[active], is_walking[active], period_defect[active] = walk_result
             is_duplicate |= _find_duplicates(
-                x[:, :n_coordinates], period_defect, n_wheels, WALK_SETTLED_TOLERANCE
+                x[:, :n_coordinates], period_defect, n_wheels, options.settled_defect, options
             )
-            active = np.flatnonzero(
-                is_walking & ~is_duplicate & (period_defect >= WALK_SETTLED_TOLERANCE)
-            )
+            is_unsettled = period_defect >= options.settled_defect
+            active = np.flatnonzero(is_walking & ~is_duplicate & is_unsettled)
             if not len(active):
                 break
-    is_selected = ~_find_duplicates(
-        x[:, :n_coordinates], period_defect, n_wheels, START_DISTANCE
-    ) & (period_defect < START_DISTANCE)
-    is_selected[np.setdiff1d(np.arange(n_wheels), wheel_index[is_selected])] = (
-        True  # else the first start
+    is_duplicate = _find_duplicates(
+        x[:, :n_coordinates], period_defect, n_wheels, options.start_defect, options
     )
+    is_selected = ~is_duplicate & (period_defect < options.start_defect)
+    # The first start is selected for a wheel without any usable walk.
+    is_selected[np.setdiff1d(np.arange(n_wheels), wheel_index[is_selected])] = True
     selected = np.flatnonzero(is_selected)
     selected = selected[np.argsort(wheel_index[selected], kind="stable")]
     return wheel_index[selected], np.where(
@@ -237,13 +245,18 @@ def _walk_to_distinct_states(
 
 
 def _find_duplicates(
-    x: np.ndarray, period_defect: np.ndarray, n_wheels: int, settled_tolerance: float
+    x: np.ndarray,
+    period_defect: np.ndarray,
+    n_wheels: int,
+    settled_defect: float,
+    options: AttractingGaitOptions,
 ) -> np.ndarray:
     """Return which walks reach the same state as another walk of the same wheel with a smaller
     defect.
 
-    Two states are the same if they are within MERGE_DISTANCE. If the other walk has settled, the
-    limit is the walk's own remaining defect if that is larger. The wheels are the last axis of all
+    Two states are the same if they are within `merge_distance`. If the other walk has settled, to
+    within `settled_defect`, the limit is three times the walk's own defect if that is larger. The
+    wheels are the last axis of all
     arrays (in `x`, the last but one, before the coordinates), and the starts are the axis before
     it.
     """
@@ -256,9 +269,9 @@ def _find_duplicates(
         )
         distance = np.abs(x - x[other]).max(-1)
         is_near = distance <= np.where(
-            period_defect[other] < settled_tolerance,
-            np.maximum(MERGE_DISTANCE, 3.0 * period_defect),
-            MERGE_DISTANCE,
+            period_defect[other] < settled_defect,
+            np.maximum(options.merge_distance, 3.0 * period_defect),
+            options.merge_distance,
         )
-        is_duplicate |= is_better & is_near & (period_defect < START_DISTANCE)
+        is_duplicate |= is_better & is_near & (period_defect < options.start_defect)
     return is_duplicate.ravel()

@@ -2,12 +2,14 @@
 
 Newton's method on the collocation system also converges to formal solutions that are no gaits. A
 cycle therefore counts as found only if every sign that its sequence of phases assumes holds at all
-nodes. Wheels still without a cycle after an attempt are packed together for the next one.
+nodes. Wheels without a cycle after an attempt are gathered for the next one.
 """
 
 import functools
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
@@ -44,13 +46,38 @@ Parameters = Float[Array, "n_parameters lanes"]
 """The float parameters in the order of PARAMETER_NAMES."""
 
 
+@dataclass(frozen=True)
+class SearchLimits:
+    """Limits of the search that users do not set."""
+
+    guard_tolerance: float = 1e-6
+    """Tolerance below zero of a guard at the end of the phase that it ends, N, m or rad/s."""
+    max_mesh_error: float = 1e-5
+    """Estimate of the mesh error above which a solution does not count as found.
+
+    It is chosen because the errors of some hundred random wheels are below it, most of them by far.
+    """
+    n_homotopy_segments: int = 16
+    """Number of segments of the last homotopy.
+
+    If no root is found, the gait of Table 1 is followed from wheel to wheel on the line to this
+    wheel. Either it arrives, or the segment where it ends gives the reason.
+    """
+    max_ungathered_lanes: int = 16
+    """Largest number of lanes that are searched without gathering."""
+
+
+SEARCH_LIMITS = SearchLimits()
+
+
 class CollocationSystem(NamedTuple):
     """Static data of a search: the phases, the number of steps and the meshes."""
 
     n_legs: int
     period_n: int
     options: CycleOptions
-    stop_at_lift_off: bool = True  # whether a pulling ground rules a gait out
+    stop_at_lift_off: bool = True  # whether the ground must push in an admissible gait
+    limits: SearchLimits = SEARCH_LIMITS
 
     @property
     def sequence(self) -> PhaseSequence:
@@ -109,7 +136,7 @@ class CollocationState(NamedTuple):
     failed_check: (
         LaneArray  # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
     )
-    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; NEWTON_FAILED; else 0
+    # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a NewtonFailure; else 0
     ends: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 
@@ -395,7 +422,8 @@ def first_failed_check(
                 _min_guards(phase, constants, passage), end_guards, strict=True
             ):
                 conditions.append(
-                    ~phase_active[i] | ((minimum > 0.0) & (end_guard > -GUARD_TOLERANCE))
+                    ~phase_active[i]
+                    | ((minimum > 0.0) & (end_guard > -system.limits.guard_tolerance))
                 )
         conditions += [
             value > 0.0
@@ -410,7 +438,9 @@ def first_failed_check(
     inputs = (solution.durations, solution.accelerations, state.phase_active)
     carry = (solution.section_state, jnp.zeros(parameters.shape[-1:], parameters.dtype))
     (_, failed_check), _ = lax.scan(check_step, carry, inputs)
-    is_resolved = estimate_mesh_error(sequence, system.meshes, solution) < MAX_MESH_ERROR
+    is_resolved = (
+        estimate_mesh_error(sequence, system.meshes, solution) < system.limits.max_mesh_error
+    )
     return jnp.where((failed_check == 0.0) & ~is_resolved, float(MESH_CHECK), failed_check)
 
 
@@ -427,27 +457,24 @@ def _run_attempt(
     result: SearchResult,
     guess: CollocationState | None,
 ) -> SearchResult:
-    options = system.options
+    options, n_segments = system.options, system.limits.n_homotopy_segments
     table_1 = stack_parameters(WheelParams(n_legs=system.n_legs)).astype(parameters.dtype)
     max_iterations = dict.fromkeys(SEARCH_ATTEMPTS, options.max_newton_iterations) | {
         "guess": options.first_newton_iterations, "surface": options.first_newton_iterations
     }  # fmt: skip
     iteration_limits = [max_iterations[name] for name in SEARCH_ATTEMPTS] + [
         options.max_newton_iterations
-    ] * (2 * N_HOMOTOPY_SEGMENTS)
-    segment_indices = [0] * len(SEARCH_ATTEMPTS) + [
-        1 + i // 2 for i in range(2 * N_HOMOTOPY_SEGMENTS)
-    ]
+    ] * (2 * n_segments)
+    segment_indices = [0] * len(SEARCH_ATTEMPTS) + [1 + i // 2 for i in range(2 * n_segments)]
     select_for_attempt = lambda table: jnp.asarray(table, jnp.int32)[attempt_index]
     origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
     # Each segment is tried twice: from the previous wheel, then without double support.
-    segment, is_second_try = (
-        select_for_attempt(segment_indices),
-        select_for_attempt([0] * len(SEARCH_ATTEMPTS) + [0, 1] * N_HOMOTOPY_SEGMENTS) == 1,
-    )
+    segment = select_for_attempt(segment_indices)
+    second_tries = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_segments
+    is_second_try = select_for_attempt(second_tries) == 1
     is_segment = segment > 0
-    is_arrived = ~is_segment | (segment == N_HOMOTOPY_SEGMENTS)
-    share = segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
+    is_arrived = ~is_segment | (segment == n_segments)
+    share = segment.astype(parameters.dtype) / n_segments
     target = jnp.where(is_arrived, parameters, origin + share * (parameters - origin))
     is_homotopy = _is_attempt(attempt_index, "homotopy")
     start_parameters = jnp.where(is_homotopy, origin, target)
@@ -465,7 +492,7 @@ def _run_attempt(
         start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
     is_pending = result.state.found < 0.5
     is_pending &= ~is_segment | (
-        result.state.failed_check == jnp.where(is_second_try, NEWTON_FAILED_ONCE, 0.0)
+        result.state.failed_check == jnp.where(is_second_try, float(NewtonFailure.FIRST_TRY), 0.0)
     )
     attempt_result = run_newton(
         system,
@@ -480,7 +507,9 @@ def _run_attempt(
         homotopy_state = _homotopy_outcome(
             attempt_result.state,
             is_arrived,
-            jnp.where(is_second_try, NEWTON_FAILED, NEWTON_FAILED_ONCE),
+            jnp.where(
+                is_second_try, float(NewtonFailure.BOTH_TRIES), float(NewtonFailure.FIRST_TRY)
+            ),
         )
         state = jax.tree.map(
             lambda a, b: jnp.where(is_segment, a, b), homotopy_state, attempt_result.state
@@ -549,12 +578,14 @@ def search_in_stages(
     """
     parameters, n_lanes = arguments[0], arguments[0].shape[-1]
     # With several steps, a repeated gait of one step would be followed, which decides nothing.
-    n_attempts = len(SEARCH_ATTEMPTS) + 2 * N_HOMOTOPY_SEGMENTS * (system.period_n == 1)
+    n_attempts = len(SEARCH_ATTEMPTS) + 2 * system.limits.n_homotopy_segments * (
+        system.period_n == 1
+    )
     first_attempt = jnp.asarray(
         SEARCH_ATTEMPTS.index("surface" if len(arguments) == 1 else "guess"), jnp.int32
     )
     result = init_search_result(system, parameters)
-    if n_lanes <= MAX_UNGATHERED_LANES:
+    if n_lanes <= system.limits.max_ungathered_lanes:
         return search(
             parameters, result, first_attempt, jnp.asarray(n_attempts, jnp.int32), *arguments[1:]
         )
@@ -585,7 +616,9 @@ def search_in_stages(
 
 def _needs_attempt(attempt_index: Int[Array, ""], result: SearchResult) -> Bool[Array, " lanes"]:
     """Return whether this attempt can still change the result of a lane."""
-    is_decided = (result.state.failed_check > 0.0) | (result.state.failed_check == NEWTON_FAILED)
+    is_decided = (result.state.failed_check > 0.0) | (
+        result.state.failed_check == NewtonFailure.BOTH_TRIES
+    )
     return (result.state.found < 0.5) & ((attempt_index < len(SEARCH_ATTEMPTS)) | ~is_decided)
 
 
@@ -603,27 +636,19 @@ def init_search_result(system: CollocationSystem, parameters: Parameters) -> Sea
 MESH_CHECK = len(ADMISSIBILITY_CHECKS)
 """`CollocationState.failed_check` of a root that the mesh does not resolve."""
 
-HOMOTOPY_OFFSET, NEWTON_FAILED_ONCE, NEWTON_FAILED = float(len(ADMISSIBILITY_CHECKS)), -1.0, -2.0
-"""Codes in `CollocationState.failed_check`. The first is the offset of a check that fails before
-the wheel is reached. The others are failures of Newton's method at the first try and at both."""
+HOMOTOPY_OFFSET = float(len(ADMISSIBILITY_CHECKS))
+"""Offset in `CollocationState.failed_check` of a check that a wheel on the homotopy fails."""
 
-GUARD_TOLERANCE = 1e-6
-"""Tolerance below zero of a guard at the end of the phase that it ends, N, m or rad/s."""
 
-MAX_MESH_ERROR = 1e-5
-"""Estimate of the mesh error above which a solution does not count as found. In all of some hundred
-random wheels the errors themselves are below it, and mostly by far."""
+class NewtonFailure(IntEnum):
+    """Codes in `CollocationState.failed_check` of a homotopy on which Newton's method fails."""
+
+    FIRST_TRY = -1
+    BOTH_TRIES = -2
+
 
 SEARCH_ATTEMPTS = ("guess", "guess, on", "surface", "surface, on", "homotopy", "without DLS")
 """Attempts in their order. They start from the guess, if any, and from the gait that the stored
 surface predicts. A homotopy from Table 1 follows, then a cycle without double support. The first
 two begin with a few iterations, so that a batch can gather the lanes that need more in separate
 blocks."""
-
-MAX_UNGATHERED_LANES = 16
-"""Largest number of lanes that are searched without gathering."""
-
-N_HOMOTOPY_SEGMENTS = 16
-"""Number of segments of the homotopy. If no root is found, the gait of Table 1 is followed from
-wheel to wheel on the line to this wheel. Either it arrives, or the segment where it ends gives the
-reason."""

@@ -7,6 +7,7 @@ fallbacks depend on concrete values; under a `jit` or `vmap` of the caller only 
 """
 
 import functools
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args, overload
 
 import jax
@@ -16,7 +17,7 @@ from jax import lax
 
 from vrw_jax.batches import step_batch
 from vrw_jax.cycles.attracting_gaits import (
-    START_DISTANCE,
+    ATTRACTING_GAIT_OPTIONS,
     compute_fallback_starts,
     compute_walk_starts,
     find_attracting_gaits,
@@ -29,7 +30,7 @@ from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, 
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
-from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
@@ -50,19 +51,25 @@ RETRY_OUTCOMES = (
 )
 """Outcomes of a search that may have missed a gait."""
 
-REFINE_ABOVE_MESH_ERROR = 1e-7
-"""Estimate of the mesh's error above which a finer mesh is used. The errors themselves are a
-hundredth of it, as the options promise."""
 
-N_GAIT_WALK_STEPS = 80
-"""Number of steps of a walk towards a gait of the paper's model."""
+@dataclass(frozen=True)
+class FallbackOptions:
+    """Fallbacks of the search for gaits of the paper's model: walks and finer meshes."""
 
-MAX_MESH_REFINEMENTS = 3
-"""Largest number of times that a mesh is made twice as fine."""
+    refine_above: float = 1e-7
+    """Estimate of the mesh error above which a finer mesh is used.
 
-GAIT_BATCH_SIZES = (8, 64, 512, 4096)
-"""Batch sizes that programs are compiled for. A single wheel takes the time of eight."""
+    It is chosen because the errors themselves are a hundredth of the estimate.
+    """
+    max_refinements: int = 3
+    """Largest number of times that a mesh is made twice as fine."""
+    n_walk_steps: int = 80
+    """Number of steps of a walk toward a gait."""
+    max_walk_defect: float = ATTRACTING_GAIT_OPTIONS.start_defect
+    """Largest period defect of a walk that is used as a start, rad, rad/s, m/s."""
 
+
+FALLBACK_OPTIONS = FallbackOptions()
 
 FailureValue = Literal["zeros", "nan"]
 FAILURE_VALUES: tuple[str, ...] = get_args(FailureValue)
@@ -221,13 +228,13 @@ def limit_cycles(
 
 
 def parse_gait_choice(which: GaitChoice) -> int:
-    """Of a list of gaits, slowest first; one clear sentence for what is none."""
+    """Return the index of the chosen gait in a list of gaits, slowest first."""
     if isinstance(which, str):
         return 0 if check_choice("which", which, ("slowest", "fastest")) == "slowest" else -1
     if not check_real("which", which).is_integer():
         raise ValueError(
-            f"which is {which!r}, but it names one of a wheel's gaits: give 'slowest', 'fastest' "
-            "or its place in vrw.limit_cycles(params, model=...)."
+            f"which is {which!r}, but it selects one of a wheel's gaits: give 'slowest', "
+            "'fastest' or an index in vrw.limit_cycles(params, model=...)."
         )
     return int(which)
 
@@ -284,7 +291,7 @@ def _search_with_fallbacks(
     finder, collocation_state = fallback
     if is_concrete:
         cycle = map_in_batches(
-            finder.find_cycles, GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
+            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
         )  # a compiled program
         return cycle if is_batch else _take_rows_on_device(cycle, 0)
     return _search(
@@ -315,17 +322,15 @@ def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
 
 
 def _walk_and_measure_defect(
-    finder: CollocationFinder, params: WheelParams, start_states: np.ndarray
+    finder: CollocationFinder, params: WheelParams, start_states: np.ndarray, n_steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Walk N_GAIT_WALK_STEPS from each state and measure the defect of one more period.
+    """Return the states after walks of `n_steps`, and the defect of one more period of each.
 
-    The defect is infinite where a walk ended early.
+    The defect is infinite if a walk ended early.
     """
-    walk_result = step_batch(params, start_states, N_GAIT_WALK_STEPS, model=finder.model)
-    states, continues = (
-        np.array(walk_result.section_state),
-        np.asarray(walk_result.outcome) == Outcome.STEPPED,
-    )
+    walk_result = step_batch(params, start_states, n_steps, model=finder.model)
+    states = np.array(walk_result.section_state)
+    continues = np.asarray(walk_result.outcome) == Outcome.STEPPED
     period_defect = np.full(len(states), np.inf)
     if continues.any():
         next_period = step_batch(
@@ -342,29 +347,32 @@ def _walk_and_measure_defect(
 
 
 class _WalkResults(NamedTuple):
-    """State of a batch of wheels after walks of N_GAIT_WALK_STEPS."""
+    """State of a batch of wheels after walks toward their gaits."""
 
-    is_usable: np.ndarray  # whether a walk continues, and repeats to START_DISTANCE
+    is_usable: np.ndarray  # whether a walk continues, and repeats to `max_walk_defect`
     section_states: np.ndarray  # (wheels, 3): section state of the walk that repeats best
 
 
 def _walk_from_all_starts(
-    finder: CollocationFinder, params: WheelParams, is_wanted: np.ndarray
+    finder: CollocationFinder,
+    params: WheelParams,
+    is_wanted: np.ndarray,
+    options: FallbackOptions,
 ) -> _WalkResults:
     n_wheels, indices = len(is_wanted), np.flatnonzero(is_wanted)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
     for compute_starts in (compute_walk_starts, compute_fallback_starts):
         own_params = _take_rows_on_device(params, indices)
         for start in compute_starts(own_params) if len(indices) else ():
-            states, period_defect = _walk_and_measure_defect(finder, own_params, start)
+            states, period_defect = _walk_and_measure_defect(
+                finder, own_params, start, options.n_walk_steps
+            )
             is_better = period_defect < smallest_defect[indices]
             better_indices = indices[is_better]
-            smallest_defect[better_indices], section_states[better_indices] = (
-                period_defect[is_better],
-                states[is_better],
-            )
-        indices = np.flatnonzero(is_wanted & (smallest_defect >= START_DISTANCE))
-    return _WalkResults(smallest_defect < START_DISTANCE, section_states)
+            smallest_defect[better_indices] = period_defect[is_better]
+            section_states[better_indices] = states[is_better]
+        indices = np.flatnonzero(is_wanted & (smallest_defect >= options.max_walk_defect))
+    return _WalkResults(smallest_defect < options.max_walk_defect, section_states)
 
 
 def _initial_guesses(
@@ -378,7 +386,7 @@ def _initial_guesses(
     gaits."""
     guesses = map_in_batches(
         lambda batch_params: finder.initial_guesses(stack_parameters(batch_params).T),
-        GAIT_BATCH_SIZES,
+        batch_sizes.GAIT_BATCH_SIZES,
         params,
     )
     from_walk = np.flatnonzero(walk_results.is_usable & ~has_state)
@@ -389,7 +397,7 @@ def _initial_guesses(
             from_walk,
             map_in_batches(
                 guess_from_state,
-                GAIT_BATCH_SIZES,
+                batch_sizes.GAIT_BATCH_SIZES,
                 _take_rows_on_device(params, from_walk),
                 walk_results.section_states[from_walk],
             ),
@@ -398,29 +406,34 @@ def _initial_guesses(
 
 
 def _fallback_starts(
-    finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, refines_mesh: bool
+    finder: CollocationFinder,
+    params: WheelParams,
+    cycle: LimitCycle,
+    refines_mesh: bool,
+    options: FallbackOptions = FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder, and starts from which it finds more of a batch's gaits; None if there are
-    none.
+    """Return a finder, and starts from which it finds more of a batch's gaits.
 
-    `refines_mesh` allows a finer mesh.
+    Returns None if there are none. `refines_mesh` allows a finer mesh.
     """
     outcome = np.asarray(cycle.outcome)
-    is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > REFINE_ABOVE_MESH_ERROR)
+    is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > options.refine_above)
     is_missing = np.isin(outcome, RETRY_OUTCOMES)
     is_open = is_missing | is_rough
     if not is_open.any():
         return None
-    walk_results = _walk_from_all_starts(finder, params, is_missing)
+    walk_results = _walk_from_all_starts(finder, params, is_missing, options)
     # Best start of each wheel so far, found by a search, on the mesh of `finder`.
     collocation_state, has_state = cycle.collocation_state, is_rough.copy()
     is_coarse = outcome == Outcome.MESH_TOO_COARSE
     best_result = None
-    for refinement_index in range(1 + MAX_MESH_REFINEMENTS * refines_mesh):
+    for refinement_index in range(1 + options.max_refinements * refines_mesh):
         if refinement_index:
             coarser_finder, finder = finder, finder.finer()
             transfer = jax.vmap(functools.partial(finder.transfer_to_mesh, coarser_finder.system))
-            collocation_state = map_in_batches(transfer, GAIT_BATCH_SIZES, collocation_state)
+            collocation_state = map_in_batches(
+                transfer, batch_sizes.GAIT_BATCH_SIZES, collocation_state
+            )
         # The search without walks has used this mesh already. One finer mesh is always tried.
         is_promising = (
             walk_results.is_usable
@@ -431,10 +444,8 @@ def _fallback_starts(
         indices = np.flatnonzero(is_open & is_promising)
         if not len(indices):
             continue
-        subset_params, subset_walks = (
-            _take_rows_on_device(params, indices),
-            _WalkResults(*(part[indices] for part in walk_results)),
-        )
+        subset_params = _take_rows_on_device(params, indices)
+        subset_walks = _WalkResults(*(part[indices] for part in walk_results))
         guesses = _initial_guesses(
             finder,
             subset_params,
@@ -442,7 +453,9 @@ def _fallback_starts(
             has_state[indices],
             subset_walks,
         )
-        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, guesses)
+        retry = map_in_batches(
+            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, guesses
+        )
         is_found, mesh_error = np.asarray(retry.found), np.asarray(retry.mesh_error)
         collocation_state = _replace_rows(
             collocation_state,
@@ -453,9 +466,9 @@ def _fallback_starts(
             best_result = finder, collocation_state
         has_state[indices[is_found]] = True
         is_coarse[indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
-        is_open[
-            indices[is_found & ((mesh_error <= REFINE_ABOVE_MESH_ERROR) | (not refines_mesh))]
-        ] = False
+        is_open[indices[is_found & ((mesh_error <= options.refine_above) | (not refines_mesh))]] = (
+            False
+        )
     return best_result
 
 
@@ -465,7 +478,9 @@ def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle
     fallback = _fallback_starts(finder, params, search_result, refines_mesh=False)
     if fallback is None:
         return search_result
-    cycle: LimitCycle = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params, fallback[1])
+    cycle: LimitCycle = map_in_batches(
+        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1]
+    )
     return cycle
 
 
@@ -480,7 +495,7 @@ def _guess_section_state(guess: Any) -> Any:
 def _retry_from_other_steps(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Search for the same orbit with another of its steps as the first one.
+    """Return a finder and the same orbits, found with another of their steps as the first one.
 
     A guess contains the accelerations of all steps, whose errors accumulate. A step without double
     support is the most sensitive. As the first or last step it may make the guess fail.
@@ -498,7 +513,9 @@ def _retry_from_other_steps(
         section_states = np.asarray(
             step_batch(subset_params, section_states, model=finder.model).section_state
         )
-        retry = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, subset_params, section_states)
+        retry = map_in_batches(
+            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, section_states
+        )
         found_indices = np.flatnonzero(
             np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing] < 0.5)
         )

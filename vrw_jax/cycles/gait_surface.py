@@ -16,16 +16,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution, PhaseMesh, mesh_transfer_matrix
 from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import WheelParams
+from vrw_jax.wheel import PAPER_PHASES, WheelParams
 
 SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
 """Meshes of the surface's accelerations, for DLS, SLS-I and SLS-II."""
-PHASE_DIMENSIONS = (1, 3, 2)
 SURFACE_DEGREE = 3
+"""Degree of the surface's polynomials, which the stored coefficients have."""
 
 
 class GaitSurface(NamedTuple):
@@ -41,6 +40,7 @@ class GaitSurface(NamedTuple):
 
 @functools.cache
 def load_surface() -> GaitSurface:
+    """Return the surface that is stored beside this file."""
     file = importlib.resources.files(__package__) / "surface.npz"
     with file.open("rb") as stream, np.load(stream) as arrays:
         return GaitSurface(**{name: arrays[name] for name in GaitSurface._fields})
@@ -64,6 +64,7 @@ def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
 
 
 def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
+    """Return all monomials of the coordinates up to the surface's degree, the constant first."""
     ones = jnp.ones_like(centered[0])
     return [
         functools.reduce(operator.mul, factors, ones)
@@ -73,10 +74,10 @@ def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
 
 
 def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
-    """Return section, durations and accelerations on `meshes` of the surface's gait, with lanes
-    last."""
+    """Return section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
     surface = load_surface()
-    ranges = (x.tolist() for x in surface[:4])  # Python floats preserve the dtype of the parameters
+    # Python floats preserve the dtype of the parameters.
+    ranges = (x.tolist() for x in surface[:4])
     centered = tuple(
         (jnp.clip(x, lower, upper) - center) / spread
         for x, center, spread, lower, upper in zip(
@@ -89,12 +90,16 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
     section = jnp.stack([values[0], values[1] / time_scale])
     durations = values[None, 2:5] * time_scale
     accelerations, start_index = [], 5
-    for dim, surface_mesh, mesh in zip(PHASE_DIMENSIONS, SURFACE_MESHES, meshes, strict=True):
+    for phase, surface_mesh, mesh in zip(PAPER_PHASES, SURFACE_MESHES, meshes, strict=True):
+        dim = phase.n_dof
         size = surface_mesh.n_intervals * N_GAUSS_NODES * dim
         flat = values[start_index : start_index + size].reshape(-1, dim, *features.shape[1:])
         start_index += size
         matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), features.dtype)
-        scale = _acceleration_scale(dim, params, time_scale)
+        # Units of the accelerations of (theta, L1, L2).
+        angle_scale = 1.0 / time_scale**2
+        length_scale = params.locked_length / time_scale**2
+        scale = jnp.stack([angle_scale, length_scale, length_scale][:dim])
         phase_accelerations = jnp.tensordot(matrix, flat, 1) * scale
         accelerations.append(
             phase_accelerations.reshape(
@@ -102,10 +107,3 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
             )
         )
     return CollocationSolution(section, durations, tuple(accelerations))
-
-
-def _acceleration_scale(dim: int, params: WheelParams, time_scale: Elementwise) -> Array:
-    """Return the units of the accelerations of (theta, L1, L2)."""
-    angle_scale = 1.0 / time_scale**2
-    length_scale = params.locked_length / time_scale**2
-    return jnp.stack([angle_scale, length_scale, length_scale][:dim])

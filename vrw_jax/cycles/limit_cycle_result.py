@@ -272,10 +272,6 @@ def _find_cycle(
 
 _compiled_find_cycle = eqx.filter_jit(_find_cycle)
 
-N_PHASE_SAMPLES = 1025
-"""Number of points of each phase between which a walked guess is interpolated. With too few (33 at
-c = 221), the fast start of a step without double support is lost and Newton's method fails."""
-
 
 class WalkSamples(NamedTuple):
     """Event-driven walk, sampled as a start on any mesh."""
@@ -288,15 +284,23 @@ class WalkSamples(NamedTuple):
 
 @eqx.filter_jit
 def sample_walk(
-    model: ViscoelasticWheel, params: WheelParams, section_state: SectionState, n_steps: int
+    model: ViscoelasticWheel,
+    params: WheelParams,
+    section_state: SectionState,
+    n_steps: int,
+    n_samples: int = 1025,
 ) -> WalkSamples:
-    """Return `n_steps` event-driven steps from a section state, sampled in time."""
+    """Return `n_steps` event-driven steps from a section state, sampled in time.
+
+    - `n_samples`: number of points of each phase, chosen because with too few (33 at c = 221) the
+      fast start of a step without double support is lost and Newton's method fails.
+    """
     options, s = StepOptions(), params.symbols()
     landing = transitions.land(s, *section_state)
     section = jnp.stack([landing.theta, landing.motion.dtheta])
 
     def sample_next_step(x: Array, _: None) -> tuple[Array, tuple]:
-        trajectory = model.sample_step(params, x, options, N_PHASE_SAMPLES)
+        trajectory = model.sample_step(params, x, options, n_samples)
         step_samples = transitions.land(s, *x).distance, trajectory.durations, trajectory.state
         return trajectory.section_state, step_samples
 

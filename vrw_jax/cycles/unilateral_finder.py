@@ -6,6 +6,7 @@ therefore searched side by side, and no large program is compiled for the deriva
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -39,22 +40,29 @@ from vrw_jax.cycles.return_map_finder import (
 )
 from vrw_jax.measures import UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models import AbstractStep, AbstractWheel
-from vrw_jax.numerics import StepOptions, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
 from vrw_jax.simulation import validate_arguments
 from vrw_jax.validation import is_traced
 from vrw_jax.wheel import Outcome, WheelParams
 
-MAX_CONTACT_NEWTON_ITERATIONS, MAX_STEP_HALVINGS = 15, 6
-"""Largest number of Newton iterations, and of halvings of a correction after which no step ends."""
 
-FAR_STEP_TOLERANCE, NEAR_CORRECTION = 1e-6, 1e-4
-"""Tolerance of the steps far from a gait, and the correction below which a state is near a gait."""
+@dataclass(frozen=True)
+class ContactNewtonOptions:
+    """Newton's method on the return map with unilateral contact."""
 
-CLEAR_CONVERGENCE_FACTOR = 0.01
-"""Factor below the tolerance at which a correction is accepted without a second one."""
+    max_iterations: int = 15
+    """Largest number of Newton iterations."""
+    max_halvings: int = 6
+    """Largest number of halvings of a correction after which no step ends."""
+    far_step_tolerance: float = 1e-6
+    """Tolerance of the steps far from a gait."""
+    near_correction: float = 1e-4
+    """Correction below which a state is near a gait, rad, rad/s, m/s."""
+    clear_convergence_factor: float = 0.01
+    """Share of the tolerance below which a correction is accepted without a second one."""
 
-GROUND_BATCH_SIZES = (1, 8, 64, 512)
-"""Numbers of gaits that are read together. Each number is compiled once."""
+
+CONTACT_NEWTON_OPTIONS = ContactNewtonOptions()
 
 
 class UnilateralFinder(AbstractReturnMapFinder):
@@ -62,7 +70,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
     friction."""
 
     model: UnilateralWheel
-    batch_sizes: tuple[int, ...] = eqx.field(static=True, default=GROUND_BATCH_SIZES)
+    batch_sizes: tuple[int, ...] = eqx.field(
+        static=True, default=batch_sizes.CONTACT_GAIT_BATCH_SIZES
+    )
 
     cycle_measures: ClassVar[tuple[str, ...]] = ("spectral_radius", "spectral_margin")
     differentiable_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
@@ -203,10 +213,8 @@ class PeriodMap(NamedTuple):
         """Evaluate the period from `x`, with derivatives with respect to the masked values and the
         section state."""
         results, (n, m) = [], (self.values.shape[1], x.shape[1])
-        jacobian, is_valid = (
-            np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None],
-            np.ones(len(x), bool),
-        )
+        jacobian = np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None]
+        is_valid = np.ones(len(x), bool)
         input_mask = np.concatenate(
             [np.broadcast_to(value_mask, n), np.broadcast_to(start_mask, m)]
         )
@@ -270,6 +278,7 @@ def _find_fixed_points(
     values: np.ndarray,
     start: np.ndarray,
     with_parameter_derivatives: bool,
+    newton_options: ContactNewtonOptions = CONTACT_NEWTON_OPTIONS,
 ) -> _FixedPoints:
     """Return fixed points near `start`. Codes at the end of a section state are those of the image.
 
@@ -279,26 +288,32 @@ def _find_fixed_points(
     """
     period_map = PeriodMap(model, n_legs, period_n, values)
     loose_tolerances = [
-        np.maximum(tolerance, FAR_STEP_TOLERANCE) for tolerance in (options.rtol, options.atol)
+        np.maximum(tolerance, newton_options.far_step_tolerance)
+        for tolerance in (options.rtol, options.atol)
     ]
     loose_options = eqx.tree_at(
         lambda o: (o.rtol, o.atol), options, jax.device_put(loose_tolerances)
     )
     tolerance, all_wheels = float(newton_tolerance(options)), np.ones(len(values), bool)
     rough_solution, return_jacobian = _run_newton(
-        period_map, loose_options, start, False, NEAR_CORRECTION, all_wheels
+        period_map,
+        loose_options,
+        start,
+        False,
+        newton_options.near_correction,
+        all_wheels,
+        newton_options,
     )
-    x, is_near = (
-        np.where(rough_solution.converged[:, None], rough_solution.x, start),
-        rough_solution.converged,
-    )
+    is_near = rough_solution.converged
+    x = np.where(is_near[:, None], rough_solution.x, start)
     exact_period = period_map.evaluate_period(options, x, False, False)
     correction = exact_period.newton_correction(x, return_jacobian)
     x[is_near] += correction[is_near] * (
-        np.abs(correction[is_near]).max(-1, keepdims=True) < NEAR_CORRECTION
+        np.abs(correction[is_near]).max(-1, keepdims=True) < newton_options.near_correction
     )
     is_near = is_near | (
-        exact_period.is_valid & (np.abs(exact_period.end_state - x).max(-1) < NEAR_CORRECTION)
+        exact_period.is_valid
+        & (np.abs(exact_period.end_state - x).max(-1) < newton_options.near_correction)
     )
     solution, _ = _run_newton(
         period_map,
@@ -307,6 +322,7 @@ def _find_fixed_points(
         with_parameter_derivatives,
         tolerance,
         is_near,
+        newton_options,
         stops_at_small_correction=False,
     )
     return solution._replace(n_iterations=rough_solution.n_iterations + 1 + solution.n_iterations)
@@ -319,6 +335,7 @@ def _run_newton(
     with_parameter_derivatives: bool,
     tolerance: float,
     is_wanted: np.ndarray,
+    newton_options: ContactNewtonOptions,
     stops_at_small_correction: bool = True,
 ) -> tuple[_FixedPoints, np.ndarray]:
     """Run Newton's method on the `is_wanted` wheels until corrections are small; return the last
@@ -335,7 +352,7 @@ def _run_newton(
     is_small, is_found, n_halvings = (np.zeros(n_wheels, dtype) for dtype in (bool, bool, int))
     return_jacobian = np.zeros((n_wheels, start.shape[1], start.shape[1]))
     active, stored = np.arange(n_wheels), None
-    for _ in range(MAX_CONTACT_NEWTON_ITERATIONS + MAX_STEP_HALVINGS):
+    for _ in range(newton_options.max_iterations + newton_options.max_halvings):
         period = period_map.select(active).evaluate_period(
             options, x[active], with_parameter_derivatives
         )
@@ -346,17 +363,18 @@ def _run_newton(
         ):
             stored_leaf[active] = new_leaf
         correction = period.newton_correction(x[active], period.return_jacobian)
-        correction_size, is_valid = (
-            np.abs(correction).max(-1),
-            period.is_valid & np.isfinite(correction).all(-1),
-        )
+        correction_size = np.abs(correction).max(-1)
+        is_valid = period.is_valid & np.isfinite(correction).all(-1)
         residual[active] = np.abs(period.end_state - x[active]).max(-1)
         return_jacobian[active] = period.return_jacobian
         n_iterations[active] += 1
         is_small_now = is_valid & (correction_size <= tolerance)
         is_done = (
             is_small_now
-            & (is_small[active] | (correction_size <= CLEAR_CONVERGENCE_FACTOR * tolerance))
+            & (
+                is_small[active]
+                | (correction_size <= newton_options.clear_convergence_factor * tolerance)
+            )
             & (not stops_at_small_correction)
         )
         is_small[active] = is_small_now
@@ -364,17 +382,15 @@ def _run_newton(
         last_x[moving_indices], n_halvings[moving_indices] = x[moving_indices], 0
         x[moving_indices] += correction[is_valid & ~is_done]
         bad_indices = active[~is_valid]
-        x[bad_indices], n_halvings[bad_indices] = (
-            0.5 * (x[bad_indices] + last_x[bad_indices]),
-            n_halvings[bad_indices] + 1,
-        )
+        x[bad_indices] = 0.5 * (x[bad_indices] + last_x[bad_indices])
+        n_halvings[bad_indices] += 1
         x[bad_indices, -n_legs:] = last_x[bad_indices, -n_legs:]
         is_found[active] = is_wanted[active] & (
             is_small[active] if stops_at_small_correction else is_done
         )
         is_lost = (
-            (n_halvings > MAX_STEP_HALVINGS)
-            | (n_iterations > MAX_CONTACT_NEWTON_ITERATIONS)
+            (n_halvings > newton_options.max_halvings)
+            | (n_iterations > newton_options.max_iterations)
             | ~is_wanted
         )
         active = active[~is_found[active] & ~is_lost[active]]
@@ -418,14 +434,10 @@ def _make_cycle(
 def _make_gait(
     model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
 ) -> Gait:
-    n_values, identity = (
-        values.shape[0],
-        jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype),
-    )
-    value_jacobian, return_jacobian = (
-        jnp.zeros((len(identity), n_values), identity.dtype),
-        _return_jacobian(fixed_points, n_values),
-    )
+    n_values = values.shape[0]
+    identity = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
+    value_jacobian = jnp.zeros((len(identity), n_values), identity.dtype)
+    return_jacobian = _return_jacobian(fixed_points, n_values)
     for jacobian in fixed_points.step_jacobians.section_state:
         value_jacobian = jacobian[:, :n_values] + jacobian[:, n_values:] @ value_jacobian
     newton_matrix = jnp.where(fixed_points.converged, identity - return_jacobian, identity)

@@ -9,9 +9,9 @@ import numpy as np
 
 from vrw_jax.batches import step_batch
 from vrw_jax.contact import UnilateralWheel
-from vrw_jax.cycles import GAIT_BATCH_SIZES, make_finder, retry_from_walks
+from vrw_jax.cycles import make_finder, retry_from_walks
 from vrw_jax.models import RigidWheel, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, map_in_batches, take_rows, value_and_jacobian
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows, value_and_jacobian
 from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -67,7 +67,7 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
     """Return gaits by collocation, with derivatives from one step by machine code."""
 
     finder = make_finder(None, params.n_legs)
-    cycles = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params)
+    cycles = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
     section_states, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
     (missing,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
     if len(missing):  # one mesh for all keeps digits independent of the batch
@@ -124,7 +124,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
     held, has a gait half as fast again.
     """
     section_states, end_states, length, duration, jacobian, duration_jacobian = map(
-        np.asarray, map_in_batches(_rolling_gaits, GAIT_BATCH_SIZES, params)
+        np.asarray, map_in_batches(_rolling_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
     )
     zeros = np.zeros_like(duration)
     quantities = np.column_stack([zeros, duration, zeros, length, end_states])
