@@ -89,7 +89,7 @@ def test_orbits_do_not_depend_on_their_first_step():
 
 
 def test_an_incomplete_grid_is_refused_with_the_missing_names():
-    with pytest.raises(ValueError, match="must name all of"):
+    with pytest.raises(ValueError, match="must contain all of"):
         vrw.basin(vrw.WheelParams(), {"theta_touchdown": 0.1})
 
 
