@@ -2,6 +2,7 @@
 
 import ast
 import re
+import unicodedata
 from pathlib import Path
 
 import pytest
@@ -88,6 +89,69 @@ def test_names_of_missing_files_are_found():
 def test_the_architecture_page_lists_every_package_in_import_order():
     text = (ROOT / "docs" / "architecture.md").read_text()
     assert tuple(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) == IMPORT_GRAPH.packages
+
+
+LINK_PATTERN = re.compile(r"\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]+))?\)")
+PAGES_WITHOUT_CODE = {
+    path: re.sub(r"```.*?```|`[^`\n]*`", "", path.read_text(), flags=re.DOTALL)
+    for path in DOCUMENTS
+    if path.suffix == ".md"
+}
+"""Text of each page without code, whose brackets are no links."""
+
+
+def list_anchors(path):
+    """Return the anchors of a page's headings, as the site makes them."""
+    headings = re.findall(r"^#+ +(.*?) *$", path.read_text(), re.MULTILINE)
+    ascii_headings = [
+        unicodedata.normalize("NFKD", heading).encode("ascii", "ignore").decode()
+        for heading in headings
+    ]
+    plain = [re.sub(r"[^\w\s-]", "", heading).strip() for heading in ascii_headings]
+    return {re.sub(r"[-\s]+", "-", heading.lower()) for heading in plain}
+
+
+def find_broken_links(path):
+    """Links of a page to files or headings that are not in the checkout."""
+    for place, anchor in LINK_PATTERN.findall(PAGES_WITHOUT_CODE[path]):
+        target = path.parent / place if place else path
+        is_page = target.suffix == ".md"
+        if not target.exists() or (
+            anchor and is_page and anchor.lower() not in list_anchors(target)
+        ):
+            yield f"{place}#{anchor}" if anchor else place
+
+
+@pytest.mark.parametrize("path", PAGES_WITHOUT_CODE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_of_a_page_leads_somewhere_in_a_checkout(path):
+    assert not list(find_broken_links(path))
+
+
+def test_a_broken_link_is_found(tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text("# A b-c\n[x](gone.md) [y](page.md#a-b-c) [z](#gone)")
+    monkeypatch.setitem(PAGES_WITHOUT_CODE, page, page.read_text())
+    assert list(find_broken_links(page)) == ["gone.md", "#gone"]
+
+
+@pytest.mark.parametrize("name", ["toml", "measures"])
+def test_a_generated_page_agrees_with_the_sources(name):
+    """If this fails: `python -m website --pages`."""
+    from website import reference
+
+    page = ROOT / "docs" / "reference" / f"{name}.md"
+    assert page.read_text() == getattr(reference, f"{name}_page")()
+
+
+def test_the_readme_is_short_and_its_figures_are_measured():
+    text = (ROOT / "README.md").read_text()
+    assert 500 <= len(re.findall(r"[A-Za-z][\w'’-]*", text)) <= 700
+    measured = (ROOT / "docs" / "benchmarks" / "cycles.md").read_text()
+    table = text.partition("## Performance")[2].partition("\n\n`")[0]
+    times = re.findall(r"\| ([\d.]+) (?:s|ms|µs) \|", table)
+    assert len(times) == 4
+    for value in times:
+        assert f"| {value} |" in measured
 
 
 def test_every_page_is_in_the_navigation():

@@ -36,7 +36,7 @@ def test_images_and_links_of_the_package_index_point_to_the_sources(
     readme.update(result)
     text = result["readme"]["text"]
     paths = re.findall(r"\]\(([^)]+)\)", text)
-    assert "https://example.org/one/two/raw/HEAD/docs/figures/walk.gif" in paths
+    assert "https://example.org/one/two/raw/HEAD/docs/figures/coordinates.png" in paths
     for path in paths:
         assert path.startswith(("https://", "#")), path
         if path.startswith("https://example.org"):

@@ -21,7 +21,7 @@ PAGES = [
     if "```python" in page.read_text()
 ]
 SLOW_PAGES = {
-    "README.md", "docs/any_system.md", "docs/own_loops.md", "docs/explanation/ladder.md",
+    "docs/any_system.md", "docs/own_loops.md", "docs/explanation/ladder.md",
     "docs/explanation/contact_model.md", "docs/explanation/batches.md",
     "docs/explanation/tolerances.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
     "docs/howto/numpyro.md", "docs/howto/own_constraint.md",

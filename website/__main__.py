@@ -1,4 +1,7 @@
-"""Builds the site: `python -m website`, or with `--stored` without executing the notebooks."""
+"""Build the site: `python -m website`, or with `--stored` without executing the notebooks.
+
+With `--pages` only write the pages of `docs/reference` that are generated from the sources.
+"""
 
 import argparse
 import os
@@ -12,36 +15,61 @@ from website.notebooks import page_of
 from website.reference import measures_page, toml_page
 
 ROOT = Path(__file__).parent.parent
-PAGES, SITE = ROOT / "build" / "pages", ROOT / "build" / "site"
-MOVED = {"README.md": "start/readme.md", "CHANGELOG.md": "start/changelog.md"}
-MOVED |= {"CONTRIBUTING.md": "start/contributing.md", "CODE_OF_CONDUCT.md": "start/conduct.md"}
-LINK = re.compile(r"(\]\()(?!https?:|#)([^)#\s]+)")
+DOCS = ROOT / "docs"
+PAGES = ROOT / "build" / "pages"
+SITE = ROOT / "build" / "site"
+ROOT_PAGES = {
+    "CHANGELOG.md": "developer/changelog.md",
+    "CONTRIBUTING.md": "developer/contributing.md",
+    "CODE_OF_CONDUCT.md": "developer/conduct.md",
+}
+"""Places in the site of the pages in the checkout's root."""
+GENERATED_PAGES = {"reference/toml.md": toml_page, "reference/measures.md": measures_page}
+"""Pages in `docs` that are generated from the sources, so that a checkout shows them too."""
+LINK_PATTERN = re.compile(r"(\]\()(?!https?:|#|mailto:)([^)#\s]+)")
+"""A link to a file, in two groups: what precedes the path, and the path."""
+
+
+def write_generated_pages() -> None:
+    """Write the pages in `docs` that are generated from the sources."""
+    for place, generate_page in GENERATED_PAGES.items():
+        (DOCS / place).write_text(generate_page(), encoding="utf-8")
 
 
 def prepare(*, execute: bool) -> None:
-    """Every page in `build/pages`: those of docs/, of the sources, and the notebooks' own."""
+    """Write every page into `build/pages`: those of docs/, of the root, and of the notebooks."""
+    write_generated_pages()
     shutil.rmtree(PAGES, ignore_errors=True)
-    shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("*.ipynb"))
-    for name, page in MOVED.items():
-        text = (ROOT / name).read_text(encoding="utf-8")
-        (PAGES / page).write_text(LINK.sub(_relinked, text), encoding="utf-8")
-    for name, text in (("toml", toml_page()), ("measures", measures_page())):
-        (PAGES / "reference" / f"{name}.md").write_text(text, encoding="utf-8")
-    (PAGES / "notebooks").mkdir(exist_ok=True)
-    for notebook in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+    shutil.copytree(DOCS, PAGES, ignore=shutil.ignore_patterns("*.ipynb"))
+    for notebook in sorted((DOCS / "notebooks").glob("*.ipynb")):
+        (PAGES / "notebooks").mkdir(exist_ok=True)
         page_of(notebook, PAGES / "notebooks", execute=execute)
+    for source in [*DOCS.rglob("*.md"), *map(ROOT.joinpath, ROOT_PAGES)]:
+        text = source.read_text(encoding="utf-8")
+        relink = lambda match, source=source: match[1] + translate_link(source, match[2])
+        place_in_pages(source).parent.mkdir(exist_ok=True)
+        place_in_pages(source).write_text(LINK_PATTERN.sub(relink, text), encoding="utf-8")
 
 
-def _relinked(found: re.Match[str]) -> str:
-    """A link of a page of the root, as its place below start/ sees it."""
-    place = found[2]
-    if place in MOVED:
-        return found[1] + Path(MOVED[place]).name
-    return found[1] + "../" + place.removeprefix("docs/")
+def place_in_pages(source: Path) -> Path:
+    """Return where a file of the checkout is in `build/pages`."""
+    if source.is_relative_to(DOCS):
+        place = PAGES / source.relative_to(DOCS)
+        return place.with_suffix(".md") if place.suffix == ".ipynb" else place
+    relative = source.relative_to(ROOT).as_posix()
+    return PAGES / ROOT_PAGES.get(relative, f"../../{relative}")
+
+
+def translate_link(source: Path, link: str) -> str:
+    """Return a link of a checkout's page as the page in the site needs it."""
+    target = Path(os.path.normpath(source.parent / link))
+    if not target.is_relative_to(ROOT):
+        return link
+    return os.path.relpath(place_in_pages(target), place_in_pages(source).parent)
 
 
 def configuration() -> Path:
-    """`zensical.toml` with the address of the sources, where VRW_SOURCE_URL gives one."""
+    """Write the configuration, with the address of the sources if VRW_SOURCE_URL gives one."""
     text, url = (ROOT / "zensical.toml").read_text(), os.environ.get("VRW_SOURCE_URL")
     if url:
         text = text.replace(
@@ -54,12 +82,21 @@ def configuration() -> Path:
 
 
 def main() -> int:
-    """Prepares and builds; any warning is an error."""
+    """Prepare and build the site; any warning is an error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stored", action="store_true", help="show the notebooks as stored")
-    prepare(execute=not parser.parse_args().stored)
+    parser.add_argument("--pages", action="store_true", help="only write the generated pages")
+    arguments = parser.parse_args()
+    if arguments.pages:
+        write_generated_pages()
+        return 0
+    prepare(execute=not arguments.stored)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    return subprocess.run([*command, "-f", str(configuration())], cwd=ROOT, check=False).returncode
+    status = subprocess.run([*command, "-f", str(configuration())], cwd=ROOT, check=False)
+    if status.returncode == 0:
+        print(f"The site is in {SITE}. Open {SITE / 'index.html'} in a browser, or serve it, with")
+        print(f"its search, by: python -m http.server --directory {SITE.relative_to(ROOT)}")
+    return status.returncode
 
 
 if __name__ == "__main__":

@@ -28,19 +28,19 @@ SYMBOL = (
     rf"|[α-ω]\d{_END}"  # λ4⁺
     r"))(?![\w\u0307\u0308])"
 )
-"""What prose writes in Unicode and readers know as a symbol."""
+"""Pattern of a symbol in prose that is written in Unicode."""
 _LOW = re.compile("[₀-₉ⱼ]+")
 _DIGITS = {ord(low): digit for low, digit in zip("₀₁₂₃₄₅₆₇₈₉ⱼ", "0123456789j", strict=True)}
 _GREEK = {ord("α"): r"\alpha ", ord("φ"): r"\phi ", ord("ε"): r"\varepsilon "}
 
 
 def mathml(tex: str, *, block: bool = False) -> str:
-    """TeX as a `<math>` element."""
+    """Return TeX as a `<math>` element."""
     return convert(tex, display="block" if block else "inline")
 
 
 def typeset(symbol: str) -> str:
-    """TeX of a symbol that is written in Unicode, such as λ₄⁺."""
+    """Return the TeX of a symbol that is written in Unicode, such as λ₄⁺."""
     indexed = _LOW.sub(lambda low: "_" + low[0].translate(_DIGITS), symbol)
     return format_mathtext(unicodedata.normalize("NFD", indexed)).translate(_GREEK)
 
@@ -53,10 +53,10 @@ class _Formula(InlineProcessor):
     def handleMatch(
         self, m: re.Match[str], data: str
     ) -> tuple[Element | str | None, int | None, int | None]:
-        told = mathml(m[1].strip(), block=self.block)
-        if self.block:  # a long one is scrolled, not cut off
-            told = f'<span class="formula">{told}</span>'
-        return self.md.htmlStash.store(told), m.start(0), m.end(0)
+        element = mathml(m[1].strip(), block=self.block)
+        if self.block:  # the style sheet makes a long one scroll
+            element = f'<span class="formula">{element}</span>'
+        return self.md.htmlStash.store(element), m.start(0), m.end(0)
 
 
 class _Symbol(InlineProcessor):
@@ -67,7 +67,7 @@ class _Symbol(InlineProcessor):
 
 
 class Formulas(Extension):
-    """After code, which keeps its dollars, and before emphasis, which would take underscores."""
+    """Formulas, processed after code, which keeps its dollars, and before emphasis."""
 
     def extendMarkdown(self, md: Markdown) -> None:
         md.inlinePatterns.register(_Formula(DISPLAYED, md, block=True), "displayed", 186)
@@ -76,5 +76,5 @@ class Formulas(Extension):
 
 
 def makeExtension(**settings: object) -> Formulas:
-    """What Python-Markdown asks a module for."""
+    """Return the extension; Python-Markdown requires this function."""
     return Formulas(**settings)

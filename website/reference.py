@@ -1,4 +1,4 @@
-"""Pages that are told by the sources: what a config may hold, and every measure."""
+"""Pages that are generated from the sources: keys of a config, and every measure."""
 
 import dataclasses
 import json
@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from vrw_jax.cli.config import (
-    MODEL_CLASSES,
     RANDOM_DESIGNS,
     BranchConfig,
     GaitConfig,
@@ -27,33 +26,40 @@ from vrw_jax.measures.table import (
 from vrw_jax.numerics import StepOptions
 from vrw_jax.printing import format_markdown_table
 from vrw_jax.scans import design as designs
+from vrw_jax.selection import find_model_class, list_config_names
 from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
 
 FIELD = re.compile(r"^ *- ((?:`\w+`(?:, )?)+): (.*(?:\n +[^ -].*)*)", re.MULTILINE)
 
 
-def fields_told(kind: type) -> dict[str, str]:
-    """What the list in a class's docstring says of each field."""
-    told = {}
-    for names, text in FIELD.findall(kind.__doc__ or ""):
-        told |= dict.fromkeys(re.findall(r"`(\w+)`", names), " ".join(text.split()).rstrip(";."))
-    return told
+def describe_fields(settings_class: type) -> dict[str, str]:
+    """Return the description of each field from the list in a class's docstring."""
+    descriptions = {}
+    for names, text in FIELD.findall(settings_class.__doc__ or ""):
+        descriptions |= dict.fromkeys(
+            re.findall(r"`(\w+)`", names), " ".join(text.split()).rstrip(";.")
+        )
+    return descriptions
 
 
 def toml_page() -> str:
-    """Every table and key of a config."""
+    """Return the page of every table and key of a config."""
     lines = [_OPENING]
-    lines += _section("wheel", "What is not swept; what is left out has the value of Table 1.")
+    lines += _section("wheel", "Parameters that no design varies; missing keys default to Table 1.")
     wheel = [(f"`{n}`", f"{_DEFAULTS[n]:g}", d.unit, str(d).split(")")[0] + ")", d.description)
              for n, d in PARAMETER_DOMAINS.items()]  # fmt: skip
     wheel.append(("`n_legs`", "8", "", "5 and more", "number of legs, a whole number"))
     lines += format_markdown_table(("key", "default", "unit", "allowed", "meaning"), wheel)
-    lines += _section("model", "Which rung of the ladder, and its settings.")
-    rungs = ", ".join(f'`"{rung}"`' for rung in MODEL_CLASSES)
-    rows = [("`rung`", "", '`"viscoelastic"`', f"one of {rungs}")]
-    for rung, kind in MODEL_CLASSES.items():
-        rows += [(f"`{n}`", f'`"{rung}"`', v, text) for n, v, text in _settings(kind)]
-    lines += format_markdown_table(("key", "of the rung", "default", "meaning"), rows)
+    lines += _section("model", "The model, and its settings.")
+    model_names = list_config_names()
+    choices = ", ".join(f'`"{name}"`' for name in model_names)
+    rows = [("`name`", "", '`"viscoelastic"`', f"one of {choices}")]
+    for model_name in model_names:
+        rows += [
+            (f"`{n}`", f'`"{model_name}"`', v, text)
+            for n, v, text in _settings(find_model_class(model_name))
+        ]
+    lines += format_markdown_table(("key", "model", "default", "meaning"), rows)
     for name, kind, what in _TABLES:
         lines += _section(name, what)
         lines += format_markdown_table(
@@ -68,28 +74,28 @@ def toml_page() -> str:
 
 _OPENING = """# Keys of a config
 
-A config is a TOML file for `vrw gait`, `scan`, `continue` and `tune`. `vrw init` writes examples. A
-key that is none, or a value out of its domain, is refused in one sentence before anything is
-computed. This page is told by the sources.
+A config is a TOML file for `vrw gait`, `scan`, `continue` and `tune`. `vrw init` writes examples.
+An unknown key, or a value outside its domain, is refused in one sentence before the computation
+starts. `python -m website --pages` generates this page from the sources.
 """
 _HEADER = ("key", "default", "meaning")
 _DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
     ("options", StepOptions, "Numerical choices of a step."),
-    ("gait", GaitConfig, "How `vrw gait` walks."),
-    ("scan", ScanConfig, "What `vrw scan` reports; the design stands in a table of its own."),
-    ("branch", BranchConfig, "What `vrw continue` follows."),
-    ("tune", TuneConfig, "What `vrw tune` seeks."),
+    ("gait", GaitConfig, "The walk of `vrw gait`."),
+    ("scan", ScanConfig, "Results of `vrw scan`; a table of its own contains the design."),
+    ("branch", BranchConfig, "The branch of `vrw continue`."),
+    ("tune", TuneConfig, "Objective, bounds and constraints of `vrw tune`."),
 )
 _GRID = (
     "`parameter = [1.0, 2.0]` lists values, `parameter = { from = 1.0, to = 2.0, count = 5 }` "
-    "spaces them evenly. Parameters are those of `[wheel]`; `friction` too, where motion feels it. "
-    "A config has one design at most.",
+    "spaces them evenly. Parameters are those of `[wheel]`, and `friction` for models that "
+    "have it. A config has at most one design.",
 )
-_SAMPLES = ("`parameter = [1.0, 2.0]`: lists of one length, a sample for each place.",)
+_SAMPLES = ("`parameter = [1.0, 2.0]`: lists of equal length, one sample per index.",)
 _DRAWN_KEYS = (
-    "`n = 512`: samples (rows, for `saltelli`), a power of two; `seed = 0`, which sequence; "
-    "`parameter = [lower, upper]` for each that is drawn.",
+    "`n = 512` is the number of samples (rows for `saltelli`), a power of two. `seed = 0` selects "
+    "the sequence. `parameter = [lower, upper]` gives the range of each parameter.",
 )
 
 
@@ -97,15 +103,15 @@ def _section(name: str, *paragraphs: str) -> list[str]:
     return ["", f"## `[{name}]`", *(line for text in paragraphs for line in ("", text)), ""]
 
 
-def _settings(kind: Any) -> Iterable[tuple[str, str, str]]:
-    """Name, default and meaning of each field of a settings class."""
-    told = fields_told(kind)
-    for name, field in kind.__dataclass_fields__.items():
-        yield name, _shown(field), told.get(name, "")
+def _settings(settings_class: Any) -> Iterable[tuple[str, str, str]]:
+    """Yield name, default and meaning of each field of a settings class."""
+    descriptions = describe_fields(settings_class)
+    for field in dataclasses.fields(settings_class):
+        yield field.name, _format_default(field), descriptions.get(field.name, "")
 
 
-def _shown(field: dataclasses.Field[Any]) -> str:
-    """The default as TOML would write it; nothing where there is none."""
+def _format_default(field: dataclasses.Field[Any]) -> str:
+    """Return the default as TOML writes it; an empty text if there is none."""
     value = field.default
     if value is dataclasses.MISSING or value is None:
         return ""
@@ -117,7 +123,7 @@ def _first_line(function: Any) -> str:
 
 
 def measures_page() -> str:
-    """Every measure of `vrw.MEASURES`."""
+    """Return the page of every measure of `vrw.MEASURES`."""
     lines = [_ON_MEASURES]
     for title, table, what in _GROUPS:
         lines += ["", f"## {title}", "", what, ""]
@@ -131,17 +137,17 @@ def measures_page() -> str:
 
 _ON_MEASURES = """# Measures
 
-Every quantity has one name, symbol and unit, in steps, cycles, trajectories, scans, branches and
-figures alike: `vrw.MEASURES["speed"].unit`. Scans and tuning take the names of steps, margins and
-cycles, and scans derivatives too, as `"d speed / d damping"`. This page is generated from the
-sources.
+Every quantity has one name, symbol and unit in steps, cycles, trajectories, scans, branches and
+figures: `vrw.MEASURES["speed"].unit`. Scans and tuning accept the names of steps, margins and
+cycles. Scans also accept derivatives, as in `"d speed / d damping"`. `python -m website --pages`
+generates this page from the sources.
 """
 _GROUPS = (
     ("Of a step", STEP_MEASURES, "Measures of `vrw.step`, gaits and scans."),
     ("Margins", MARGIN_MEASURES, "Positive while the condition holds: "
         "`step.margins`, scans."),
-    ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Beside those of a step "
-        "that every model has."),
+    ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "In addition to "
+        "those of a step, which every model has."),
     ("Of a gait", LIMIT_CYCLE_MEASURES, "Of a limit cycle."),
     ("Of a trajectory", TRAJECTORY_MEASURES, "Coordinates and variables of `vrw.simulate`."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES, "Variables of each leg."),
