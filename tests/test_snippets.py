@@ -22,9 +22,14 @@ PAGES = [
 ]
 SLOW_PAGES = {
     "docs/any_system.md", "docs/own_loops.md", "docs/explanation/ladder.md",
-    "docs/explanation/contact_model.md", "docs/explanation/batches.md",
-    "docs/explanation/tolerances.md", "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
+    "docs/explanation/batches.md", "docs/explanation/branches.md",
+    "docs/explanation/contact_gaits.md", "docs/explanation/contact_model.md",
+    "docs/explanation/numerics.md", "docs/explanation/tolerances.md",
+    "docs/howto/add_a_measure.md", "docs/howto/cluster.md",
     "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
+    "docs/studies/beyond_the_border.md", "docs/studies/borders.md",
+    "docs/studies/double_support.md", "docs/studies/friction.md",
+    "docs/verification/contact.md",
 }  # fmt: skip
 """Pages that compile for long, or that a test of their own runs in the quick suite."""
 

@@ -20,7 +20,14 @@ from matplotlib.patches import Patch
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, format_markdown, read_column, read_table, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    format_markdown,
+    read_column,
+    read_table,
+    show_table,
+    write_table,
+)
 from experiments.shared.wheels import WIDE_BOX
 from vrw_jax import figures as plots
 from vrw_jax.cycles import make_finder
@@ -230,6 +237,7 @@ def count_results() -> None:
             )
     header = "set", "tolerance", "answers", *KINDS, "steps", "outside", "worst", "gait unconfirmed"
     write_table(COUNT, header, table)
+    show_table("verification/tolerances.md", COUNT, "experiments.answers.claimed")
     print(format_markdown(header, table))
 
 

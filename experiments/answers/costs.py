@@ -18,7 +18,12 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, format_markdown, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    format_markdown,
+    show_table,
+    write_table,
+)
 from experiments.shared.wheels import BOX
 from vrw_jax.tolerance.measure_result import MeasureStatus
 from vrw_jax.tolerance.multifidelity import N_STANDARD_ERRORS
@@ -94,6 +99,8 @@ def measure_means() -> None:
         "CPU time, s", "wheels alone", "ms each", "ratio",
     )  # fmt: skip
     write_table(TABLE, header, rows)
+    columns = [name for name in header if name not in ("wheels alone", "ms each")]
+    show_table("verification/tolerances.md", TABLE, "experiments.answers.costs", columns)
     print(format_markdown(header, rows))
 
 

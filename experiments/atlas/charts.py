@@ -1,7 +1,7 @@
 """Charts and tables of the atlas, drawn from its tables of numbers alone."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from experiments.shared.tables import (
     DOCS,
     FIGURES,
     Row,
+    describe_run,
     format_markdown,
     group_rows,
     read_column,
@@ -440,9 +441,15 @@ def as_table(rows: list[Row]) -> str:
     )
 
 
-def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
-    """Every chart and table of the page whose data exist."""
-    page = DOCS / "verification" / "failures.md"
+def draw(
+    tables: dict[str, Path], limit: Callable[[str], float], measured_names: Sequence[str]
+) -> None:
+    """Draw every chart and table of the pages whose data exist.
+
+    Tables of maps that were measured now get a new line of command, commit, machine and date.
+    """
+    accuracy = DOCS / "verification" / "accuracy.md"
+    stiff_legs = DOCS / "benchmarks" / "stiff_legs.md"
     known_by_name = {name: read_table(path) for name, path in tables.items() if path.exists()}
     result_by_name = {
         "switch": ("stiffness", automatic),
@@ -455,7 +462,10 @@ def draw(tables: dict[str, Path], limit: Callable[[str], float]) -> None:
     }
     for mark, (name, text) in result_by_name.items():
         if name in known_by_name:
-            replace_block(page, mark, text(known_by_name[name]))
+            page = stiff_legs if mark == "switch" else accuracy
+            command = f"experiments.atlas.run --only {name}"
+            source = describe_run(command) if name in measured_names else None
+            replace_block(page, mark, text(known_by_name[name]), source)
     charts: dict[str, Callable[[list[Row]], Figure]] = {
         "stiffness": lambda rows: stiffness(rows, limit),
         "between": between,

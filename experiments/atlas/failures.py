@@ -14,6 +14,7 @@ import pkgutil
 import re
 import time
 import unicodedata
+from collections.abc import Collection
 
 from matplotlib.figure import Figure
 
@@ -23,6 +24,7 @@ from experiments.shared.command import make_parser
 from experiments.shared.tables import (
     DOCS,
     FIGURES,
+    describe_run,
     format_markdown,
     group_rows,
     read_table,
@@ -68,7 +70,12 @@ def as_text(name: str, row: Row) -> dict[str, str]:
     }
 
 
-WORSE = ("right", "says so", "WRONG, silently")
+VERDICT_LABELS = {
+    "right": "correct",
+    "says so": "failure reported",
+    "WRONG, silently": "WRONG, not reported",
+}
+"""What the page calls the stored verdicts, best first."""
 
 
 def anchor(title: str) -> str:
@@ -79,15 +86,16 @@ def anchor(title: str) -> str:
 
 def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
     """A line for each method of a case: its worst answer, and what it cost."""
-    lines = []
+    lines, severities = [], list(VERDICT_LABELS)
     for method, own_values in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
-        worst = max(own_values, key=lambda row: (WORSE.index(row["verdict"]), size(row)))
+        worst = max(own_values, key=lambda row: (severities.index(row["verdict"]), size(row)))
         good = sum(row["verdict"] == "right" for row in own_values)
         says = next((row["says"] for row in [worst, *own_values] if row["says"]), "")
         lines.append(
             [
-                method, worst["verdict"], f"{good} of {len(own_values)}", worst["quantity"],
+                method.replace("ours", "vrw_jax"), VERDICT_LABELS[worst["verdict"]],
+                f"{good} of {len(own_values)}", worst["quantity"],
                 worst["error"], says, worst["work"], worst["ms"],
                 f"{worst['options']}; {worst['version']}",
             ]
@@ -107,8 +115,11 @@ def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     ]
 
 
-def format_page(rows: list[dict[str, str]]) -> None:
-    """Tables of the page: one line for each case, and under each case one for each method."""
+def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()) -> None:
+    """Tables of the page: one line for each case, and under each case one for each method.
+
+    Blocks of the cases that were measured now get a new line of command, commit, machine and date.
+    """
     lines = []
     for name, selection in group_rows(rows, "case").items():
         case, methods = import_case(name), summarize_by_method(selection)
@@ -116,21 +127,25 @@ def format_page(rows: list[dict[str, str]]) -> None:
             float(row["error"]) / float(row["condition"]) for row in select_exact_rows(selection)
         ]
         result_list = [
-            "; ".join(m for m, verdict, *_ in methods if verdict == word) for word in WORSE
+            "; ".join(m for m, verdict, *_ in methods if verdict == label)
+            for label in VERDICT_LABELS.values()
         ]
         lines.append(
             [
-                f"[{case.title}](#{anchor(case.title)})", case.breaks, case.truth,
-                f"{max(errors):.0e}" if errors else "-", *result_list, f"`--only {name}`",
+                f"[{case.title}](#{anchor(case.title)})", case.breaks, case.source, case.truth,
+                f"{max(errors):.0e}" if errors else "-", *result_list,
             ]
         )  # fmt: skip
-        header = ["method", "worst verdict", "right", "worst question", "error", "says", "work",
+        header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
                   "ms", "options; version"]  # fmt: skip
         table = format_markdown(header, methods)
-        replace_block(TEXT, f"failure {name}", f"{table}\n\nSource: {case.source}.")
-    header = ["case", "what breaks", "truth", "our largest error over the condition", "right",
-              "says so", "wrong silently", "`python -m experiments.atlas.failures`"]  # fmt: skip
-    replace_block(TEXT, "failures", format_markdown(header, lines))
+        measured = name in measured_names
+        source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None
+        replace_block(TEXT, f"failure {name}", table, source)
+    header = ["case", "difficulty", "origin", "reference",
+              "largest error of vrw_jax over the condition", *VERDICT_LABELS.values()]  # fmt: skip
+    source = describe_run("experiments.atlas.failures") if len(measured_names) > 1 else None
+    replace_block(TEXT, "failures", format_markdown(header, lines), source)
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:
@@ -161,7 +176,7 @@ def main() -> None:
             rows = [row for row in rows if row["case"] != name] + selection
     rows.sort(key=lambda row: ORDER.index(row["case"]))
     write_named_rows(TABLE, rows)
-    format_page(rows)
+    format_page(rows, names)
 
 
 if __name__ == "__main__":

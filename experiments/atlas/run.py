@@ -3,8 +3,8 @@
     python -m experiments.atlas.run [--only NAME] [--cases 1000000] [--redraw]
 
 Each map is a function that fills one small table (csv) and one that draws it. A table that exists
-is kept; those of events and of dips go on where they were stopped. docs/verification/failures.md
-reads them.
+is kept; those of events and of dips go on where they were stopped. docs/verification/accuracy.md
+and docs/benchmarks/stiff_legs.md show them.
 """
 
 import csv
@@ -79,15 +79,19 @@ def main() -> None:
     chosen = parser.parse_args()
     with use_one_core():
         start_without_cache()
+        measured_names = []
         for name, rows in MAPS.items():
             if chosen.redraw or chosen.only not in (None, name):
                 continue
             retained = len(read_table(select_table(name))) if select_table(name).exists() else 0
             if name in GO_ON:
                 write_table(name, rows(GO_ON[name] * chosen.cases, retained), append=retained > 0)
+                measured_names.append(name)
             elif retained == 0:
                 write_table(name, rows())
-    charts.draw({name: select_table(name) for name in MAPS}, stiffness.real_axis_limit)
+                measured_names.append(name)
+    tables = {name: select_table(name) for name in MAPS}
+    charts.draw(tables, stiffness.real_axis_limit, measured_names)
 
 
 if __name__ == "__main__":

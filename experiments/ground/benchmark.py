@@ -19,7 +19,11 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser
-from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_table,
+)
 from experiments.shared.timing import measure_cpu_seconds, start_without_cache, use_one_core
 
 WHEELS, N_STEPS, N_FIRST, SEED = 2048, 10, 10, 0
@@ -99,6 +103,8 @@ def jacobians() -> None:
             )
             print(rows[-1], flush=True)
     write_table(FIGURES / "ground_jacobians.csv", OF_JACOBIANS, rows)
+    command = "experiments.ground.benchmark --jacobians"
+    show_table("benchmarks/contact.md", FIGURES / "ground_jacobians.csv", command)
 
 
 def main() -> None:
@@ -135,6 +141,9 @@ def main() -> None:
         print(row, flush=True)
     write_table(
         FIGURES / "ground_benchmark.csv", HEADER, [[f"{x:.3g}" for x in row] for row in rows]
+    )
+    show_table(
+        "benchmarks/contact.md", FIGURES / "ground_benchmark.csv", "experiments.ground.benchmark"
     )
 
 

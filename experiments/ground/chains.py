@@ -15,7 +15,11 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_table,
+)
 
 SEED = 5
 DAMPING, SLOPE = (20.0, 400.0), (0.1, 0.34)
@@ -62,6 +66,7 @@ def main() -> None:
             )
             print(rows[-1], flush=True)
     write_table(TABLE, HEADER, rows)
+    show_table("verification/contact.md", TABLE, "experiments.ground.chains")
 
 
 if __name__ == "__main__":

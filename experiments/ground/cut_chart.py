@@ -14,7 +14,14 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, group_rows, read_column, read_table, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    group_rows,
+    read_column,
+    read_table,
+    show_table,
+    write_table,
+)
 from vrw_jax import figures as plots
 
 N_FIRST, SEED, SOLVER = 10, 0, "Tsit5"
@@ -56,6 +63,7 @@ def compute(wheels: int) -> None:
             rows.append([row[0], *(f"{x:.3g}" for x in row[1:])])
             print(rows[-1], flush=True)
     write_table(TABLE, HEADER, rows)
+    show_table("verification/contact.md", TABLE, "experiments.ground.cut_chart")
 
 
 def draw() -> None:

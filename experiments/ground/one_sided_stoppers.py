@@ -13,7 +13,11 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_table,
+)
 from experiments.shared.timing import measure_cpu_seconds
 
 DAMPING, FRICTION = (200.0, 300.0), (0.4, 0.5, 0.6, 0.7, 1.0, 1.3, 1.7, 2.0, 3.0)
@@ -56,6 +60,10 @@ def main() -> None:
     each = [f"{name}_{stoppers}" for stoppers in result_by_name for name in NAMES]
     header = ("damping", "friction", *each, "period_change_percent")
     write_table(FIGURES / "one_sided_stoppers.csv", header, rows)
+    shown = "damping", "friction", "period_s_bilateral", "period_s_one-sided"
+    shown += "events_bilateral", "events_one-sided", "period_change_percent"
+    module, table = "experiments.ground.one_sided_stoppers", FIGURES / "one_sided_stoppers.csv"
+    show_table("verification/contact.md", table, module, shown)
 
 
 def walk_batch(damping, friction, states, n_steps: int, stoppers: str) -> vrw.StepBatchResult:

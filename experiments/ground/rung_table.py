@@ -17,7 +17,11 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.ground.friction_map import FIELDS, SETTLING_OPTIONS, compute_fields
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_table,
+)
 from experiments.shared.timing import measure_cpu_seconds
 
 SCENES = {  # label: friction and what differs from Table 1
@@ -77,6 +81,11 @@ def errors() -> None:
     header = ["scene", "friction", "outcome", "period_change_s", *MEASURES]
     header += [f"{rung}_{name}_error" for rung in ("paper", "rigid") for name in MEASURES]
     write_table(FIGURES / "rung_table.csv", header, rows)
+    shown = "scene", "outcome", "period", "dls_fraction", "speed"
+    shown += "paper_period_error", "paper_dls_fraction_error", "paper_speed_error"
+    show_table(
+        "explanation/ladder.md", FIGURES / "rung_table.csv", "experiments.ground.rung_table", shown
+    )
 
 
 def costs() -> None:
@@ -113,6 +122,7 @@ def costs() -> None:
         rows.append(row)
         print(row, flush=True)
     write_table(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
+    show_table("benchmarks/contact.md", FIGURES / "rung_costs.csv", "experiments.ground.rung_table")
 
 
 if __name__ == "__main__":

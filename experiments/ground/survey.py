@@ -14,7 +14,11 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, write_named_rows
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_named_rows,
+)
 
 SEED, SOLVER = 0, "Tsit5"
 DAMPING, SLOPE = (20.0, 400.0), (0.1, 0.34)
@@ -80,6 +84,8 @@ def main() -> None:
                 rows.append(row)
                 print(row, flush=True)
     write_named_rows(FIGURES / "ground_survey.csv", rows)
+    command = f"experiments.ground.survey --wheels {chosen.wheels}"
+    show_table("verification/contact.md", FIGURES / "ground_survey.csv", command)
 
 
 if __name__ == "__main__":

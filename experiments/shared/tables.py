@@ -1,14 +1,19 @@
 """Tables of numbers as csv files and in pages."""
 
 import csv
+import subprocess
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 
+from experiments.shared.timing import describe_processor
+
 DOCS = Path(__file__).parents[2] / "docs"
 FIGURES = DOCS / "figures"
+SOURCE_LINE_START = "Command:"
 Row = dict[str, str]
 
 
@@ -48,9 +53,42 @@ def format_markdown(header: Iterable[object], rows: Iterable[Iterable[object]]) 
     return "\n".join(f"|{line}|" if k == 1 else f"| {line} |" for k, line in enumerate(lines))
 
 
-def replace_block(page: Path, name: str, text: str) -> None:
-    """Put a table between its two marks in a page."""
+def describe_run(module: str) -> str:
+    """Return the line below a measured block: command, commit, machine and date of this run."""
+    git = ("git", "-C", str(DOCS), "rev-parse", "--short", "HEAD")
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    return (
+        f"{SOURCE_LINE_START} `python -m {module}`; commit: `{commit or 'unknown'}`; machine: "
+        f"{describe_processor()}; date: `{time.strftime('%Y-%m-%d', time.gmtime())}`."
+    )
+
+
+def replace_block(page: Path, name: str, text: str, source: str | None = None) -> None:
+    """Replace the text between two marks of a page.
+
+    The block ends with `source`, the line of `describe_run`. Without it the line that stands there
+    is kept: a table drawn again from stored numbers still belongs to the run that measured them.
+    """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     head, rest = page.read_text().split(begin)
-    tail = rest.split(end)[1]
-    page.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}")
+    block, tail = rest.split(end)
+    if source is None:
+        lines = block.strip().splitlines()
+        source = lines[-1] if lines and lines[-1].startswith(SOURCE_LINE_START) else ""
+    page.write_text(f"{head}{begin}\n\n{text}\n\n{source}".rstrip() + f"\n\n{end}{tail}")
+
+
+def shorten_number(text: str) -> str:
+    """Return a number with four significant digits; whole numbers and other text stay."""
+    try:
+        return text if float(text).is_integer() and "e" not in text else f"{float(text):.4g}"
+    except (ValueError, OverflowError):
+        return text
+
+
+def show_table(page: str, table: Path, module: str, columns: Iterable[str] = ()) -> None:
+    """Write a csv file's columns, all by default, into the block of a page with its name."""
+    rows = read_table(table)
+    names = list(columns) or list(rows[0])
+    cells = [[shorten_number(row[name]) for name in names] for row in rows]
+    replace_block(DOCS / page, table.stem, format_markdown(names, cells), describe_run(module))

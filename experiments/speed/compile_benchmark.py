@@ -4,7 +4,7 @@
 
 Compiles programs of this package with and without XLA's fusion emitters, which `vrw.start_jax`
 switches off, and writes `docs/figures/compile_benchmark.csv` and the table of
-`docs/explanation/numerics.md`. CPU seconds of one core, no cache; each pair of a program's times is
+`docs/benchmarks/compiling.md`. CPU seconds of one core, no cache; each pair of a program's times is
 taken in turn. Limit cycles are found by machine code that does not come from XLA: making it counts
 as tracing.
 """
@@ -20,6 +20,7 @@ from experiments.shared.command import make_parser
 from experiments.shared.tables import (
     DOCS,
     FIGURES,
+    describe_run,
     format_markdown,
     replace_block,
     write_named_rows,
@@ -100,7 +101,8 @@ def main() -> None:
     table = format_markdown(
         TABLE_COLUMNS.values(), [[row[name] for name in TABLE_COLUMNS] for row in rows]
     )
-    replace_block(DOCS / "explanation" / "numerics.md", "compile times", table)
+    source = describe_run("experiments.speed.compile_benchmark")
+    replace_block(DOCS / "benchmarks" / "compiling.md", "compile times", table, source)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """What limit cycles cost: per cycle and core, per gradient, to the first answer; and the hit rate.
 
-    python -m experiments.speed.cycle_benchmark [file]
+    python -m experiments.speed.cycle_benchmark
 
-Writes `docs/benchmarks/cycles.md`, or the file given. Times are CPU seconds of one core, the least
-of some, unless called wall; take them on an idle machine.
+Writes the block of `docs/benchmarks/cycles.md`. Times are CPU seconds of one core, the least of
+some, unless called wall; take them on an idle machine.
 """
 
 import os
@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +18,8 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, format_markdown
-from experiments.shared.timing import describe_processor, measure_cpu_seconds, use_one_core
+from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
+from experiments.shared.timing import measure_cpu_seconds, use_one_core
 from experiments.shared.wheels import WIDE_BOX, draw_parameter_rows
 from experiments.shared.wheels import make_wheels as wheels_of_rows
 from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS
@@ -193,7 +192,7 @@ def compiling() -> str:
         for measure in ("dls_fraction", "spectral_radius")
         for state, (wall, cpu) in zip(STARTS, measure_first_gait(measure), strict=True)
     ]
-    return format_markdown(("to the first answer of a process", "wall, s", "CPU, s"), answers)
+    return format_markdown(("first result of a process", "wall, s", "CPU, s"), answers)
 
 
 def measure_batches() -> str:
@@ -222,20 +221,13 @@ def measure_hit_rates() -> str:
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("file", type=Path, nargs="?", default=DOCS / "benchmarks" / "cycles.md")
-    file = parse_and_start_jax(parser).file
-    parts = [
-        "# What limit cycles cost, and how often they are found",
-        f"`python -m experiments.speed.cycle_benchmark`; {describe_processor()}, jax "
-        f"{jax.__version__}. CPU "
-        "seconds, one core; wall times on two. On a shared machine the same code has taken up to "
-        "1.5 times more or less.",
-    ]
+    parse_and_start_jax(make_parser(__doc__))
+    parts = []
     for section in (compiling, measure_batches, measure_single_gait, measure_hit_rates):
         parts.append(section())
         print(parts[-1], flush=True)
-        file.write_text("\n\n".join(parts) + "\n")
+    source = describe_run("experiments.speed.cycle_benchmark")
+    replace_block(DOCS / "benchmarks" / "cycles.md", "cycles", "\n\n".join(parts), source)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ Wheels near their own cycles (1 % off), as in `engine_benchmark`; values and Jac
 and durations in one run. Errors: 99th percentile over lanes of the largest entry, against the
 diffrax engine at `Options.tight()`. Times in batches are CPU time of one core, the least of the
 repeats; alone and to a first answer they are wall time. Then the seven columns of state, c, k, L*
-and phi beside peers, speed over error. Writes three tables into `docs/explanation/batches.md`, and
+and phi beside peers, speed over error. Writes three tables into `docs/benchmarks/steps.md`, and
 a chart.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, FIGURES, format_markdown, replace_block
+from experiments.shared.tables import DOCS, FIGURES, describe_run, format_markdown, replace_block
 from experiments.shared.timing import describe_processor, measure_cpu_seconds, use_one_core
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.derivative_peers import HeyokaVariations, numba_differences
@@ -254,9 +254,10 @@ def main() -> None:
         f"{describe_processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     )
     replace_block(
-        DOCS / "explanation" / "batches.md",
+        DOCS / "benchmarks" / "steps.md",
         "derivatives",
         f"{batches}\n\n{one}\n\n{compared}\n\n{result}",
+        describe_run("experiments.speed.derivative_benchmark"),
     )
 
 

@@ -24,6 +24,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser
 from experiments.shared.tables import (
     DOCS,
+    describe_run,
     format_markdown,
     read_table,
     replace_block,
@@ -233,7 +234,8 @@ def write(table, shares, cost, out):
         f"on {os.cpu_count()} cores."
     )
     print(text)
-    replace_block(out / "explanation" / "batches.md", "speeds", text)
+    source = describe_run("experiments.speed.engine_benchmark")
+    replace_block(out / "benchmarks" / "steps.md", "speeds", text, source)
     draw(table, shares, cost, figures)
 
 

@@ -5,7 +5,7 @@
 Wheels and starts of a wide box: many step, others fall in every way. Both engines at the default
 options; lanes whose outcome differs, or whose state or durations do by more than 1e-8, are looked
 at again: at tolerances of 1e-13 by both, whether they come to rest, at 1e-12, then at starts 1e-10
-and 1e-8 away by the lanes alone. Writes a table into `docs/explanation/batches.md`, and names the
+and 1e-8 away by the lanes alone. Writes a table into `docs/verification/accuracy.md`, and names the
 lanes for which no reason was found.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, format_markdown, replace_block
+from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, wheel_from_parameters
 
 BOX = {
@@ -161,7 +161,10 @@ def main() -> None:
         f"\n\nNo reason was found for lanes {left_part.tolist()}." if len(left_part) else ""
     )
     replace_block(
-        DOCS / "explanation" / "batches.md", "agreement", f"{table}\n\n{spread}{unexplained}"
+        DOCS / "verification" / "accuracy.md",
+        "agreement",
+        f"{table}\n\n{spread}{unexplained}",
+        describe_run("experiments.speed.engines_agree"),
     )
     print(table, spread, unexplained)
 

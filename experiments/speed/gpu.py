@@ -5,7 +5,7 @@
 Steps, seven columns of their Jacobians, limit cycles and a scan in float64, on JAX's default
 device, where that is a GPU; without one it says so and writes nothing. The same lanes are then
 computed by the CPU in a process of its own. A rate is lanes over the wall time of the second call;
-what the first call took beyond it is compiling. Writes a table into `docs/explanation/batches.md`;
+what the first call took beyond it is compiling. Writes a table into `docs/benchmarks/steps.md`;
 `--rehearse` goes the same way on a CPU and prints the table instead.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, format_markdown, replace_block
+from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
 from experiments.shared.wheels import BOX, draw_parameter_rows, make_wheels
 
 COLUMNS = ("section_state", "damping", "stiffness", "natural_length", "slope")
@@ -124,7 +124,9 @@ def main() -> None:
     if chosen.rehearse:
         print(result)
     else:
-        replace_block(DOCS / "explanation" / "batches.md", "gpu", result)
+        replace_block(
+            DOCS / "benchmarks" / "steps.md", "gpu", result, describe_run("experiments.speed.gpu")
+        )
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@
 
 A group of eight lanes goes through each phase together. Told is how many steps its slowest lane
 tries over how many its lanes do on average: 1 where none waits. Orders are as given, by c/m, that
-of `vrw.steps`, and by the steps of SLS-I themselves, which no one knows before. Printed are also
-fits of SLS-I's steps, of which `work_order` has the powers rounded, over that of c/m. Writes a
-table into `docs/explanation/batches.md`.
+of `vrw.step_batch`, and by the steps of SLS-I themselves, unknown in advance. Printed are also fits
+of SLS-I's steps, of which `work_order` has the powers rounded, over that of c/m. Writes a
+table into `docs/benchmarks/steps.md`.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, format_markdown, replace_block
+from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.engines_agree import draw_wheels
 from vrw_jax.batches.batch_steps import sort_by_work
@@ -99,8 +99,11 @@ def main() -> None:
         result.append((scene, *(f"{compute_group_steps(steps, order):.2f}" for order in orders)))
         fit = powers(rows, states, steps)
         fits.append((scene, *(f"{x / fit[0]:.2f}" for x in fit)))
-    table = format_markdown(("wheels", "as given", "c/m", "`vrw.steps`", "SLS-I's steps"), result)
-    replace_block(DOCS / "explanation" / "batches.md", "waiting", table)
+    table = format_markdown(
+        ("wheels", "as given", "c/m", "`vrw.step_batch`", "SLS-I's steps"), result
+    )
+    source = describe_run("experiments.speed.lanes_that_wait")
+    replace_block(DOCS / "benchmarks" / "steps.md", "waiting", table, source)
     print(table)
     print(format_markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
 

@@ -22,7 +22,12 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, read_table, write_named_rows
+from experiments.shared.tables import (
+    FIGURES,
+    read_table,
+    show_table,
+    write_named_rows,
+)
 from vrw_jax.scans import ScanPlan, ScanProgress, plan_scan, run_scan
 
 ROOT = Path(__file__).parents[2]
@@ -187,6 +192,9 @@ def main() -> None:
         print(figures_of(size), flush=True)
     rows = [figures_of(size) for size in sizes]
     write_named_rows(FIGURES / "scan_benchmark.csv", rows)
+    show_table(
+        "benchmarks/scans.md", FIGURES / "scan_benchmark.csv", "experiments.speed.scan_benchmark"
+    )
     draw(rows)
     compare(sizes[-1])
 

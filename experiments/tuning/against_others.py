@@ -27,7 +27,13 @@ from scipy.optimize import minimize
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
-from experiments.shared.tables import FIGURES, format_markdown, replace_block, write_named_rows
+from experiments.shared.tables import (
+    FIGURES,
+    describe_run,
+    format_markdown,
+    replace_block,
+    write_named_rows,
+)
 from vrw_jax import figures as plots
 from vrw_jax.cli.config import load_config
 from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
@@ -334,7 +340,7 @@ def main() -> None:
     print(table)
     page = folder.parent / "tuning.md"
     if page.exists():
-        replace_block(page, "table", table)
+        replace_block(page, "table", table, describe_run("experiments.tuning.against_others"))
     plots.save(draw_chart(results), folder, "tuning_against_others")
 
 

@@ -9,7 +9,11 @@ the other rung.
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, write_table
+from experiments.shared.tables import (
+    FIGURES,
+    show_table,
+    write_table,
+)
 from experiments.shared.wheels import WIDE_BOX
 
 FRICTION = 0.7
@@ -94,6 +98,11 @@ def main() -> None:
     best = max(climbed, key=lambda tuned: tuned.value)
     row("optimum on real ground, paper's rung", best.params, on_paper(best.params))
     write_table(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
+    show_table(
+        "studies/double_support.md",
+        FIGURES / "tuning_on_ground.csv",
+        "experiments.tuning.on_ground",
+    )
 
 
 if __name__ == "__main__":

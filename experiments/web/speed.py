@@ -13,8 +13,7 @@ import tempfile
 from typing import Any
 
 from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
-from experiments.shared.tables import format_markdown, replace_block
-from experiments.shared.timing import describe_processor
+from experiments.shared.tables import describe_run, format_markdown, replace_block
 from experiments.web.build import (
     CODE,
     FACTS,
@@ -164,7 +163,10 @@ def main() -> None:
     table = format_markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     replace_block(
-        ROOT / "docs" / "explore.md", "speed", f"{table}\n\n{describe_processor()}; {load}."
+        ROOT / "docs" / "explore.md",
+        "speed",
+        f"{table}\n\n{load[0].upper()}{load[1:]}.",
+        describe_run("experiments.web.speed"),
     )
 
 

@@ -375,8 +375,8 @@ def write_page(
     path.write_text(text, encoding="utf-8")
 
 
-def draw(rows: list[Row], batches: list[Row]) -> None:
-    """All charts and the tables."""
+def draw(rows: list[Row], batches: list[Row], source: str | None = None) -> None:
+    """Draw all charts and tables; `source` is the line of `describe_run` of a new measurement."""
     unit = unit_of(rows)
     with figure_style():
         for name, (quantities, shown_values) in CHARTS.items():
@@ -387,7 +387,7 @@ def draw(rows: list[Row], batches: list[Row]) -> None:
         save(batch_chart(batches, rows), FIGURES, "work_precision_batch")
     write_page(rows, FIGURES / "work_precision.html", works(unit))
     page = DOCS / "benchmarks" / "work_precision.md"
-    replace_block(page, "what to use", table(rows))
-    replace_block(page, "defaults", on_the_front(rows))
-    replace_block(page, "floors", floors(rows))
-    replace_block(page, "failures", failures(rows))
+    replace_block(page, "what to use", table(rows), source)
+    replace_block(page, "defaults", on_the_front(rows), source)
+    replace_block(page, "floors", floors(rows), source)
+    replace_block(page, "failures", failures(rows), source)

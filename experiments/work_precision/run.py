@@ -19,7 +19,13 @@ import numpy as np
 from rich.progress import track
 
 from experiments.shared.command import make_parser, require_extra
-from experiments.shared.tables import FIGURES, Row, read_table, write_named_rows
+from experiments.shared.tables import (
+    FIGURES,
+    Row,
+    describe_run,
+    read_table,
+    write_named_rows,
+)
 from experiments.shared.timing import measure_cpu_seconds, start_without_cache, use_one_core
 from experiments.shared.wheels import make_wheels
 from experiments.work_precision import charts
@@ -182,7 +188,8 @@ def main() -> None:
         with use_one_core():
             start_without_cache()
             measure_all(chosen)
-    charts.draw(read_measured_rows(TABLE), read_measured_rows(BATCH_TABLE))
+    source = None if chosen.redraw else describe_run("experiments.work_precision.run")
+    charts.draw(read_measured_rows(TABLE), read_measured_rows(BATCH_TABLE), source)
 
 
 if __name__ == "__main__":

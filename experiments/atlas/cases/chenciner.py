@@ -205,7 +205,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
 
 CASE = Case(
     "Near a Chenciner point",
-    "a cycle that no walk reaches; its pair on the circle",
+    "a cycle that no simulation reaches; its pair of multipliers on the circle",
     "published point and state; trivial multiplier 1; Liouville",
     "MatCont's manual (2012), its second point for this reaction, as its users quote it; constants "
     "as in the tutorials of BifurcationKit and COCO; De Witte et al., Physica D 267 (2013)",

@@ -150,10 +150,10 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
 
 
 CASE = Case(
-    "Stability told wrong with few segments",
+    "Wrong multipliers with few segments",
     "collocation loses a narrow contraction",
     "closed form, exp(−2π)",
-    "the failure that issues of continuation packages tell of; closed form made here",
+    "a failure reported in issues of continuation packages; closed form derived here",
     rows,
     draw,
 )

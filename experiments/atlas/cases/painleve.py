@@ -129,7 +129,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
 
 CASE = Case(
     "Rod of Painlevé",
-    "the contact has no answer, or two",
+    "the contact problem has no solution, or two",
     "analysis: counts, and the least friction 4/3",
     "Painlevé 1895; Génot and Brogliato, Eur. J. Mech. A 18 (1999); derived in the module",
     rows,

@@ -95,7 +95,7 @@ CASE = Case(
     "Pendulum with a pin",
     "a sequence of modes, each begun on its own guard",
     "elliptic integrals",
-    "ARGESIM benchmark C7, undamped; equation and jumps as sdynamix.com/pendulum.html tells them, "
+    "ARGESIM benchmark C7, undamped; equation and jumps as sdynamix.com/pendulum.html gives them, "
     "lengths and angles from memory",
     rows,
     draw,

@@ -279,7 +279,7 @@ def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
 
 # fmt: off
 ASSUMPTION_CLAIMS = ClaimGroup(
-    "Premises of the model at Table 1 (what it assumes without saying)",
+    "Assumptions of the model at Table 1",
     _compute_assumption_numbers, (
     Claim("Leg 1 pushes on the ground: least λ2", REFERENCE_CODE_LABEL, "103.9 N",
           "{fore_foot_force:.1f} N", agrees_within(fore_foot_force=(103.9, 0.05))),

@@ -18,9 +18,11 @@ from vrw_jax.paper.facts.misprints import MISPRINT_CLAIMS
 from vrw_jax.printing import format_markdown_table
 
 INTRODUCTION = (
-    "“independent code” is a solver in the paper's own five constrained coordinates: where the "
-    "paper prints no number, or only a curve, the number to meet is that code's. A tolerance is "
-    "half a unit of the last digit published unless the row gives another reason."
+    "The paper is *Modeling and analysis of passive viscoelastic-legged rimless wheel that "
+    "generates measurable period of double-limb support*. “Independent code” is a solver in the "
+    "paper's own five constrained coordinates; it provides the reference if the paper prints no "
+    "number, or only a curve. A tolerance is half a unit of the last published digit unless the "
+    "row gives another reason."
 )
 
 CLAIM_GROUPS = (
@@ -48,7 +50,10 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
     """Return the table as a page of Markdown."""
     failed_facts = [fact for fact in facts if not fact.holds]
     lines = [
-        "# The paper's facts, published against found",
+        "# The paper's facts",
+        "",
+        "After reading this page you can compare every number that the paper publishes with the "
+        "computed one. `vrw reproduce --out results` computes this page and the figures again.",
         "",
         f"{summarize_facts(facts)}."
         + (
@@ -59,9 +64,9 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
         "",
         INTRODUCTION,
         "",
-        "Figure 10 is drawn at slope 0.30 rad: Section 5.2 prints 0.10, where the gaits do not fit "
-        "its numbers (last group). With Coulomb friction the rear foot would slip in the landing; "
-        "this model holds it, as the paper does.",
+        "Figure 10 is drawn at slope 0.30 rad, since Section 5.2 prints 0.10, at which the gaits do "
+        "not fit its numbers (last group). With Coulomb friction the rear foot would slip in the "
+        "landing; this model holds it, as the paper does.",
     ]
     for title, group in itertools.groupby(facts, lambda fact: fact.group):
         rows = []
