@@ -64,9 +64,9 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
         "",
         INTRODUCTION,
         "",
-        "Figure 10 is drawn at slope 0.30 rad, since Section 5.2 prints 0.10, at which the gaits do "
-        "not fit its numbers (last group). With Coulomb friction the rear foot would slip in the "
-        "landing; this model holds it, as the paper does.",
+        "Figure 10 is drawn at slope 0.30 rad, since Section 5.2 prints 0.10, at which the gaits "
+        "do not fit its numbers (last group). With Coulomb friction the rear foot would slip in "
+        "the landing; this model holds it, as the paper does.",
     ]
     for title, group in itertools.groupby(facts, lambda fact: fact.group):
         rows = []
