@@ -310,6 +310,9 @@ MEASURES: dict[str, Measure] = (
 PHASE_NAMES = tuple(phase.name for phase in PAPER_PHASES)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
 
+CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphill")
+"""Names of the contact modes of a foot, in order: values 0, 1, 2, 3 of `contact`."""
+
 
 def flag_attrs(names: Iterable[str]) -> dict[str, object]:
     """Return the CF attributes of an integer variable whose values 0, 1, ... have names."""
@@ -356,7 +359,7 @@ def measure_attrs(name: str) -> dict[str, object]:
     if name == "phase":
         attrs |= flag_attrs(PHASE_NAMES)
     if name == "contact":
-        attrs |= flag_attrs(("in the air", "at rest", "sliding downhill", "sliding uphill"))
+        attrs |= flag_attrs(CONTACT_MODE_NAMES)
     if name == "outcome":
         attrs |= flag_attrs(outcome.name for outcome in Outcome)
     return attrs
