@@ -233,6 +233,16 @@ LIMIT_CYCLE_MEASURES = _make_table(
 )
 """Measures of a limit cycle."""
 
+GAIT_SENSITIVITY_MEASURES = _make_table(
+    Measure("gait_sensitivity_dls_fraction", "1/rad", "G_DLS", "gait sensitivity of DLS fraction",
+            "Standard deviation of the DLS fraction on uneven ground, over that of the slopes."),
+    Measure("gait_sensitivity_period", "s/rad", "G_T", "gait sensitivity of the period",
+            "Standard deviation of the period on uneven ground, over that of the slopes."),
+    Measure("gait_sensitivity_speed", "m/(s rad)", "G_v", "gait sensitivity of the speed",
+            "Standard deviation of the speed on uneven ground, over that of the slopes."),
+)
+"""Gait sensitivity norms of a limit cycle, for independent slopes of small standard deviation."""
+
 TRAJECTORY_MEASURES = _make_table(
     Measure("time", "s", "t", "time", "Time since the landing that opens the first step."),
     Measure("step", "1", "step", "step", "Number of the step, from 0."),
@@ -301,6 +311,7 @@ MEASURES: dict[str, Measure] = (
     | UNILATERAL_STEP_MEASURES
     | STOPPER_MARGIN_MEASURES
     | LIMIT_CYCLE_MEASURES
+    | GAIT_SENSITIVITY_MEASURES
     | TRAJECTORY_MEASURES
     | CONTACT_MEASURES
     | PARAMETER_MEASURES
