@@ -261,7 +261,11 @@ class WheelParams(AbstractPrintable):
         return is_inside
 
     def scaled(
-        self, *, mass: RealInput = 1.0, length: RealInput = 1.0, time: RealInput = 1.0
+        self,
+        *,
+        mass: RealInput | int = 1.0,
+        length: RealInput | int = 1.0,
+        time: RealInput | int = 1.0,
     ) -> "WheelParams":
         """Return the similar wheel whose masses, lengths and times are larger by the given factors.
 
