@@ -16,10 +16,10 @@ from vrw_jax.scans.measure_catalog import select_catalog
 from vrw_jax.scans.planning import ScanPlan
 
 STARTUP_SECONDS = 5.0
-"""Time in seconds until the first sample if the compiled code is cached; see docs/scans.md."""
+"""Time in seconds until the first sample with cached code; see docs/benchmarks/scans.md."""
 
 TYPICAL_MEMORY_BYTES = 0.5e9
-"""Typical memory in bytes of code and arrays; see docs/scans.md."""
+"""Typical memory in bytes of code and arrays; see docs/benchmarks/scans.md."""
 
 
 def forecast_scan(plan: ScanPlan, store: str | Path | None = None) -> dict[str, str]:
