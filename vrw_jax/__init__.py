@@ -36,7 +36,6 @@ from vrw_jax.models import (
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness import GaitSensitivity, gait_sensitivity
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import (
     SpecialPointMap,
@@ -81,7 +80,6 @@ __all__ = (
     "DoubleSupportIndicators",
     "EnergyLoss",
     "FixedPointResult",
-    "GaitSensitivity",
     "LadderStep",
     "LadderWheel",
     "LimitCycle",
@@ -113,7 +111,6 @@ __all__ = (
     "continue_special_point",
     "default_margins",
     "explore",
-    "gait_sensitivity",
     "grid",
     "limit_cycle",
     "limit_cycles",

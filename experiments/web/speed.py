@@ -150,15 +150,15 @@ def main() -> None:
     rows = [
         ("a slider moved: gait, multipliers, forces, margins", f"{node['update']:.1f} ms",
          f"{times[0]:.0f} ms, 95 in 100 below {times[1]:.0f}"),
-        ("the same where there is no gait: searched, walked until lost",
+        ("the same without a gait: searched, then walked until it ends",
          "{:.0f} ms, 95 in 100 below {:.0f}, none above {:.0f}".format(*node["lost"]), ""),
         ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
         ("a map of 65 × 65 gaits", "", f"{full_values:.1f} s"),
-        ("real ground: a slider moved a little",
+        ("unilateral contact: a slider moved a little",
          "{:.0f} ms, 95 in 100 below {:.0f}".format(*node["real"]),
          f"{real[0]:.0f} ms, 95 in 100 below {real[1]:.0f}"),
-        ("real ground: a basin of 32 × 32 starts", "", f"{slow:.0f} s"),
-        ("real ground: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
+        ("unilateral contact: a basin of 32 × 32 starts", "", f"{slow:.0f} s"),
+        ("unilateral contact: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
     ]  # fmt: skip
     table = format_markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
