@@ -36,6 +36,7 @@ from vrw_jax.models import (
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import StepOptions
+from vrw_jax.robustness import GaitSensitivity, gait_sensitivity
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import (
     SpecialPointMap,
@@ -80,6 +81,7 @@ __all__ = (
     "DoubleSupportIndicators",
     "EnergyLoss",
     "FixedPointResult",
+    "GaitSensitivity",
     "LadderStep",
     "LadderWheel",
     "LimitCycle",
@@ -111,6 +113,7 @@ __all__ = (
     "continue_special_point",
     "default_margins",
     "explore",
+    "gait_sensitivity",
     "grid",
     "limit_cycle",
     "limit_cycles",

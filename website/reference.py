@@ -15,6 +15,7 @@ from vrw_jax.cli.config import (
 )
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
+    GAIT_SENSITIVITY_MEASURES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     PARAMETER_MEASURES,
@@ -148,7 +149,7 @@ _GROUPS = (
         "`step.margins`, scans."),
     ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "In addition to "
         "those of a step, which every model has."),
-    ("Of a gait", LIMIT_CYCLE_MEASURES, "Of a limit cycle."),
+    ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES, "Of a limit cycle."),
     ("Of a trajectory", TRAJECTORY_MEASURES, "Coordinates and variables of `vrw.simulate`."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES, "Variables of each leg."),
     ("Parameters", PARAMETER_MEASURES, "Axes of scans and branches."),

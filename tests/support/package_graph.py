@@ -18,7 +18,7 @@ PACKAGE_LAYERS = (
     ("simd",), ("validation",), ("printing",), ("runtime",), ("numerics",), ("integrator",),
     ("hybrid",), ("collocation",), ("wheel",), ("measures",), ("models",), ("contact",),
     ("selection",), ("simulation",), ("batches",), ("continuation",), ("cycles",), ("tolerance",),
-    ("branches", "tuning"), ("scans",), ("figures", "web"), ("paper",), ("cli",),
+    ("branches", "tuning"), ("scans", "robustness"), ("figures", "web"), ("paper",), ("cli",),
 )  # fmt: skip
 """Packages in import order: a package may import those of earlier rows only."""
 

@@ -32,7 +32,9 @@ from vrw_jax.cycles.finder import (
     is_same_branch,
 )
 from vrw_jax.cycles.finder_selection import (
+    Guess,
     make_finder,
+    resolve_finder,
     resolve_model,
     resolve_model_with_reason,
 )
@@ -48,4 +50,5 @@ from vrw_jax.cycles.margin_defaults import default_margins, gait_takeoff_acceler
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.cycles.sensitivity import sensitivities
+from vrw_jax.cycles.slope_response import compute_gait_sensitivity
 from vrw_jax.cycles.unilateral_finder import PeriodMap, solve_linear_systems

@@ -1,6 +1,7 @@
 """Gaits of the paper's model: one algebraic system for the cycle, and one step as a check."""
 
 import dataclasses
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
 
@@ -30,7 +31,13 @@ from vrw_jax.cycles.limit_cycle_result import (
     transfer_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import DIFFERENTIABLE_STEP_NAMES, MARGIN_MEASURES, MEASURES
+from vrw_jax.cycles.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
+from vrw_jax.measures import (
+    DIFFERENTIABLE_STEP_NAMES,
+    GAIT_SENSITIVITY_MEASURES,
+    MARGIN_MEASURES,
+    MEASURES,
+)
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
 from vrw_jax.simulation import validate_arguments
@@ -62,7 +69,7 @@ class CollocationFinder(AbstractGaitFinder):
     )
     supports_cold_start: ClassVar[bool] = True
     default_measures: ClassVar[tuple[str, ...]] = tuple(
-        n for n in cycle_measures if n != "spectral_margin"
+        n for n in cycle_measures if n not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES)
     )
 
     @classmethod
@@ -164,6 +171,16 @@ class CollocationFinder(AbstractGaitFinder):
         cycle: Any = None if guess is None else self.find_cycle_from_values(values, guess)
         start = self.initial_guess(values) if cycle is None else cycle.collocation_state
         return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
+
+    def slope_response(
+        self, params: WheelParams, cycle: Any, names: Sequence[str]
+    ) -> SlopeResponse:
+        """Return the response from the collocation if it determines the measures, else from the
+        step."""
+        if not set(names) <= set(COLLOCATION_RESPONSE_MEASURES):
+            return super().slope_response(params, cycle, names)
+        response: SlopeResponse = cycle.slope_response
+        return response.select([COLLOCATION_RESPONSE_MEASURES.index(name) for name in names])
 
     def precompile(self, params: WheelParams) -> None:
         values = stack_parameters(params)

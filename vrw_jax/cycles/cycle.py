@@ -245,6 +245,10 @@ def _read_indicator(name: str) -> Callable[[Any], Array]:
     return lambda cycle: cycle.combine_steps(getattr(cycle.indicators, name), jnp.min)
 
 
+def _read_gait_sensitivity(name: str) -> Callable[[Any], Array]:
+    return lambda cycle: cycle.gait_sensitivity(name)
+
+
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "dls_fraction": _read_property("dls_fraction"),
     "period": _read_property("period"),
@@ -265,6 +269,9 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "spectral_margin": _read_property("spectral_margin"),
     "stability_margin": _read_property("stability_margin"),
     "takeoff_acceleration": _read_property("takeoff_acceleration"),
+    "gait_sensitivity_dls_fraction": _read_gait_sensitivity("dls_fraction"),
+    "gait_sensitivity_period": _read_gait_sensitivity("period"),
+    "gait_sensitivity_speed": _read_gait_sensitivity("speed"),
 }
 """Functions of a cycle by name of the measure; the only such table. Derivatives of the stability
 measures are second derivatives of the motion. They need one more compiled program and take twice

@@ -1,7 +1,7 @@
 """Interface of the gait finders: each finds, checks and differentiates the gaits of one model."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.options import CycleOptions
+from vrw_jax.cycles.slope_response import SlopeResponse, step_slope_response
 from vrw_jax.models import AbstractStep, AbstractWheel
 from vrw_jax.numerics import StepOptions, take_rows, value_and_jacobian
 from vrw_jax.wheel import Outcome, WheelParams
@@ -171,11 +172,23 @@ class AbstractGaitFinder(eqx.Module):
         """
         return measure_from_cycle(self, values, guess, names)
 
+    def slope_response(
+        self, params: WheelParams, cycle: Any, names: Sequence[str]
+    ) -> SlopeResponse:
+        """Return the response of the cycle's step, one for each period, to the slopes of its two
+        lines, with these measures of a step."""
+        return _step_slope_response(
+            self.model, params, cycle.section_state, tuple(names), self.step_options
+        )
+
     @classmethod
     def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
         """Return a measure of a gait by name. Margins of the locked legs have one value for each
         leg."""
         return cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
+
+
+_step_slope_response = eqx.filter_jit(step_slope_response)
 
 
 class GaitMeasures(NamedTuple):

@@ -32,6 +32,12 @@ from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle_with_derivatives
 from vrw_jax.cycles.margin_defaults import gait_takeoff_acceleration
 from vrw_jax.cycles.phase_sequence import ADMISSIBILITY_CHECKS
+from vrw_jax.cycles.slope_response import (
+    COLLOCATION_RESPONSE_MEASURES,
+    SlopeResponse,
+    collocation_slope_response,
+    compute_gait_sensitivity,
+)
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
 from vrw_jax.printing import TextRow, describe_elements, format_numbers
@@ -146,6 +152,28 @@ class LimitCycle(AbstractCycle):
         return self._mask_missing(
             self._map_over_batch(acceleration_of_cycle)(self.parameters, self.collocation_state)
         )
+
+    @property
+    def slope_response(self) -> SlopeResponse:
+        """Return the response of the step to the slopes of its lines, with
+        `slope_response.COLLOCATION_RESPONSE_MEASURES`."""
+        if self.period_n > 1:
+            raise ValueError(
+                f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
+                "for gaits that repeat after one: give a cycle of period_n = 1."
+            )
+        respond = functools.partial(collocation_slope_response, self.system)
+        return self._map_over_batch(respond)(self.parameters, self.collocation_state)
+
+    def gait_sensitivity(self, name: str) -> Array:
+        """Return the gait sensitivity norm of a measure, in its unit per rad of slope: see
+        `gait_sensitivity`."""
+        index = COLLOCATION_RESPONSE_MEASURES.index(name)
+
+        def norm_of(response: SlopeResponse) -> Array:
+            return compute_gait_sensitivity(response.select([index])).norm[0]
+
+        return self._mask_missing(self._map_over_batch(norm_of)(self.slope_response))
 
     @property
     def margins(self) -> Margins:

@@ -46,8 +46,19 @@ def compute_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
 
 def _symbols(n_legs: int, constants: PhaseConstants) -> Symbols:
     alpha = 2.0 * math.pi / n_legs
-    fields: tuple[Any, ...] = (*constants, n_legs, math.sin(alpha), math.cos(alpha), alpha)
+    fields: tuple[Any, ...] = (
+        *constants[:N_LANE_CONSTANTS],
+        n_legs,
+        math.sin(alpha),
+        math.cos(alpha),
+        alpha,
+    )
     return Symbols(*fields)
+
+
+def _is_uneven(constants: PhaseConstants) -> bool:
+    """Return whether the constants end with the angle by which the next line is steeper, rad."""
+    return len(constants) > N_LANE_CONSTANTS
 
 
 def _make_collocation_phase(
@@ -59,9 +70,8 @@ def _make_collocation_phase(
     def evaluate_phase(
         constants: PhaseConstants, point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
-        phase = phase_class(
-            _symbols(n_legs, constants), point.held_constants, stop_at_lift_off=True
-        )
+        turn = sine_cosine(constants[N_LANE_CONSTANTS]) if _is_uneven(constants) else ()
+        phase = phase_class(_symbols(n_legs, constants), point.held_constants, True, turn)
         return phase, phase.motion_at(point.q, point.v)
 
     def residual(constants: PhaseConstants, point: PhasePoint, acceleration: Vector) -> Vector:
@@ -87,6 +97,7 @@ def _make_collocation_phase(
     def to_section(constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
         (theta, _), (dtheta, dL1) = point.q, point.v
         s = _symbols(n_legs, constants)
+        theta = theta - constants[N_LANE_CONSTANTS] if _is_uneven(constants) else theta
         return PhasePoint((), transitions.land_on_both_feet(s, theta, dtheta, dL1), ())
 
     reset = to_section if phase_class is PAPER_PHASES[-1] else to_next_phase

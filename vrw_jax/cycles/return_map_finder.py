@@ -25,7 +25,11 @@ from vrw_jax.cycles.finder import (
     value_and_tangents,
 )
 from vrw_jax.cycles.options import CycleOptions
-from vrw_jax.measures import DIFFERENTIABLE_STEP_NAMES, SHARED_STEP_MEASURE_NAMES
+from vrw_jax.measures import (
+    DIFFERENTIABLE_STEP_NAMES,
+    GAIT_SENSITIVITY_MEASURES,
+    SHARED_STEP_MEASURE_NAMES,
+)
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
 from vrw_jax.printing import TextRow, format_numbers
@@ -210,7 +214,9 @@ class ReturnMapFinder(AbstractReturnMapFinder):
     """Finder for any model, with the derivatives of Newton's method."""
 
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
-        n for n in CYCLE_MEASURE_FUNCTIONS if n != "takeoff_acceleration"
+        n
+        for n in CYCLE_MEASURE_FUNCTIONS
+        if n not in ("takeoff_acceleration", *GAIT_SENSITIVITY_MEASURES)
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         dict.fromkeys(

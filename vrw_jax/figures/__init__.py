@@ -12,6 +12,7 @@ from vrw_jax.figures.style import (
     figure_style,
     save,
 )
+from vrw_jax.figures.tornado_figures import tornado_figure
 from vrw_jax.figures.tuning_figures import tuning_figure
 from vrw_jax.figures.walk_figures import (
     foot_height,

@@ -10,6 +10,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from vrw_jax.figures.contact_figures import (
+    FootMotion,
+    compute_foot_motion,
+    draw_contact_sticks,
+    draw_feet,
+    make_contact_panels,
+    make_mode_handles,
+    reports_contact_modes,
+    select_leg_color,
+)
 from vrw_jax.figures.style import (
     COLUMN_WIDTH_INCHES,
     DARK_GRAY,
@@ -27,7 +37,7 @@ from vrw_jax.figures.style import (
     require_variables_of_all,
 )
 from vrw_jax.measures import MEASURES, PHASE_NAMES
-from vrw_jax.validation import check_type
+from vrw_jax.validation import check_int, check_positive, check_type
 
 Coordinate = float | np.ndarray
 """One coordinate of points, in m."""
@@ -36,8 +46,25 @@ FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
 """Names of the ground forces on the feet of Leg 1 and Leg 2, in N."""
 
 
-GAIT_REMEDY = "give vrw.simulate(params)"
-"""Remedy that completes the message about a wrong dataset."""
+WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
+"""Remedy in the message about a dataset that is no walk."""
+
+PAPER_WALK_REMEDY = (
+    "give vrw.simulate(params) of the paper's wheel; vrw.plot.gait_panels, sticks and walk_frames "
+    "draw walks of any model"
+)
+"""Remedy in the message about a walk without the phases of the paper."""
+
+
+def _require_walk(name: str, walk: xr.Dataset) -> None:
+    """Raise unless `walk` is a trajectory with at least one sample."""
+    needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
+    require_variables(name, walk, needed_names, WALK_REMEDY)
+    if not walk.sizes["time"]:
+        raise ValueError(
+            f"{name} has no samples, because the walk ended at once as {walk.attrs['outcome']}: "
+            "give one that takes a step."
+        )
 
 
 def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
@@ -68,10 +95,11 @@ def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
 def gait_panels(gait: xr.Dataset) -> Figure:
     """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
 
-    Gray bands are double support, and dotted lines are collision II.
+    Gray bands are double support, and dotted lines are collision II. With unilateral contact the
+    panels show angle, leg lengths, contact modes, foot heights, normal and tangential forces.
 
     Args:
-        gait: dataset of `vrw.simulate` with the paper's model.
+        gait: dataset of `vrw.simulate` with any model.
 
     Returns:
         Figure: panels over time in s, in SI units.
@@ -80,7 +108,9 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.gait_panels(gait)
     """
-    require_variables("gait", gait, ("phase", *FORCE_NAMES), GAIT_REMEDY)
+    _require_walk("gait", gait)
+    if reports_contact_modes(gait):
+        return make_contact_panels(gait)
     time, theta, L1, L2, z2, *forces = insert_landing_gaps(
         gait, "theta", "L1", "L2", "foot_2_z", *FORCE_NAMES
     )
@@ -128,8 +158,11 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     """Return a stick diagram in the X-Z plane (Fig. 7); Leg 1 is solid and Leg 2 dotted.
 
+    With unilateral contact the feet have the colors of their contact modes, in place of the colors
+    of the phases, and other legs on the ground are drawn too.
+
     Args:
-        gait: dataset of `vrw.simulate` with the paper's model.
+        gait: dataset of `vrw.simulate` with any model.
         interval: time between two sticks, in s.
 
     Returns:
@@ -139,11 +172,35 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.sticks(gait, interval=0.1)
     """
-    require_variables("gait", gait, ("phase", "foot_1_x"), GAIT_REMEDY)
-    tones = ("#A0A0A0", SKY, "#000000")
-    time = gait.time.values
+    _require_walk("gait", gait)
+    check_positive("interval", interval)
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
+    draw_sticks = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
+    draw_sticks(axes, gait, interval)
+    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
+    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+    last_hub_x = float(gait.hub_x[-1])
+    axes.annotate(
+        "downhill",
+        (last_hub_x, -0.07),
+        (last_hub_x - 0.3, -0.07),
+        va="center",
+        ha="right",
+        arrowprops={"arrowstyle": "->", "linewidth": 0.6},
+    )
+    axes.set_ylim(-0.12, None)
+    axes.set_aspect("equal")
+    axes.set_xlabel("$X$ [m]")
+    axes.set_ylabel("$Z$ [m]")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
+    """Draw Legs 1 and 2 of a walk in phases, in the colors of the phases."""
+    tones = ("#A0A0A0", SKY, "#000000")
+    time = gait.time.values
     for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
         instant = gait.isel(time=int(i))
         for foot, line in ((1, "-"), (2, ":")):
@@ -154,27 +211,11 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
                 linestyle=line,
                 linewidth=0.8,
             )
-    axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
-    axes.axhline(0.0, color="black", linewidth=0.8)
-    axes.annotate(
-        "downhill",
-        (float(gait.foot_1_x[-1]), -0.07),
-        (float(gait.foot_1_x[-1]) - 0.3, -0.07),
-        va="center",
-        ha="right",
-        arrowprops={"arrowstyle": "->", "linewidth": 0.6},
-    )
-    axes.set_ylim(-0.12, None)
-    axes.set_aspect("equal")
-    axes.set_xlabel("$X$ [m]")
-    axes.set_ylabel("$Z$ [m]")
     for line, name in (("-", "Leg 1"), (":", "Leg 2")):
         axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
     for phase, tone in zip(PHASE_NAMES, tones, strict=True):
         axes.plot([], [], color=tone, linewidth=3.0, label=phase)
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
@@ -203,7 +244,7 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.foot_height([gait])
     """
-    require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), GAIT_REMEDY)
+    require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), PAPER_WALK_REMEDY)
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
     step_axes, takeoff_axes = figure.subplots(1, 2)
     for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
@@ -252,7 +293,7 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.rear_force([gait])
     """
-    require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), GAIT_REMEDY)
+    require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), PAPER_WALK_REMEDY)
     figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 2.5))
     axes = figure.subplots()
     for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
@@ -356,11 +397,12 @@ def walk_frames(
 ) -> tuple[list[Image.Image], int]:
     """Return looping frames of one step of a steady gait, and the duration of a frame in ms.
 
-    The camera moves at the mean speed. Arrows are ground forces, 1 m for 300 N.
+    The camera moves at the mean speed. Arrows are ground forces, 1 m for 300 N. Feet have the
+    colors of their contact modes.
 
     Args:
-        step: dataset of `vrw.simulate` over one step of a gait.
-        n_frames: number of frames of the step.
+        step: dataset of `vrw.simulate` over one step of a gait, or over several, with any model.
+        n_frames: number of frames.
         slow: factor of slow motion; 2 plays at half speed.
 
     Returns:
@@ -372,73 +414,61 @@ def walk_frames(
         >>> len(frames)
         2
     """
-    require_variables("step", step, ("parameter_slope", "phase", "foot_2_x"), GAIT_REMEDY)
-    slope, time = step.attrs["parameter_slope"], step.time.values
-    period = time[-1]
-    stride = float(step.hub_x[-1] - step.hub_x[0])
+    _require_walk("step", step)
+    n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
+    slope, motion = step.attrs["parameter_slope"], compute_foot_motion(step)
+    duration = motion.time[-1]
+    distance = float(motion.hub[-1, 0] - motion.hub[0, 0])
+    stride = distance / max(int(motion.step[-1] - motion.step[0]) + 1, 1)
     frames = []
-    for t in np.linspace(0.0, period, n_frames, endpoint=False):
+    for t in np.linspace(0.0, duration, n_frames, endpoint=False):
         figure = Figure(figsize=(3.6, 3.3), dpi=100)
         figure.set_layout_engine("none")
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        center = float(step.hub_x[0]) + stride * t / period
+        center = float(motion.hub[0, 0]) + distance * t / duration
         _draw_ground(axes, slope, center, stride)
-        _draw_wheel(axes, step, t)
-        time_index = min(int(np.searchsorted(time, t, side="right")), time.size - 1)
-        _draw_forces(axes, step.isel(time=time_index), np.interp(t, time, step.foot_2_x))
+        sample = _draw_wheel(axes, motion, t, slope)
         view_center = [float(v) for v in _rotate_to_vertical(center, 0.75, slope)]
         axes.set_xlim(view_center[0] - 1.35, view_center[0] + 1.35)
         axes.set_ylim(view_center[1] - 1.25, view_center[1] + 1.225)
-        axes.text(
-            0.02,
-            0.03,
-            PHASE_NAMES[int(step.phase[time_index])],
-            transform=axes.transAxes,
-            fontsize=14,
-        )
+        if reports_contact_modes(step):
+            handles = make_mode_handles(motion.contact)
+            axes.legend(handles=handles, loc="lower left", fontsize=8)
+        else:
+            phase_name = PHASE_NAMES[int(step.phase[sample])]
+            axes.text(0.02, 0.03, phase_name, transform=axes.transAxes, fontsize=14)
         canvas.draw()
         picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
         frames.append(picture.convert("RGB"))
-    return frames, round(1e3 * slow * period / n_frames)
+    return frames, round(1e3 * slow * duration / n_frames)
 
 
-def _draw_wheel(axes: Axes, step: xr.Dataset, t: float) -> None:
-    """Draw hub and legs of the wheel at the time t, in s."""
-    slope, n = step.attrs["parameter_slope"], step.attrs["parameter_n_legs"]
-    names = ("theta", "L1", "L2", "hub_x", "hub_z")
-    theta, L1, L2, x, z = (float(np.interp(t, step.time, step[name])) for name in names)
-    for j in range(1, n + 1):
-        angle = theta + (j - 1) * 2.0 * np.pi / n
-        leg_length = {1: L1, 2: L2}.get(j, step.attrs["parameter_locked_length"])
-        color, width = {1: (LEG_1_COLOR, 3.0), 2: (LEG_2_COLOR, 3.0)}.get(j, ("#999999", 1.5))
+def _draw_wheel(axes: Axes, motion: FootMotion, t: float, slope: float) -> int:
+    """Draw hub, legs, feet and forces at the time t, in s; return the sample of the modes."""
+    hub, feet, sample = motion.interpolate(t)
+    rotate = lambda points: np.array(_rotate_to_vertical(points[..., 0], points[..., 1], slope))
+    for leg, foot in enumerate(feet, 1):
         axes.plot(
-            *_rotate_to_vertical(
-                np.array([x, x - leg_length * np.sin(angle)]),
-                np.array([z, z - leg_length * np.cos(angle)]),
-                slope,
-            ),
-            color=color,
-            linewidth=width,
+            *rotate(np.stack([hub, foot])),
+            color=select_leg_color(leg),
+            linewidth=3.0 if leg < 3 else 1.5,
             solid_capstyle="round",
-            zorder=5 if j < 3 else 3,
+            zorder=5 if leg < 3 else 3,
         )
-    axes.plot(*_rotate_to_vertical(x, z, slope), "o", color="black", markersize=9, zorder=6)
-
-
-def _draw_forces(axes: Axes, instant: xr.Dataset, foot_2_x: float) -> None:
-    """Draw arrows of the ground forces on both feet."""
-    slope, forces = instant.attrs["parameter_slope"], [float(instant[name]) for name in FORCE_NAMES]
-    for foot, tangential, normal in ((0.0, *forces[:2]), (foot_2_x, *forces[2:])):
-        if normal != 0.0:
+    axes.plot(*rotate(hub), "o", color="black", markersize=9, zorder=6)
+    draw_feet(axes, rotate(feet), motion.contact[sample], 6.0)
+    for foot, force in zip(feet, motion.forces[sample], strict=True):
+        if force[1] != 0.0:
             axes.annotate(
                 "",
-                _rotate_to_vertical(foot + tangential / 300.0, normal / 300.0, slope),
-                _rotate_to_vertical(foot, 0.0, slope),
+                tuple(rotate(foot + force / 300.0)),
+                tuple(rotate(foot)),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
+    return sample
 
 
 def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None:

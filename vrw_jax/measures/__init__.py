@@ -3,7 +3,9 @@
 from vrw_jax.measures.provenance import provenance
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
+    CONTACT_MODE_NAMES,
     DIFFERENTIABLE_STEP_NAMES,
+    GAIT_SENSITIVITY_MEASURES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     MEASURES,

@@ -233,6 +233,16 @@ LIMIT_CYCLE_MEASURES = _make_table(
 )
 """Measures of a limit cycle."""
 
+GAIT_SENSITIVITY_MEASURES = _make_table(
+    Measure("gait_sensitivity_dls_fraction", "1/rad", "G_DLS", "gait sensitivity of DLS fraction",
+            "Standard deviation of the DLS fraction on uneven ground, over that of the slopes."),
+    Measure("gait_sensitivity_period", "s/rad", "G_T", "gait sensitivity of the period",
+            "Standard deviation of the period on uneven ground, over that of the slopes."),
+    Measure("gait_sensitivity_speed", "m/(s rad)", "G_v", "gait sensitivity of the speed",
+            "Standard deviation of the speed on uneven ground, over that of the slopes."),
+)
+"""Gait sensitivity norms of a limit cycle, for independent slopes of small standard deviation."""
+
 TRAJECTORY_MEASURES = _make_table(
     Measure("time", "s", "t", "time", "Time since the landing that opens the first step."),
     Measure("step", "1", "step", "step", "Number of the step, from 0."),
@@ -301,6 +311,7 @@ MEASURES: dict[str, Measure] = (
     | UNILATERAL_STEP_MEASURES
     | STOPPER_MARGIN_MEASURES
     | LIMIT_CYCLE_MEASURES
+    | GAIT_SENSITIVITY_MEASURES
     | TRAJECTORY_MEASURES
     | CONTACT_MEASURES
     | PARAMETER_MEASURES
@@ -309,6 +320,9 @@ MEASURES: dict[str, Measure] = (
 
 PHASE_NAMES = tuple(phase.name for phase in PAPER_PHASES)
 """Names of the phases of a step, in order: values 0, 1, 2 of `phase`."""
+
+CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphill")
+"""Names of the contact modes of a foot, in order: values 0, 1, 2, 3 of `contact`."""
 
 
 def flag_attrs(names: Iterable[str]) -> dict[str, object]:
@@ -356,7 +370,7 @@ def measure_attrs(name: str) -> dict[str, object]:
     if name == "phase":
         attrs |= flag_attrs(PHASE_NAMES)
     if name == "contact":
-        attrs |= flag_attrs(("in the air", "at rest", "sliding downhill", "sliding uphill"))
+        attrs |= flag_attrs(CONTACT_MODE_NAMES)
     if name == "outcome":
         attrs |= flag_attrs(outcome.name for outcome in Outcome)
     return attrs

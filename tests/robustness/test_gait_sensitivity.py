@@ -1,0 +1,142 @@
+"""Gait sensitivity norms: long walks, differences, a second formulation, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax.cycles import compute_gait_sensitivity, make_finder, slope_response
+from vrw_jax.simulation import walk
+
+TABLE_1 = vrw.WheelParams()
+PERIOD_NORM = 3.509
+"""Of Table 1's wheel, s/rad, by an independent code to 0.001."""
+MEASURES = ("period", "speed", "dls_fraction", "step_length", "duration_dls", "duration_sls2")
+HELD = vrw.RigidWheel(held_landing=True)
+
+
+@pytest.fixture(scope="module")
+def sensitivity():
+    return vrw.gait_sensitivity(TABLE_1, MEASURES)
+
+
+def test_the_norm_of_the_period_is_that_of_an_independent_code(sensitivity):
+    assert abs(float(sensitivity.norm[0]) - PERIOD_NORM) < 1e-3
+    assert sensitivity.ending == "The gait is stable, and the norms are finite."
+    assert "3.50861 s per rad" in repr(sensitivity)
+
+
+def test_squares_of_the_parts_add_up_to_the_square_of_the_norm(sensitivity):
+    parts = sensitivity.ending_step, sensitivity.beginning_step, sensitivity.later_steps
+    np.testing.assert_allclose(sum(x**2 for x in parts), sensitivity.norm**2, rtol=1e-12)
+
+
+def test_collocation_and_event_driven_steps_give_the_same_norms(sensitivity):
+    finder = make_finder(None, TABLE_1.n_legs)
+    x = vrw.limit_cycle(TABLE_1).section_state
+    response = slope_response.step_slope_response(
+        finder.model, TABLE_1, x, MEASURES, vrw.StepOptions.tight()
+    )
+    by_steps = compute_gait_sensitivity(response)
+    # The states are taken at different instants of the step; the norm does not depend on that.
+    np.testing.assert_allclose(by_steps.norm, sensitivity.norm, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(by_steps.beginning_step, sensitivity.beginning_step, atol=1e-6)
+
+
+def test_a_long_walk_on_slightly_uneven_ground_has_that_standard_deviation(sensitivity):
+    # 400 walks of 100 steps after 20 that settle: correlated samples, standard error near 0.4 %.
+    n_lanes, n_steps, slope_sd = 400, 120, 1e-4
+    slopes = 0.3 + slope_sd * np.random.default_rng(1).standard_normal((n_lanes, n_steps + 1))
+    state = np.tile(vrw.limit_cycle(TABLE_1).section_state, (n_lanes, 1))
+    periods = []
+    for k in range(n_steps):
+        pair = vrw.WheelParams(slope=slopes[:, k : k + 2])
+        result = vrw.step_batch(pair, state, 1)
+        state = np.asarray(result.section_state)
+        periods.append(np.asarray(result.durations).sum(-1))
+    deviation = np.std(np.stack(periods[20:])) / slope_sd
+    assert abs(deviation / float(sensitivity.norm[0]) - 1.0) < 0.01
+
+
+def test_the_linear_map_is_that_of_differences_of_walks():
+    # Central differences with steps of 1e-4 have errors near 1e-9 of derivatives near 1.
+    cycle, h = vrw.limit_cycle(TABLE_1), 1e-4
+    response = slope_response.step_slope_response(
+        vrw.ViscoelasticWheel(), TABLE_1, cycle.section_state, ("period",), vrw.StepOptions.tight()
+    )
+    exact = np.concatenate([response.C[0], response.D1, response.D0])
+    point = np.concatenate([cycle.section_state, [0.3, 0.3]])
+
+    def period(inputs):
+        params = vrw.WheelParams(slope=jnp.asarray(inputs[3:]))
+        step = walk(params, inputs[:3], 1, options=vrw.StepOptions.tight())
+        return float(step.steps.durations.sum())
+
+    for i, unit in enumerate(np.eye(5)):
+        difference = lambda h, unit=unit: (
+            (period(point + h * unit) - period(point - h * unit)) / (2.0 * h)
+        )
+        extrapolated = (4.0 * difference(h) - difference(2.0 * h)) / 3.0
+        assert abs(extrapolated - exact[i]) < 1e-8, i
+
+
+def test_gradients_are_central_differences():
+    norm = lambda damping: vrw.gait_sensitivity(vrw.WheelParams(damping=damping), "period").norm[0]
+    gradient, h = float(jax.jit(jax.grad(norm))(180.0)), 0.05
+    outer, inner = (float(norm(180.0 + k * h) - norm(180.0 - k * h)) / (2 * k * h) for k in (2, 1))
+    assert abs(gradient / ((4.0 * inner - outer) / 3.0) - 1.0) < 1e-6
+
+
+def test_the_norm_is_a_measure_of_cycles_tables_and_scans(tmp_path):
+    names = ["gait_sensitivity_period", "gait_sensitivity_speed"]
+    expected = vrw.gait_sensitivity(TABLE_1, ("period", "speed")).norm
+    cycle = vrw.limit_cycle(TABLE_1)
+    np.testing.assert_allclose([cycle.measure(name) for name in names], expected, rtol=1e-12)
+    table = vrw.sensitivities(TABLE_1, measures=names)
+    np.testing.assert_allclose(table.value, expected, rtol=1e-9)
+    gradient = jax.jit(jax.grad(lambda p: vrw.gait_sensitivity(p, "period").norm[0]))(TABLE_1)
+    exact = [gradient.damping, gradient.slope]
+    of_table = table.derivative.sel(measure=names[0], parameter=["damping", "slope"])
+    np.testing.assert_allclose(of_table, exact, rtol=1e-7)
+    assert table.measure_unit.values.tolist() == ["s/rad", "m/(s rad)"]
+    scan = vrw.scan(vrw.grid(damping=[150.0, 200.0]), measures=names, store=tmp_path / "scan")
+    np.testing.assert_allclose(scan.gait_sensitivity_period.values[1], expected[0], rtol=1e-9)
+
+
+def test_the_rigid_wheel_has_the_norm_of_its_closed_map():
+    params = vrw.WheelParams(slope=0.1)
+    result = vrw.gait_sensitivity(params, ["period"], model=HELD, guess=[0.39, 1.5, 0.0])
+    cycle = vrw.limit_cycle(params, model=HELD, guess=[0.39, 1.5, 0.0])
+
+    def end_and_period(rate, slope, next_slope):
+        pair = vrw.WheelParams(slope=jnp.stack([slope, next_slope]))
+        step = vrw.step(pair, jnp.stack([jnp.asarray(jnp.pi / 8), rate, 0.0 * rate]), model=HELD)
+        return jnp.stack([step.section_state[1], step.period])
+
+    at_gait = cycle.section_state[1], jnp.asarray(0.1), jnp.asarray(0.1)
+    (a, b1, b0), (c, d1, d0) = np.transpose(jax.jacfwd(end_and_period, (0, 1, 2))(*at_gait))
+    # One number is the state, so that the sum over later steps is a geometric series.
+    later = (c * (a * b0 + b1)) ** 2 / (1.0 - a * a)
+    norm = np.sqrt(d0**2 + (c * b0 + d1) ** 2 + later)
+    assert abs(float(result.norm[0]) / norm - 1.0) < 1e-9
+
+
+def test_an_unstable_gait_has_an_infinite_norm():
+    response = slope_response.SlopeResponse(
+        jnp.diag(jnp.array([1.1, 0.2])), *jnp.ones((2, 2)), jnp.ones((1, 2)), *jnp.ones((2, 1))
+    )
+    assert float(compute_gait_sensitivity(response).norm[0]) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("measures", "changes", "sentence"),
+    [
+        ("perod", {}, "did you mean 'period'"),
+        ([], {}, "'nothing' is no measure of a step"),
+        ("period", {"damping": 300.0}, "this wheel has no gait whose sensitivity"),
+    ],
+)
+def test_bad_arguments_are_one_sentence(measures, changes, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        vrw.gait_sensitivity(vrw.WheelParams(**changes), measures)

@@ -1,0 +1,3 @@
+"""Robustness of gaits on uneven ground: sensitivity norms, mean first-passage times."""
+
+from vrw_jax.robustness.gait_sensitivity import GaitSensitivity, gait_sensitivity

@@ -1,0 +1,150 @@
+"""Gait sensitivity norm: how much a measure of a gait varies on slightly uneven ground."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.continuation import floquet
+from vrw_jax.cycles import (
+    CycleOptions,
+    Guess,
+    compute_gait_sensitivity,
+    limit_cycle,
+    resolve_finder,
+    resolve_model,
+)
+from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
+from vrw_jax.numerics import Scalar, StepOptions
+from vrw_jax.printing import AbstractPrintable, TextRow, describe_ending
+from vrw_jax.simulation import ModelLike
+from vrw_jax.validation import check_known_name, check_names, is_traced
+from vrw_jax.wheel import Outcome, WheelParams
+
+
+class GaitSensitivity(AbstractPrintable):
+    """Gait sensitivity norms of several measures, each in the measure's unit per rad of slope.
+
+    The norm is the standard deviation of a measure in a long walk over independent slopes, divided
+    by the standard deviation of the slopes, if that is small. It is infinite if the gait is not
+    stable. The squares of the three parts add up to the square of the norm.
+
+    - `norm`: the norms, in the order of `measures`;
+    - `ending_step`: response to one line of the step that ends on it, with its sign;
+    - `beginning_step`: response of the step that begins on it, with its sign;
+    - `later_steps`: root of the sum of the squared responses of all later steps;
+    - `spectral_radius`: of the gait;
+    - `outcome`: Outcome.STEPPED, or why there is no gait; all numbers are then zero;
+    - `measures`: names of the measures.
+
+    Examples:
+        >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"]))
+        GaitSensitivity
+          step period T: 3.50861 s per rad (step that ends on a line: 0.566241, step that begins on it: -2.78338, later steps: 2.05973)
+          spectral radius of the gait: 0.32862
+    """  # noqa: E501
+
+    norm: Float[Array, " n_measures"]
+    ending_step: Float[Array, " n_measures"]
+    beginning_step: Float[Array, " n_measures"]
+    later_steps: Float[Array, " n_measures"]
+    spectral_radius: Scalar
+    outcome: Int[Array, ""]
+    measures: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def ending(self) -> str:
+        """Return whether the norms are finite, or why not, as a sentence."""
+        if self.outcome != Outcome.STEPPED:
+            return describe_ending(self.outcome, Outcome)
+        if self.spectral_radius < 1.0:
+            return "The gait is stable, and the norms are finite."
+        return "The gait is not stable: deviations grow from step to step, and no norm is finite."
+
+    def summary_rows(self) -> list[TextRow]:
+        """Return one row for each measure, with its parts."""
+        if self.outcome != Outcome.STEPPED:
+            return [("outcome", self.ending)]
+        rows = []
+        for i, name in enumerate(self.measures):
+            measure = MEASURES[name]
+            unit = f"{measure.display_unit} per rad".strip()
+            parts = (
+                f"step that ends on a line: {float(self.ending_step[i]):.6g}, "
+                f"step that begins on it: {float(self.beginning_step[i]):.6g}, "
+                f"later steps: {float(self.later_steps[i]):.6g}"
+            )
+            rows.append((measure.label, f"{float(self.norm[i]):.6g} {unit} ({parts})"))
+        return [*rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
+
+
+def gait_sensitivity(
+    params: WheelParams,
+    measures: str | Sequence[str],
+    *,
+    model: ModelLike | None = None,
+    guess: Guess | None = None,
+    options: CycleOptions | StepOptions | None = None,
+) -> GaitSensitivity:
+    """Return the gait sensitivity norm of each measure of a step.
+
+    The slopes of the lines that join the footholds are independent, with mean `params.slope`. A
+    line enters two steps: the one that ends on it and the one that begins on it. The response of
+    all later steps is summed by a discrete Lyapunov equation (Hobbelen and Wisse 2007, who sum over
+    a few steps).
+
+    Norms are differentiable with respect to `params` in every mode. With margins and other measures
+    that durations and the first landing do not determine, the gradient needs second derivatives of
+    a step, which compile for minutes. With unilateral contact there are values only.
+
+    Args:
+        params: the wheel, whose slope is the mean slope.
+        measures: names of measures of a step, such as "period", "speed" or a margin.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        guess: as in `limit_cycle`.
+        options: as in `limit_cycle`.
+
+    Returns:
+        A `GaitSensitivity`.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, or a wheel without a gait, described in one
+            sentence.
+
+    Examples:
+        >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period", "speed"]).norm.round(3))
+        [3.509 3.757]
+        >>> norm = lambda p: vrw.gait_sensitivity(p, "period").norm[0]
+        >>> print(f"{jax.grad(norm)(vrw.WheelParams()).damping:.5f} s/rad per N s/m")
+        0.01431 s/rad per N s/m
+    """
+    names = check_names("measures", measures)
+    model = resolve_model(params, model)
+    finder = resolve_finder(params, model, options)
+    of_step = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
+    known_names = tuple(name for name in finder.differentiable_measures if name in of_step)
+    for name in names or ("nothing",):
+        check_known_name(
+            name, known_names, f"measure of a step of {finder.model.model_name} wheels"
+        )
+    cycle: Any = limit_cycle(params, guess=guess, model=model, options=options)
+    if not is_traced(cycle) and int(cycle.outcome) != Outcome.STEPPED:
+        raise ValueError(
+            f"this wheel has no gait whose sensitivity could be computed: {cycle.why} Take a wheel "
+            "for which vrw.limit_cycle finds a gait."
+        )
+    norms = compute_gait_sensitivity(finder.slope_response(params, cycle, names))
+    mask = lambda value: jnp.where(cycle.outcome == Outcome.STEPPED, value, 0.0)
+    radius = floquet.spectral_radius(lax.stop_gradient(cycle.monodromy_value))
+    return GaitSensitivity(
+        norm=mask(norms.norm),
+        ending_step=mask(norms.ending_step),
+        beginning_step=mask(norms.beginning_step),
+        later_steps=mask(norms.later_steps),
+        spectral_radius=mask(radius),
+        outcome=cycle.outcome,
+        measures=names,
+    )
