@@ -55,12 +55,12 @@ FUNCTIONS = {
     ("return_map", "rigid"): rigid_map,
     ("step", "viscoelastic"): lambda x: vrw.step(wheel_on(x), vrw.paper_start()).period,
     ("step", "unilateral"): lambda x: vrw.step(wheel_on(x), vrw.paper_start(), model=GROUND).period,
-    ("walk", "viscoelastic"): lambda x: vrw.walk(
-        wheel_on(x, 150.0), vrw.paper_start(), 2
-    ).steps.period[-1],
-    ("walk", "unilateral"): lambda x: vrw.walk(
-        wheel_on(x), vrw.paper_start(), 2, model=GROUND
-    ).steps.period[-1],
+    ("walk", "viscoelastic"): lambda x: (
+        vrw.walk(wheel_on(x, 150.0), vrw.paper_start(), 2).steps.durations[-1].sum()
+    ),
+    ("walk", "unilateral"): lambda x: (
+        vrw.walk(wheel_on(x), vrw.paper_start(), 2, model=GROUND).steps.durations[-1].sum()
+    ),
     ("limit_cycle", "viscoelastic"): lambda x: vrw.limit_cycle(wheel_on(x, 150.0)).period,
     ("limit_cycle", "unilateral"): gait_with_contact,
     ("solve_fixed_point", "any map"): lambda x: solve_fixed_point(
