@@ -1,0 +1,124 @@
+"""Pages keep the rules of their language: length, plain verbs, few numbers in a sentence.
+
+The rules are this project's own, of CONTRIBUTING.md. Each check is tried on a sentence that breaks
+it.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MAX_PAGE_WORDS = 1500
+MAX_NUMBERS = 2
+"""Numbers of a sentence beyond which a table is clearer."""
+MAX_SHARE_OF_NUMERIC_SENTENCES = 0.05
+"""Of all sentences: names, dates of references and formulas have numbers too."""
+MAX_SENTENCE_WORDS = 40
+"""The rule is 25; a machine counts a list or a formula as one sentence."""
+MAX_SHARE_OF_LONG_SENTENCES = 0.05
+
+FORBIDDEN_WORDS = {
+    r"tell|tells|told": "report, return, show",
+    r"say|says|said": "report, state",
+    r"ask|asks|asked": "require, request",
+    r"stand|stands|stood": "be, lie, hold",
+    r"know|knows|knew": "depend on, contain",
+    r"felt|feels": "depend on",
+    r"real ground": "unilateral contact",
+    r"oracle|truth|truths": "reference",
+    r"premise|premises": "margin, assumption",
+    r"aimed at|until then|no longer|mended since": "the present only; history is in the changelog",
+}
+"""Words that prose avoids, with better ones."""
+
+BLOCK = re.compile(r"<!-- (?!end of|runs elsewhere)([^\n]*?) -->(.*?)<!-- end of \1 -->", re.DOTALL)
+UNMEASURED_BLOCKS = {"functions and models"}
+SOURCE_LINE = re.compile(r"Command: .+; commit: .+; machine: .+; date: .+\.$")
+
+
+def strip_markup(text):
+    """Return the prose of a page: no code, comments, tables or headings; links by their text."""
+    text = re.sub(r"```.*?```", " ", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->", " ", text, flags=re.DOTALL)
+    text = re.sub(r"^\s*[|#].*$", " ", text, flags=re.MULTILINE)
+    text = re.sub(r"\$\$?[^$]*\$\$?", " x ", text)
+    text = re.sub(r"`[^`]*`", " x ", text)
+    return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+
+
+def split_sentences(prose):
+    """Return sentences of more than three words."""
+    without_bullets = re.sub(r"^\s*(?:[-*]|\d+\.) ", "\n", prose, flags=re.MULTILINE)
+    parts = re.split(r"(?<=[.;:!?])\s+|\n\s*\n", without_bullets)
+    sentences = [" ".join(part.split()) for part in parts]
+    return [sentence for sentence in sentences if len(sentence.split()) > 3]
+
+
+def count_words(prose):
+    return len(re.findall(r"[A-Za-z][\w'’-]*", prose))
+
+
+def find_forbidden_words(prose):
+    return [
+        f"{word!r}: write {better}"
+        for pattern, better in FORBIDDEN_WORDS.items()
+        for word in re.findall(rf"\b(?:{pattern})\b", prose, re.IGNORECASE)
+    ]
+
+
+def is_numeric(sentence):
+    return len(re.findall(r"\d[\d.,]*(?:e-?\d+)?", sentence)) > MAX_NUMBERS
+
+
+def find_blocks_without_source(page_text):
+    """Return names of measured blocks that do not end with command, commit, machine and date."""
+    return [
+        name
+        for name, content in BLOCK.findall(page_text)
+        if name not in UNMEASURED_BLOCKS
+        and not SOURCE_LINE.match(content.strip().splitlines()[-1] if content.strip() else "")
+    ]
+
+
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_page_is_short_and_uses_plain_verbs(page):
+    prose = strip_markup(page.read_text())
+    assert count_words(prose) <= MAX_PAGE_WORDS
+    assert not find_forbidden_words(prose)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_measured_block_names_command_commit_machine_and_date(page):
+    assert not find_blocks_without_source(page.read_text())
+
+
+def test_few_sentences_are_long_or_hold_many_numbers():
+    sentences = [s for page in PAGES for s in split_sentences(strip_markup(page.read_text()))]
+    numeric = [s for s in sentences if is_numeric(s)]
+    long = [s for s in sentences if len(s.split()) > MAX_SENTENCE_WORDS]
+    assert len(numeric) <= MAX_SHARE_OF_NUMERIC_SENTENCES * len(sentences), numeric
+    assert len(long) <= MAX_SHARE_OF_LONG_SENTENCES * len(sentences), long
+
+
+def test_prose_against_the_rules_is_found():
+    assert find_forbidden_words("The step tells its time. It was asked for the truth.")
+    assert not find_forbidden_words(strip_markup("`tell` and ```\nsays\n``` report their time."))
+    assert is_numeric("It takes 1 s, 2 s or 3 s.")
+    assert not is_numeric("It takes 1e-3 s or 2.5 s.")
+    assert count_words("It takes three seconds.") == 4
+    block = "<!-- speeds -->\n\n| a |\n\n{}\n\n<!-- end of speeds -->"
+    source = "Command: `x`; commit: `y`; machine: z; date: `2026-01-01`."
+    assert find_blocks_without_source(block.format("")) == ["speeds"]
+    assert not find_blocks_without_source(block.format(source))
+    assert split_sentences("One is here now. Two are\nthere now.\n\n- Three are in a list.") == [
+        "One is here now.",
+        "Two are there now.",
+        "Three are in a list.",
+    ]
