@@ -46,6 +46,7 @@ from vrw_jax.models import (
     scaled_jacobian_columns,
 )
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import check_model, check_options, check_section_state
 from vrw_jax.validation import (
     check_choice,
@@ -76,6 +77,7 @@ NEXT_SLOPE_INDEX = len(PARAMETER_NAMES) + 3
 """Index of the slope of the next line among the same inputs."""
 
 
+@with_default_settings
 def step_batch(
     params: WheelParams,
     states: Array | np.ndarray,

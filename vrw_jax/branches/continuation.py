@@ -55,6 +55,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import refuse_ladder
 from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
@@ -149,6 +150,7 @@ class GaitContinuation(AbstractContinuation):
         )
 
 
+@with_default_settings
 def continue_branch(
     params: WheelParams,
     name: str,
@@ -219,6 +221,7 @@ def continue_branch(
     return branch
 
 
+@with_default_settings
 def continue_branches(
     params: WheelParams,
     name: str,
@@ -441,6 +444,7 @@ class MapContinuation(AbstractContinuation):
         return np.asarray(np.isfinite(table["x"]).all(-1))
 
 
+@with_default_settings
 def continue_map(
     function: Callable[[Any, Array, Array], Array],
     x: object,

@@ -27,6 +27,7 @@ from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -69,6 +70,7 @@ class UnexplainedChange(NamedTuple):
     cell_position: tuple[float, float]  # in cells of the scan
 
 
+@with_default_settings
 def trace_special_points(
     scan: xr.Dataset,
     params: WheelParams,

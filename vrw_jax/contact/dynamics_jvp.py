@@ -36,6 +36,7 @@ from vrw_jax.contact.mechanics import (
     prevent_fusion,
     sum_over_legs,
 )
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.wheel import Symbols
 
 
@@ -163,6 +164,7 @@ def _differentiable_solution(
     )
 
     @solve.defjvp
+    @with_default_settings
     def rule(primals: tuple, tangents: tuple) -> tuple[ForceSolution, ForceSolution]:
         configuration, tangent = assemble(*primals), assemble(tangents[0], primals[1])
         inertia, free, solution = _solve_with_free_motion(free_motion_fn, configuration)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.hybrid import ReturnMap, Termination, find_program
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
 from vrw_jax.printing import describe_elements, format_numbers, format_quantity, format_text
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.validation import (
     check_callable,
     check_int,
@@ -223,7 +224,7 @@ def _run_newton(
 
     def iterate_newton(state: tuple) -> tuple:
         x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
-        is_searching_now = is_searching(correction_norm, n_iterations)
+        n_searching = is_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
         correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
         correction_norm = jnp.max(
             jnp.abs(correction)
@@ -233,8 +234,8 @@ def _run_newton(
         return (
             next_x,
             correction_norm,
-            n_iterations + is_searching_now,
-            n_derivative_iterations + ~is_searching_now,
+            n_iterations + n_searching,
+            n_derivative_iterations + 1 - n_searching,
             *jacobian_and_residual,
         )
 
@@ -257,6 +258,7 @@ def _run_newton(
 
 
 @_run_newton.defjvp
+@with_default_settings
 def _run_newton_jvp(
     converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
@@ -289,6 +291,7 @@ def _run_newton_implicit(
 
 
 @_run_newton_implicit.defjvp
+@with_default_settings
 def _run_newton_implicit_jvp(
     converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vrw_jax.contact import embed_section_states, walk_batch
 from vrw_jax.numerics import StepOptions, concat_rows, take_rows
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
 
@@ -218,7 +219,7 @@ def _walk_to_distinct_states(
     active = np.arange(len(wheel_index))
     is_walking, is_duplicate = np.ones(len(wheel_index), bool), np.zeros(len(wheel_index), bool)
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(finder.precompile_newton, values[:1], start_states[:1])
+        pool.submit(with_default_settings(finder.precompile_newton), values[:1], start_states[:1])
         for n_steps in options.round_steps:
             walk_result = _walk_and_measure_defect(
                 finder, columns[:, active], x[active], n_steps, options.step_tolerance

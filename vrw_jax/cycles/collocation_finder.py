@@ -40,6 +40,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import validate_arguments
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -188,10 +189,19 @@ class CollocationFinder(AbstractGaitFinder):
         dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
         with ThreadPoolExecutor(2) as pool:
             cycle = pool.submit(
-                cycle_with_jacobian, self.system, values, self.initial_guess(values)
+                with_default_settings(cycle_with_jacobian),
+                self.system,
+                values,
+                self.initial_guess(values),
             )
             step = pool.submit(
-                step_with_jacobian, self.model, self.n_legs, values, x, dx, self.step_options
+                with_default_settings(step_with_jacobian),
+                self.model,
+                self.n_legs,
+                values,
+                x,
+                dx,
+                self.step_options,
             )
             cycle.result(), step.result()
 

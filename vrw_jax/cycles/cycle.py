@@ -19,6 +19,7 @@ from vrw_jax.printing import (
     format_numbers,
     format_outcome_counts,
 )
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -167,6 +168,7 @@ class AbstractCycle(AbstractPrintable):
         matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
         return self._mask_missing(jnp.linalg.cond(matrix))
 
+    @with_default_settings
     def measure(self, name: str) -> Array:
         """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `measures.MEASURES`. Batch
         axes come first.

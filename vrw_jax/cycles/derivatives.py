@@ -35,7 +35,7 @@ from vrw_jax.numerics import (
     with_implicit_derivative,
     zero_tangent,
 )
-from vrw_jax.runtime import cached_lane_function, cached_trace
+from vrw_jax.runtime import cached_lane_function, cached_trace, with_default_settings
 from vrw_jax.wheel import PARAMETER_NAMES
 
 
@@ -205,6 +205,7 @@ def solve_cycle_with_derivatives(
         return collocation_state, tuple(diagnostics)
 
     @solve_with_rule.defjvp
+    @with_default_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         collocation_state, diagnostics = solve_with_rule(*primals)
         tangent = apply_jacobian(tangents_of(primals[0], collocation_state), tangents[0])
@@ -238,6 +239,7 @@ def attach_monodromy(
         return monodromy_value
 
     @attach_with_rule.defjvp
+    @with_default_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         return attach_with_rule(*primals), apply_jacobian(jacobian_of(*primals[1:]), tangents[1])
 

@@ -31,6 +31,7 @@ from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
@@ -105,6 +106,7 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
+@with_default_settings
 @refuse_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
@@ -177,6 +179,7 @@ def limit_cycle(
     return cycle.replace_missing_by_nan(params) if uses_nan else cycle
 
 
+@with_default_settings
 def limit_cycles(
     params: WheelParams,
     *,

@@ -44,6 +44,7 @@ from vrw_jax.integrator.tangents import (
     stack_directions,
 )
 from vrw_jax.numerics import StepOptions, Vector, tree_where, zero_tangent
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simd import noinline
 
 
@@ -138,6 +139,7 @@ def integrate_batch_phase(
     )
 
     @integrate.defjvp
+    @with_default_settings
     def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
         def implicit_dynamics_of(*constants: Any) -> ImplicitDynamics:
             implicit_dynamics = phase_of(*constants).implicit_dynamics

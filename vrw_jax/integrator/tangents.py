@@ -31,6 +31,7 @@ from vrw_jax.integrator.tableaus import (
     evaluate_stage,
 )
 from vrw_jax.numerics import Vector, run_if_any, zero_tangent
+from vrw_jax.runtime import with_default_settings
 
 
 class ImplicitDynamics(NamedTuple):
@@ -95,6 +96,7 @@ def _vmap_size(_: Any) -> Array:
 
 
 @_vmap_size.def_vmap
+@with_default_settings
 def _vmap_size_rule(size: int, _: list, _tangent: Any) -> tuple[Array, bool]:
     return jnp.zeros(size), False
 
@@ -267,6 +269,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
         differentiable_function = jax.custom_jvp(evaluate_combined)
 
         @differentiable_function.defjvp
+        @with_default_settings
         def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_combined(*primals),

@@ -19,6 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
 from vrw_jax.numerics.batching import BatchFunction, unbatch
+from vrw_jax.runtime import with_default_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """A map from float arrays to (float outputs, other outputs without derivative)."""
@@ -51,6 +52,7 @@ def enable_all_ad_modes(
             else enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
         )
 
+    @with_default_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
         argnums = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
         if not argnums:
@@ -133,6 +135,7 @@ def with_implicit_derivative(
     wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
 
     @wrapped_function.defjvp
+    @with_default_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
         jacobian = implicit_jacobian(function, tangents_of, wrap_execution, order + 1)(*primals)
         return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax import simd
 from vrw_jax.numerics.types import Vector
+from vrw_jax.runtime import with_default_settings
 
 LaneArray = Float[Array, "... lanes"]
 
@@ -117,6 +118,7 @@ def solve_node_equations(
 
 
 @solve_node_equations.defjvp
+@with_default_settings
 def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Return the tangent by a second solve; differentiating the elimination would double
     its work.

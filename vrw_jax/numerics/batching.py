@@ -15,6 +15,8 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
+from vrw_jax.runtime import with_default_settings
+
 BatchFunction = Callable[..., PyTree[Array]]
 """A function of arrays that all have the batch on their last axis."""
 
@@ -26,6 +28,7 @@ def unbatch(function: BatchFunction) -> BatchFunction:
     batched_function = custom_vmap(function)
 
     @batched_function.def_vmap
+    @with_default_settings
     def merge_axis(axis_size: int, is_batched_tree: PyTree, *arrays: PyTree) -> tuple:
         def merge(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))

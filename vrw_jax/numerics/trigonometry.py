@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics.types import Elementwise
+from vrw_jax.runtime import with_default_settings
 
 MAX_EXACT_ANGLE = 1.6
 """Angle up to which the polynomials are accurate to round-off, rad, chosen because it exceeds pi/2,
@@ -68,6 +69,7 @@ _differentiable_sine_cosine = jax.custom_jvp(jax.jit(lambda angle: _evaluate_ser
 
 
 @_differentiable_sine_cosine.defjvp
+@with_default_settings
 def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
     sin, cos = _differentiable_sine_cosine(*primals)
     (angle_tangent,) = tangents

@@ -9,4 +9,5 @@ from vrw_jax.runtime.cached_programs import (
 )
 from vrw_jax.runtime.disk_cache import source_digest
 from vrw_jax.runtime.lazy_import import lazy_import, xarray
+from vrw_jax.runtime.settings import with_default_settings
 from vrw_jax.runtime.start import start_jax

@@ -22,7 +22,7 @@ from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome, make_fi
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import compile_exported
+from vrw_jax.runtime import compile_exported, with_default_settings
 from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
@@ -125,6 +125,7 @@ class CollocationEngine:
             parts = list(pool.map(self._evaluate_batch, batches))
         return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
 
+    @with_default_settings  # in a thread of its own
     def _evaluate_batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the results of a batch, which is padded with copies of its first wheel."""
         padded_rows = np.concatenate([rows, np.repeat(rows[:1], WHEELS_PER_BATCH - len(rows), 0)])
@@ -146,11 +147,12 @@ class CollocationEngine:
         values = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, len(PARAMETER_NAMES)), self._dtype)
         state = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, 3), self._dtype)
         cache_key = self._cache_key
+        compile_with_defaults = with_default_settings(compile_exported)  # in threads
         with ThreadPoolExecutor(2) as pool:
             step_arguments = (values, state, self._options)
             steps = [
                 pool.submit(
-                    compile_exported,
+                    compile_with_defaults,
                     self._evaluate_step,
                     step_arguments,
                     ("step", *cache_key),
@@ -160,7 +162,11 @@ class CollocationEngine:
             ]
             cycles = [
                 pool.submit(
-                    compile_exported, self._evaluate_cycle, (values,), ("cycle", *cache_key), device
+                    compile_with_defaults,
+                    self._evaluate_cycle,
+                    (values,),
+                    ("cycle", *cache_key),
+                    device,
                 )
                 for device in devices
             ]

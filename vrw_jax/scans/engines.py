@@ -25,6 +25,7 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
 from vrw_jax.numerics import map_in_batches
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.scans.collocation_engine import (
     CollocationEngine,
     EvaluationRequest,
@@ -78,6 +79,7 @@ class UnilateralEngine:
             results += pool.map(self._evaluate_part, other_parts)
         return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
 
+    @with_default_settings  # in a thread of its own
     def _evaluate_part(self, values: np.ndarray) -> ResultColumns:
         """Return the results of the gait to which slow starts of each sample converge."""
         # Friction balances the weight along the slope over a period; with less there is no gait.

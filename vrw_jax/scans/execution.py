@@ -18,6 +18,7 @@ import numpy as np
 
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import AbstractDesign
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
@@ -55,6 +56,7 @@ class ScanProgress:
     n_reused: int  # samples that an earlier run computed
 
 
+@with_default_settings
 @refuse_renamed_arguments(report="on_progress")
 def scan(
     design: AbstractDesign,
@@ -139,6 +141,7 @@ def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[Chun
     return connect_workers(dask)
 
 
+@with_default_settings
 def run_scan(
     scan_plan: ScanPlan,
     store: str | Path | AbstractStore | None = None,

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.scans.collocation_engine import count_cores
 from vrw_jax.scans.design import AbstractDesign, SampleColumns
 from vrw_jax.scans.execution import find_store
@@ -22,6 +23,7 @@ TYPICAL_MEMORY_BYTES = 0.5e9
 """Typical memory in bytes of code and arrays; see docs/benchmarks/scans.md."""
 
 
+@with_default_settings
 def forecast_scan(plan: ScanPlan, store: str | Path | None = None) -> dict[str, str]:
     """Return sizes, chunks, memory and time of a scan as lines of text, without writing anything.
 

@@ -1,7 +1,7 @@
 """Machine code as a JAX primitive, which JAX programs call by the name of the code."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import Any
 
@@ -44,8 +44,21 @@ def _abstract_results(
 
 
 @MACHINE_CODE_PRIMITIVE.def_impl
-def _call_jitted(*arguments: Any, **params: Any) -> Any:
-    return jax.jit(functools.partial(MACHINE_CODE_PRIMITIVE.bind, **params))(*arguments)
+def _call_in_program(
+    *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+) -> Any:
+    with jax.disable_jit(False):  # only a compiled program can call machine code
+        return _make_program(code, tuple(result_shapes))(*arguments)
+
+
+@functools.cache
+def _make_program(
+    code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
+) -> Callable[..., Any]:
+    """Return a program that calls the code and nothing else."""
+    return jax.jit(
+        functools.partial(MACHINE_CODE_PRIMITIVE.bind, code=code, result_shapes=result_shapes)
+    )
 
 
 def _lower_call(

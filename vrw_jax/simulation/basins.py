@@ -12,6 +12,7 @@ import numpy as np
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, measure_attrs, provenance
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation.attractors import find_distinct_orbits, measure_orbits, walk_until_periodic
 from vrw_jax.simulation.stepping import ModelLike, check_model, check_options, check_single_wheel
@@ -34,6 +35,7 @@ StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """Values of each component of a start, by name; a single number is not an axis."""
 
 
+@with_default_settings
 @refuse_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,

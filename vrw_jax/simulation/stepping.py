@@ -34,6 +34,7 @@ from vrw_jax.printing import (
     format_outcome_counts,
     format_quantity,
 )
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_models
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
@@ -44,6 +45,7 @@ ModelLike = AbstractWheel | Literal["auto"]
 """Model as a caller gives it; "auto" is `LadderWheel()`, the simplest valid model."""
 
 
+@with_default_settings
 def paper_start() -> SectionState:
     """Return a section state (theta-, dtheta-, dL1-) in the basin of the gait of Table 1.
 
@@ -185,6 +187,7 @@ def step(
 ) -> StepResult: ...
 
 
+@with_default_settings
 def step(
     params: WheelParams,
     x: SectionLike,
@@ -225,6 +228,7 @@ def step(
     return model.take_step(params, state, options)
 
 
+@with_default_settings
 def return_map(
     params: WheelParams,
     x: SectionLike,
@@ -344,6 +348,7 @@ def _scan_steps(
     return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
 
 
+@with_default_settings
 def walk(
     params: WheelParams,
     x: SectionLike,
@@ -427,6 +432,7 @@ def walk_toward_gait(
     return walk(params, model.default_start(params), n_steps, model=model, options=options)
 
 
+@with_default_settings
 def choose_model(
     params: WheelParams,
     start: SectionLike,

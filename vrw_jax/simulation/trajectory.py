@@ -29,6 +29,7 @@ from vrw_jax.contact import (
 from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_variables, provenance
 from vrw_jax.models import AbstractWheel, Trajectory, complete_slopes, split_slopes
 from vrw_jax.numerics import EngineName, StepOptions
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import SELECTION_ATTRS
 from vrw_jax.simulation.stepping import (
@@ -50,6 +51,7 @@ from vrw_jax.wheel import (
 )
 
 
+@with_default_settings
 def simulate(
     params: WheelParams,
     x: SectionLike | None = None,

@@ -21,6 +21,7 @@ import numpy as np
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.printing import AbstractPrintable, TextRow
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.tolerance.contact_steps import GroundBatch
 from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult
@@ -111,6 +112,7 @@ class _SamplingPlan(NamedTuple):
     control_index: int
 
 
+@with_default_settings
 def multifidelity_mean(
     measure: str,
     params: WheelParams,

@@ -18,6 +18,7 @@ import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.tolerance.contact_steps import TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE, GroundBatch
 from vrw_jax.tolerance.lower_fidelity import (
     NO_MODEL,
@@ -72,6 +73,7 @@ N_STEPS_BEFORE_DIFFERENCES = 3
 them."""
 
 
+@with_default_settings
 def measure_to_tolerance(
     measures: str | Sequence[str],
     params: WheelParams,

@@ -36,6 +36,7 @@ from vrw_jax.measures import (
     provenance,
 )
 from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import SELECTION_MARGINS, describe_models
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
@@ -101,6 +102,7 @@ class ValidationOptions:
     margin_tolerance: float = 1e-2
 
 
+@with_default_settings
 def tune(
     params: WheelParams,
     objective: ObjectiveSpec,
