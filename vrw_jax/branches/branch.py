@@ -1,5 +1,4 @@
-"""Results of a continuation: a labeled branch with its special points, and a curve of special
-points."""
+"""Results of a continuation: labeled branches with special points, and curves of special points."""
 
 from __future__ import annotations
 
@@ -18,14 +17,15 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
 MAX_PRINTED_POINTS = 20
-"""Largest number of special points in the printed form of a branch."""
+"""Largest number of printed special points, chosen so that a branch fits on a screen."""
 
 
 class FixedPoint(NamedTuple):
     """Fixed point of a return map at one value of the parameter.
 
-    - `section_state`: the coordinates of the map;
-    - `jacobian`: of the map.
+    - `section_state`: coordinates of the point;
+    - `parameter`: value of the parameter;
+    - `jacobian`: Jacobian of the map.
     """
 
     section_state: np.ndarray
@@ -48,14 +48,14 @@ class SpecialPoint:
     """Bifurcation, border collision or end of a branch.
 
     `kind` is "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision" (the
-    indicator or monitor `name` is zero), "order_of_contacts_changes" (the branch goes on with a
-    kink or a jump) or "lost" (the order of events changes: `name` says which).
+    indicator or margin `name` is zero), "order_of_contacts_changes" (the branch continues with a
+    kink or a jump) or "lost" (the order of events changes, as `name` describes).
 
-    - `value`: of the parameter;
-    - `point`: beside it, on the side that belongs to the branch;
-    - `ends_branch`: whether the branch goes no further;
-    - `find_cycle`: finds the gait there, as the property `cycle`;
-    - `n_multipliers`: multipliers that pass the unit circle there; 0 at other borders.
+    - `value`: value of the parameter;
+    - `point`: fixed point beside it, on the side that belongs to the branch;
+    - `ends_branch`: whether the branch ends there;
+    - `find_cycle`: function that finds the gait there, for the property `cycle`;
+    - `n_multipliers`: number of multipliers that cross the unit circle there, 0 for other kinds.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -74,7 +74,7 @@ class SpecialPoint:
 
     @functools.cached_property
     def cycle(self) -> Any:
-        """Return the `LimitCycle` there; for models without one, the `FixedPoint`."""
+        """Return the `LimitCycle` at the special point, or for other models the `FixedPoint`."""
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
@@ -91,14 +91,13 @@ class SpecialPoint:
 
 @dataclass(frozen=True, repr=False)
 class Branch:
-    """Gaits along one parameter, in the order of the branch, with its special points in the same
-    order.
+    """Gaits along one parameter and their special points, both in the order of the branch.
 
-    `dataset` has the dimension `point`. The parameter is a coordinate on it, which reverses at
-    folds. `ends` gives the reasons why the branch ends at its first and last point.
-
-    - `parameter`: its name;
-    - `special_points`: each a `SpecialPoint`;
+    - `parameter`: name of the parameter;
+    - `dataset`: measures over the dimension `point`. The parameter is a coordinate on it, which
+      reverses at folds;
+    - `special_points`: bifurcations, border collisions and ends;
+    - `ends`: reasons why the branch ends at its first and its last point;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait to start from.
 
     Examples:
@@ -149,7 +148,7 @@ class Branch:
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
             f"  {len(self.special_points)} special points" + (":" if self.special_points else "."),
-            *(f"    {border}" for border in self.special_points[:MAX_PRINTED_POINTS]),
+            *(f"    {special_point}" for special_point in self.special_points[:MAX_PRINTED_POINTS]),
         ]
         if len(self.special_points) > MAX_PRINTED_POINTS:
             lines.append(
@@ -171,7 +170,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Codim2Point:
-    """Point of codimension two, where a curve of special points meets another special point."""
+    """Point of codimension two, at which a curve of special points meets another special point."""
 
     name: str  # of the other special point
     values: tuple[float, float]  # of the two parameters
@@ -186,11 +185,11 @@ class Codim2Point:
 class SpecialPointCurve:
     """Curve of a special point in two parameters, its points in order along the dimension `point`.
 
-    - `name`: of the special point;
-    - `parameters`: names of the two;
+    - `name`: name of the special point;
+    - `parameters`: names of the two parameters;
     - `dataset`: durations, spectral radius and section state along the curve;
-    - `codim2_points`: where it meets other special points;
-    - `ends`: the reason why it ends at either end; both are the same for a closed curve.
+    - `codim2_points`: points at which it meets other special points;
+    - `ends`: reasons why it ends at its first and its last point, equal for a closed curve.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
@@ -220,6 +219,6 @@ class SpecialPointCurve:
         lines = [f"Curve of {self.name} over {first} and {second}: {len(self.values)} points."]
         for end, text in zip((0, -1), self.ends, strict=True):
             lines.append(f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {text}")
-        return "\n".join([*lines, *(f"    {meeting}" for meeting in self.codim2_points)])
+        return "\n".join([*lines, *(f"    {point}" for point in self.codim2_points)])
 
     __repr__ = __str__

@@ -1,8 +1,7 @@
 """Continuation of branches and location of their special points, independent of the wheel.
 
-Several branches run side by side. First, each is continued both ways. Then the points where it
-stops being admissible are located; they are its ends. Then every other change of sign on it is
-located.
+Several branches run concurrently. First, each is continued in both directions. Then its ends are
+located, at which it stops being admissible. Then every other change of sign on it is located.
 """
 
 import abc
@@ -18,22 +17,22 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.branches.branch import FixedPoint, SpecialPoint
-from vrw_jax.branches.jumps import find_jumps, follow_beyond_jumps
+from vrw_jax.branches.jumps import continue_beyond_jumps, find_jumps
 from vrw_jax.branches.multiplicity import (
     BRANCH_POINT_KIND,
-    CONTACT_ORDER,
-    MODULI,
-    ORDER_CHANGES,
-    WEIGHTS,
-    ZERO_MARGIN,
-    Found,
-    drop_twins,
+    CONTACT_ORDER_CHANGE,
+    CONTACT_ORDER_COLUMN,
+    MODULI_COLUMN,
+    N_CROSSING_MULTIPLIERS,
+    ZERO_TOLERANCES,
+    NamedZero,
+    add_multiple_bifurcations,
+    contact_order_quantity_name,
+    drop_duplicate_order_changes,
+    evaluate_quantity,
     is_off_circle,
-    is_zero,
-    moduli_of,
-    name_order,
-    quantity_of,
-    with_ranks,
+    rank_moduli,
+    vanishes_at,
 )
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
@@ -41,6 +40,7 @@ from vrw_jax.continuation import (
     ArclengthOptions,
     ConstraintPlane,
     ContinuationPoint,
+    ContinuationResult,
     ContinuationStatus,
     arclength,
     continue_many_from,
@@ -53,27 +53,35 @@ from vrw_jax.continuation import (
 )
 from vrw_jax.numerics import concat_rows, map_in_batches, map_in_numpy_batches, take_rows
 
-LOCATION_ACCURACY = 1e-10
-"""Accuracy of a special point in the parameter: the width of the bracket at which the search
-ends."""
 
-FOLD_BRACKET_FRACTION = 1e-6
-"""Final width of the bracket as a fraction of the initial one, used near a fold, where the
-parameter enters squared."""
+@dataclass(frozen=True)
+class LocationOptions:
+    """Numbers of the location of special points.
 
-RETRY_FRACTIONS = (0.99, 0.9)
-"""Fractions of the distance to an ill-conditioned zero at which a point beside it is tried
-again."""
+    - `accuracy`: width of the bracket in the parameter at which the search ends;
+    - `min_bracket_fraction`: the same as a fraction of the initial bracket, chosen because near a
+      fold the parameter enters squared;
+    - `retry_fractions`: fractions of the distance to an ill-conditioned zero at which the point
+      beside it is tried again.
+    """
+
+    accuracy: float = 1e-10
+    min_bracket_fraction: float = 1e-6
+    retry_fractions: tuple[float, ...] = (0.99, 0.9)
+
+
+LOCATION_OPTIONS = LocationOptions()
+"""Options of all branches."""
 
 LOCATION_BATCH_SIZES = (1, 8)
-"""Numbers of points that are located side by side; only one of them is compiled where compilation
-is expensive."""
+"""Numbers of points that one call locates, chosen because only one of them is compiled if
+compilation is expensive."""
 
 READ_BATCH_SIZE = 32
-"""Number of points that one program evaluates; fewer points take the same time."""
+"""Number of points that one call evaluates, chosen because fewer points take the same time."""
 
 ADMISSIBLE_COLUMN = "sequence"
-"""Name of the column that is 1 where a point is admissible, else -1."""
+"""Name of the column that is 1 if a point is admissible, else -1."""
 
 QuantityTable = dict[str, np.ndarray]
 """Named quantities over a batch of points, first axis."""
@@ -81,8 +89,7 @@ QuantityTable = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class AbstractContinuation(abc.ABC):
-    """Continuation of several wheels side by side, with the quantities to evaluate at its
-    points."""
+    """Continuation of several wheels, with the quantities that are evaluated at its points."""
 
     problem: AbstractContinuationProblem
     options: ArclengthOptions
@@ -91,46 +98,44 @@ class AbstractContinuation(abc.ABC):
 
     ending_quantities: ClassVar[tuple[str, ...]] = ()
     """Names of columns at whose zeros a branch ends because the order of events changes."""
+
     linear_substitutes: ClassVar[Mapping[str, str]] = {}
     """Margins that vanish ill-conditioned, each with the column that vanishes at the same point."""
 
     @abc.abstractmethod
     def evaluate_points(self, wheels: Any, points: ContinuationPoint) -> QuantityTable:
-        """Return the quantities that the Jacobian does not give, of the wheels with the same
-        axis."""
+        """Return the quantities of points that need more than the Jacobian, one wheel per point."""
 
     @abc.abstractmethod
     def is_admissible(self, table: QuantityTable) -> np.ndarray:
-        """Return which points are admissible, from their table."""
+        """Return for each point of a table whether it is admissible."""
 
     def is_margin(self, name: str) -> bool:
         """Return whether a column's zero is a border collision."""
         return False
 
     def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
-        """Return the table with undefined quantities masked, which depend on the wheel of the
-        point."""
+        """Return the table with NaN for quantities that are undefined for the wheel of a point."""
         return table
 
     def name_end(self, table: QuantityTable, row_index: int) -> str:
         """Return a name for the end of a branch from the first point beyond it."""
         return ADMISSIBLE_COLUMN
 
-    def is_alike(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
-        """Return which points beyond a jump are still the branch's, row by row."""
+    def is_same_gait(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+        """Return for each row whether the point beyond a jump belongs to the branch before it."""
         return after[ADMISSIBLE_COLUMN] > 0.0
 
     def describe_end(self, name: str, value: float) -> str:
-        """Return the sentence for an end of a branch, by its border's name."""
+        """Return the sentence about an end of a branch, given the name of its special point."""
         return f"{name.replace('_', ' ')} at {value:.9g} ends it."
 
     def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
-        """Return whether the mesh limits the extent or the accuracy of a branch; `ends` are names
-        of ends."""
+        """Return whether the mesh limits the extent or the accuracy of a branch with these ends."""
         return False
 
     def map_batched(self, function: Callable, batch_size: int, *trees: Any) -> Any:
-        """Map over many numpy rows, `size` at a time if the function is compiled."""
+        """Map a function over rows of NumPy arrays, in batches if it is compiled."""
         if self.problem.is_traceable:
             return map_in_numpy_batches(function, (batch_size,), *trees)
         return jax.tree.map(np.asarray, map_in_batches(function, LOCATION_BATCH_SIZES, *trees))
@@ -146,7 +151,7 @@ class AbstractContinuation(abc.ABC):
         table = self.mask_undefined(table, wheel_indices)
         with np.errstate(divide="ignore", invalid="ignore"):
             table[BRANCH_POINT_KIND] = table["fold"] / points.fraction_rate
-        table[MODULI] = moduli_of(np.asarray(points.jacobian))
+        table[MODULI_COLUMN] = rank_moduli(np.asarray(points.jacobian))
         for name, substitute in self.linear_substitutes.items():
             if substitute in table and name in table:
                 table[_combined_name(name)] = combined_margin(table[name], table[substitute])
@@ -155,22 +160,22 @@ class AbstractContinuation(abc.ABC):
 
 
 def _combined_name(name: str) -> str:
-    """Return the name of the column that is positive where a margin and its substitute are."""
+    """Return the name of the column that is positive if a margin and its substitute are."""
     return f"{name} for certain"
 
 
 def combined_margin(margin: np.ndarray, substitute: np.ndarray) -> np.ndarray:
-    """Return a quantity with the sign of both, and of `substitute` alone where that is negative.
+    """Return a quantity that is positive if both are, and crosses zero continuously.
 
-    It crosses zero without a jump at the zeros of either.
+    If `substitute` is negative, it is the value.
     """
     return np.where(substitute < 0.0, substitute, np.minimum(substitute, margin))
 
 
 def _continue_both_ways(
     continuation: AbstractContinuation, z: Any, parameter_values: Array, is_wanted: np.ndarray
-) -> arclength.ContinuationResult:
-    """Continue all wheels, axes (wheel, direction), the first direction towards smaller values."""
+) -> ContinuationResult:
+    """Continue all wheels, axes (wheel, direction); the first direction leads to smaller values."""
     repeat_for_directions = lambda tree: jax.device_put(
         take_rows(tree, np.repeat(np.arange(len(parameter_values)), 2))
     )
@@ -188,9 +193,9 @@ def _continue_both_ways(
         arclength.continue_from if continuation.problem.is_traceable else continue_many_from
     )
     continue_all = functools.partial(continue_all, continuation.problem, continuation.options)
-    results: arclength.ContinuationResult = jax.tree.map(np.asarray, continue_all(*arguments))
+    results: ContinuationResult = jax.tree.map(np.asarray, continue_all(*arguments))
     if continuation.problem.has_kinks:
-        results = follow_beyond_jumps(continuation, continue_all, arguments[0], results)
+        results = continue_beyond_jumps(continuation, continue_all, arguments[0], results)
     return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), results)
 
 
@@ -238,7 +243,7 @@ _make_starts_between = eqx.filter_jit(
 )
 
 
-def _solve_many_between(
+def _solve_between_untraced(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     bounds: Array,
@@ -261,9 +266,11 @@ class _PointTable(NamedTuple):
 
 
 class _LocatedZero(NamedTuple):
+    """Located zero of a quantity between two points of a branch."""
+
     bracket: tuple[int, int, str]  # left and right point, name of the quantity
-    value: float
-    fraction: float
+    value: float  # of the parameter
+    fraction: float  # of the chord between the points, in [0, 1]
     point_beside: ContinuationPoint  # on the side of the left point, leading axis 1
     table: QuantityTable  # at `point_beside`
 
@@ -272,9 +279,9 @@ def _locate_zeros(
     continuation: AbstractContinuation,
     point_table: _PointTable,
     requests: list[tuple[int, int, str]],
+    options: LocationOptions = LOCATION_OPTIONS,
 ) -> list[_LocatedZero]:
-    """Locate the zero of each request (left, right, quantity) whose sign differs between two
-    points."""
+    """Locate the zero of each request (left, right, quantity), whose signs differ at two points."""
     if not requests:
         return []
     lefts, rights = (np.array([request[i] for request in requests]) for i in (0, 1))
@@ -282,7 +289,7 @@ def _locate_zeros(
     left, right = take_rows(point_table.points, lefts), take_rows(point_table.points, rights)
     wheel_indices = point_table.wheel_indices[lefts]
     wheels = take_rows(continuation.wheels, wheel_indices)
-    solve_points = _solve_between if continuation.problem.is_traceable else _solve_many_between
+    solve_points = _solve_between if continuation.problem.is_traceable else _solve_between_untraced
     solve_between = functools.partial(
         solve_points, continuation.problem, continuation.options, jnp.asarray(continuation.bounds)
     )
@@ -305,30 +312,32 @@ def _locate_zeros(
         )
         points = points._replace(is_admissible=points.is_admissible & is_found)
         table = continuation.make_table(points, wheel_indices[bracket_indices])
-        return points, {
-            k: np.where(_broadcast_flags(is_found, v), v, np.nan) for k, v in table.items()
-        }
+        align = lambda flags, values: flags.reshape(-1, *(1,) * (values.ndim - 1))
+        return points, {k: np.where(align(is_found, v), v, np.nan) for k, v in table.items()}
 
     def quantity_at(fractions: np.ndarray, bracket_indices: np.ndarray) -> np.ndarray:
         table = solve_at_fractions(fractions, bracket_indices)[1]
-        return np.array([quantity_of(table, names[k])[i] for i, k in enumerate(bracket_indices)])
+        return np.array(
+            [evaluate_quantity(table, names[k])[i] for i, k in enumerate(bracket_indices)]
+        )
 
     values_at = lambda row_indices: np.array(
-        [quantity_of(point_table.table, n)[i] for n, i in zip(names, row_indices, strict=True)]
+        [
+            evaluate_quantity(point_table.table, n)[i]
+            for n, i in zip(names, row_indices, strict=True)
+        ]
     )
-    parameter_distance = np.maximum(np.abs(right.p - left.p), LOCATION_ACCURACY)
-    tolerances = np.minimum(LOCATION_ACCURACY / parameter_distance, FOLD_BRACKET_FRACTION)
+    parameter_distance = np.maximum(np.abs(right.p - left.p), options.accuracy)
+    tolerances = np.minimum(options.accuracy / parameter_distance, options.min_bracket_fraction)
     location = locate_zeros(quantity_at, (values_at(lefts), values_at(rights)), tolerances)
     all_indices = np.arange(len(requests))
-    # Slightly to the left even of an exact zero, where the point is still admissible.
+    # The point beside is to the left even of an exact zero, so that it is still admissible.
     points_beside, table = solve_at_fractions(
         np.maximum(location.left_end - tolerances, 0.0), all_indices
     )
-    for retry_fraction in RETRY_FRACTIONS:
-        failed, row_indices = (
-            np.flatnonzero(~(table[ADMISSIBLE_COLUMN] > 0.0)),
-            np.arange(len(requests)),
-        )
+    for retry_fraction in options.retry_fractions:
+        failed = np.flatnonzero(~(table[ADMISSIBLE_COLUMN] > 0.0))
+        row_indices = np.arange(len(requests))
         if len(failed):
             retries = solve_at_fractions(retry_fraction * location.left_end[failed], failed)
             row_indices[failed] = len(row_indices) + np.arange(len(failed))
@@ -347,14 +356,8 @@ def _locate_zeros(
     ]
 
 
-def _broadcast_flags(flags: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return flags.reshape(-1, *(1,) * (values.ndim - 1))
-
-
-def _collect_points(
-    continuation: AbstractContinuation, results: arclength.ContinuationResult
-) -> _PointTable:
-    """Collect all points of all results, each wheel's two directions joined at its start."""
+def _collect_points(continuation: AbstractContinuation, results: ContinuationResult) -> _PointTable:
+    """Return all points of all results; the two directions of a wheel are joined at its start."""
     point_parts, wheel_indices = [], []
     for wheel_index in range(results.n_points.shape[0]):
         n_down, n_up = (int(n) for n in results.n_points[wheel_index])
@@ -375,8 +378,7 @@ def _collect_points(
 
 
 class _ValidRange(NamedTuple):
-    """Admissible points of one wheel, and the first one beyond at either end (-1 if there is
-    none)."""
+    """Admissible points of one wheel, and the first point beyond each end, -1 if there is none."""
 
     wheel_index: int
     point_indices: np.ndarray
@@ -416,7 +418,7 @@ def _find_valid_ranges(point_table: _PointTable, starts: Mapping[int, int]) -> l
 def _is_mesh_limited(
     continuation: AbstractContinuation, point_table: _PointTable, valid_range: _ValidRange
 ) -> bool:
-    """Return `AbstractContinuation.is_mesh_limited` before special points are located."""
+    """Return whether the mesh limits a branch whose special points are not yet located."""
     lost_indices = [
         i
         for i in valid_range.beyond_indices
@@ -434,7 +436,7 @@ def _find_crossings(
     valid_range: _ValidRange,
     beyond_index: int,
 ) -> list[str]:
-    """Return the quantities that change sign from the last point to the first one beyond."""
+    """Return the ending quantities that change sign from the last point to the first beyond."""
     last_index = valid_range.point_indices[0 if beyond_index < valid_range.point_indices[0] else -1]
     known_names = [name for name in continuation.ending_quantities if name in point_table.table]
     return [
@@ -447,8 +449,7 @@ def _find_crossings(
 def _locate_ends(
     continuation: AbstractContinuation, point_table: _PointTable, ranges: list[_ValidRange]
 ) -> dict[tuple[int, int], _LocatedZero]:
-    """Locate where each branch stops being admissible, by (wheel, end: 0 or 1), at the nearest
-    zero."""
+    """Locate the nearest zero at each end of each branch, by (wheel, end: 0 or 1)."""
     requests, keys = [], []
     for valid_range in ranges:
         for end_index, beyond_index in enumerate(valid_range.beyond_indices):
@@ -472,7 +473,7 @@ def _join_ends(
     ranges: list[_ValidRange],
     located_ends: Mapping[tuple[int, int], _LocatedZero],
 ) -> _PointTable:
-    """Return the admissible points alone, joined with the points next to the located ends."""
+    """Return the admissible points, joined with the points beside the located ends."""
     points, wheel_indices, tables = [], [], []
 
     def append_points(
@@ -485,12 +486,10 @@ def _join_ends(
     for valid_range in ranges:
         lower_end, upper_end = (located_ends.get((valid_range.wheel_index, end)) for end in (0, 1))
         if lower_end is not None and lower_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
-            # Located the way back: its tangent leads against the branch.
-            back = lower_end.point_beside._replace(
-                fraction_rate=-lower_end.point_beside.fraction_rate
-            )
+            # It was located in the opposite direction, so that the rates have the opposite sign.
+            point = lower_end.point_beside
             append_points(
-                back,
+                point._replace(fraction_rate=-point.fraction_rate),
                 valid_range.wheel_index,
                 lower_end.table | {BRANCH_POINT_KIND: -lower_end.table[BRANCH_POINT_KIND]},
             )
@@ -506,100 +505,105 @@ def _join_ends(
 
 def _locate_inner_zeros(
     continuation: AbstractContinuation, point_table: _PointTable
-) -> list[Found]:
-    """Return every border between neighbours on the same branch, with its name.
+) -> list[NamedZero]:
+    """Return all special points between neighbors on a branch, but for its ends."""
+    requests, names = _request_sign_changes(continuation, point_table)
+    table, all_rows = point_table.table, np.arange(len(point_table.wheel_indices))
+    fraction_rates = np.asarray(point_table.points.fraction_rate)
+    jumps: list[tuple[int, int]] = []
+    if continuation.problem.has_kinks:
+        states = np.asarray(jax.vmap(continuation.problem.section_state)(point_table.points.z))
+        fractions = point_table.points.p / (continuation.bounds[1] - continuation.bounds[0])
+        neighbors = _neighbor_pairs(point_table, all_rows)
+        jumps = find_jumps(states, fractions, fraction_rates, neighbors)
+    order = table.get(CONTACT_ORDER_COLUMN, np.zeros(len(all_rows)))
+    for left, right in _neighbor_pairs(point_table, all_rows):
+        if order[left] != order[right]:
+            # Between the end of the left order and the begin of the right one may be others.
+            requests += [
+                (left, right, contact_order_quantity_name(order[i])) for i in (left, right)
+            ]
+            names += [CONTACT_ORDER_CHANGE] * 2
+    contains_jump = lambda left, right: any(left <= i and j <= right for i, j in jumps)
+    is_continuous = [not contains_jump(left, right) for left, right, _ in requests]
+    requests = [x for x, is_kept in zip(requests, is_continuous, strict=True) if is_kept]
+    names = [x for x, is_kept in zip(names, is_continuous, strict=True) if is_kept]
+    located_zeros = _locate_zeros(continuation, point_table, requests)
+    named_zeros = []
+    for name, zero in zip(names, located_zeros, strict=True):
+        if name in N_CROSSING_MULTIPLIERS and not vanishes_at(table, zero):
+            continue
+        jacobian = np.asarray(zero.point_beside.jacobian[0])
+        if name != "neimark_sacker" or has_unit_circle_pair(jacobian):
+            named_zeros.append((name, zero, N_CROSSING_MULTIPLIERS.get(name, 0)))
+    named_zeros += [
+        (CONTACT_ORDER_CHANGE, _make_zero_at_jump(point_table, pair), 0) for pair in jumps
+    ]
+    pairs = _neighbor_pairs(point_table, np.flatnonzero(is_off_circle(table[MODULI_COLUMN])))
+    pairs = [pair for pair in pairs if not contains_jump(*pair)]
+    search = functools.partial(_locate_zeros, continuation, point_table)
+    return add_multiple_bifurcations(
+        table, fraction_rates, pairs, drop_duplicate_order_changes(named_zeros), search
+    )
 
-    The number is that of the multipliers that pass the unit circle there.
-    """
+
+def _request_sign_changes(
+    continuation: AbstractContinuation, point_table: _PointTable
+) -> tuple[list[tuple[int, int, str]], list[str]]:
+    """Return (left, right, column) and the name of each sign change of a bifurcation or margin."""
+    table = point_table.table
     skipped_names = (
         ADMISSIBLE_COLUMN,
         BRANCH_POINT_KIND,
         *continuation.linear_substitutes.values(),
     )
-    names = [
-        name
-        for name, values in point_table.table.items()
-        if values.ndim == 1 and name not in skipped_names
+    quantity_names = [
+        name for name, values in table.items() if values.ndim == 1 and name not in skipped_names
     ]
-    names = [name for name in names if name in BIFURCATION_NAMES or continuation.is_margin(name)]
+    quantity_names = [
+        name for name in quantity_names if name in BIFURCATION_NAMES or continuation.is_margin(name)
+    ]
     columns = [
-        _combined_name(name) if _combined_name(name) in point_table.table else name
-        for name in names
+        _combined_name(name) if _combined_name(name) in table else name for name in quantity_names
     ]
     # At a branch point itself the sign of the fold's margin is round-off.
-    rows = np.flatnonzero(~(np.abs(point_table.table["fold"]) < ZERO_MARGIN))
-    requests, request_names = [], []
+    rows = np.flatnonzero(~(np.abs(table["fold"]) < ZERO_TOLERANCES.zero_margin))
+    fraction_rates = np.asarray(point_table.points.fraction_rate)
+    requests, names = [], []
     for i, j, column_index in find_sign_changes(
-        np.stack([point_table.table[name] for name in columns], 1)[rows]
+        np.stack([table[name] for name in columns], 1)[rows]
     ):
-        if point_table.wheel_indices[rows[i]] == point_table.wheel_indices[rows[j]]:
-            requests.append((int(rows[i]), int(rows[j]), columns[column_index]))
-            request_names.append(names[column_index])
-    fraction_rates, fold = np.asarray(point_table.points.fraction_rate), point_table.table["fold"]
-    for i, (left, right, _) in enumerate(requests):
-        if request_names[i] == "fold" and fraction_rates[left] * fraction_rates[right] > 0.0:
-            request_names[i] = BRANCH_POINT_KIND
-    for left, right in _neighbours(point_table, rows):
-        # Along the side branch of a pitchfork the margin touches zero where the parameter turns.
-        if fold[left] * fold[right] > 0.0 and fraction_rates[left] * fraction_rates[right] < 0.0:
+        left, right, name = int(rows[i]), int(rows[j]), quantity_names[column_index]
+        if point_table.wheel_indices[left] == point_table.wheel_indices[right]:
+            if name == "fold" and fraction_rates[left] * fraction_rates[right] > 0.0:
+                name = BRANCH_POINT_KIND
+            requests.append((left, right, columns[column_index]))
+            names.append(name)
+    for left, right in _neighbor_pairs(point_table, rows):
+        # On the side branch of a pitchfork the margin touches zero where the parameter turns.
+        has_same_margin_sign = table["fold"][left] * table["fold"][right] > 0.0
+        if has_same_margin_sign and fraction_rates[left] * fraction_rates[right] < 0.0:
             requests.append((left, right, BRANCH_POINT_KIND))
-            request_names.append(BRANCH_POINT_KIND)
-    jumps: list[tuple[int, int]] = []
-    if continuation.problem.has_kinks:
-        states = np.asarray(jax.vmap(continuation.problem.section_state)(point_table.points.z))
-        shares = point_table.points.p / (continuation.bounds[1] - continuation.bounds[0])
-        jumps = find_jumps(
-            states, shares, fraction_rates, _neighbours(point_table, np.arange(len(fold)))
-        )
-    order = point_table.table.get(CONTACT_ORDER, np.zeros(len(fold)))
-    for left, right in _neighbours(point_table, np.arange(len(fold))):
-        if order[left] != order[right]:
-            # Where the first order ends, and where the last one begins: in between may be others.
-            requests += [(left, right, name_order(order[i])) for i in (left, right)]
-            request_names += [ORDER_CHANGES] * 2
-    across = [any(left <= i and j <= right for i, j in jumps) for left, right, _ in requests]
-    requests = [one for one, leaves in zip(requests, across, strict=True) if not leaves]
-    request_names = [name for name, leaves in zip(request_names, across, strict=True) if not leaves]
-    named_zeros = [
-        (name, zero, WEIGHTS.get(name, 0))
-        for name, zero in zip(
-            request_names, _locate_zeros(continuation, point_table, requests), strict=True
-        )
-        if name not in WEIGHTS or is_zero(point_table.table, zero)
-    ]
-    named_zeros = [
-        (name, zero, count)
-        for name, zero, count in named_zeros
-        if name != "neimark_sacker"
-        or has_unit_circle_pair(np.asarray(zero.point_beside.jacobian[0]))
-    ]
-    named_zeros += [(ORDER_CHANGES, _zero_at_jump(point_table, pair), 0) for pair in jumps]
-    pairs = _neighbours(point_table, np.flatnonzero(is_off_circle(point_table.table[MODULI])))
-    pairs = [(a, b) for a, b in pairs if not any(a <= i and j <= b for i, j in jumps)]
-    search = functools.partial(_locate_zeros, continuation, point_table)
-    return with_ranks(point_table.table, fraction_rates, pairs, drop_twins(named_zeros), search)
+            names.append(BRANCH_POINT_KIND)
+    return requests, names
 
 
-def _neighbours(pieces: _PointTable, rows: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of the points `rows` that follow each other on the same branch."""
+def _neighbor_pairs(point_table: _PointTable, rows: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs of points that follow each other in `rows` and belong to one branch."""
     pairs = zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)
-    return [(i, j) for i, j in pairs if pieces.wheel_indices[i] == pieces.wheel_indices[j]]
+    wheel_indices = point_table.wheel_indices
+    return [(i, j) for i, j in pairs if wheel_indices[i] == wheel_indices[j]]
 
 
-def _zero_at_jump(pieces: _PointTable, pair: tuple[int, int]) -> _LocatedZero:
-    """Return the border at a jump: the point at which the branch stalled, for lack of steps."""
+def _make_zero_at_jump(point_table: _PointTable, pair: tuple[int, int]) -> _LocatedZero:
+    """Return the zero at a jump: the point of the pair at which the continuation stalled."""
     i, j = pair
-    p, last = pieces.points.p, len(pieces.points.p) - 1
-    stalled_first = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last)] - p[j])
-    place = 0 if stalled_first else 1
-    point, table = take_rows((pieces.points, pieces.table), slice(pair[place], pair[place] + 1))
-    return _LocatedZero((i, j, ORDER_CHANGES), float(p[pair[place]]), float(place), point, table)
-
-
-def _classify(continuation: AbstractContinuation, name: str) -> str:
-    if name in WEIGHTS or name == ORDER_CHANGES:
-        return name
-    return "border_collision" if continuation.is_margin(name) else "lost"
+    p, last = point_table.points.p, len(point_table.points.p) - 1
+    is_left = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last)] - p[j])
+    fraction = 0.0 if is_left else 1.0
+    index = i if is_left else j
+    point, table = take_rows((point_table.points, point_table.table), slice(index, index + 1))
+    return _LocatedZero((i, j, CONTACT_ORDER_CHANGE), float(p[index]), fraction, point, table)
 
 
 class BranchData(NamedTuple):
@@ -609,27 +613,11 @@ class BranchData(NamedTuple):
     table: QuantityTable
     special_points: tuple[SpecialPoint, ...]
     ends: tuple[str, str]
-    is_mesh_limited: bool  # `AbstractContinuation.is_mesh_limited`
+    is_mesh_limited: bool  # see `AbstractContinuation.is_mesh_limited`
 
 
 CycleFactory = Callable[[int, ContinuationPoint], Callable[[], Any] | None]
 """Function of a wheel's index and a point that returns a function for its limit cycle."""
-
-
-def _collect_mesh_limited(
-    continuation: AbstractContinuation,
-    point_table: _PointTable,
-    ranges: list[_ValidRange],
-    n_wheels: int,
-) -> list[BranchData | None]:
-    branches: list[BranchData | None] = [None] * n_wheels
-    for valid_range in ranges:
-        if _is_mesh_limited(continuation, point_table, valid_range):
-            points, table = take_rows(
-                (point_table.points, point_table.table), valid_range.point_indices
-            )
-            branches[valid_range.wheel_index] = BranchData(points, table, (), ("", ""), True)
-    return branches
 
 
 def continue_and_locate(
@@ -640,11 +628,10 @@ def continue_and_locate(
     make_cycle: CycleFactory,
     is_finest: bool = True,
 ) -> list[BranchData | None]:
-    """Continue the branches, locate special points, and return the branches by wheel; None without
-    a start.
+    """Continue branches, and return them by wheel with located special points; None without start.
 
-    Without `is_finest`, special points of mesh-limited branches are not located, because these are
-    continued again.
+    Unless `is_finest`, special points of mesh-limited branches are not located, because these
+    branches are continued again on a finer mesh.
     """
     results = _continue_both_ways(continuation, z, p, has_start)
     # A closed curve has both directions in one result.
@@ -659,7 +646,12 @@ def continue_and_locate(
     ranges = _find_valid_ranges(point_table, start_indices)
     branches: list[BranchData | None] = [None] * n_wheels
     if not is_finest:
-        branches = _collect_mesh_limited(continuation, point_table, ranges, n_wheels)
+        for valid_range in ranges:
+            if _is_mesh_limited(continuation, point_table, valid_range):
+                points, table = take_rows(
+                    (point_table.points, point_table.table), valid_range.point_indices
+                )
+                branches[valid_range.wheel_index] = BranchData(points, table, (), ("", ""), True)
         ranges = [
             valid_range for valid_range in ranges if branches[valid_range.wheel_index] is None
         ]
@@ -672,13 +664,17 @@ def continue_and_locate(
     def make_special_point(
         name: str, zero: _LocatedZero, wheel_index: int, ends_branch: bool, count: int = 0
     ) -> SpecialPoint:
+        """Return the special point at a located zero."""
         point_beside = take_rows(zero.point_beside, 0)
         section = np.asarray(continuation.problem.section_state(jax.device_put(point_beside.z)))
         point = FixedPoint(section, float(point_beside.p), point_beside.jacobian)
         if name == ADMISSIBLE_COLUMN:
             name = continuation.name_end(point_table.table, zero.bracket[1])
+        kind = "border_collision" if continuation.is_margin(name) else "lost"
+        if name in N_CROSSING_MULTIPLIERS or name == CONTACT_ORDER_CHANGE:
+            kind = name
         return SpecialPoint(
-            _classify(continuation, name),
+            kind,
             name,
             zero.value,
             point,
@@ -712,16 +708,15 @@ def continue_and_locate(
                 (point_indices[0] - 1.0 if end == 0 else point_indices[-1] + 1.0, end_point)
             )
             end_reasons.append(continuation.describe_end(end_point.name, end_point.value))
-        special_points = tuple(b for _, b in sorted(positioned_points, key=lambda pair: pair[0]))
+        positioned_points.sort(key=lambda pair: pair[0])
+        special_points = tuple(special_point for _, special_point in positioned_points)
         table = take_rows(all_points.table, point_indices)
         end_names = tuple(b.name for b in special_points if b.ends_branch)
-        branch_fields = (
+        branches[valid_range.wheel_index] = BranchData(
             take_rows(all_points.points, point_indices),
             table,
             special_points,
             (end_reasons[0], end_reasons[1]),
-        )
-        branches[valid_range.wheel_index] = BranchData(
-            *branch_fields, continuation.is_mesh_limited(table, end_names)
+            continuation.is_mesh_limited(table, end_names),
         )
     return branches

@@ -52,12 +52,12 @@ class BranchStart(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FindLimitCycle:
-    """Function without arguments that finds the gait at a border; its class lets it be pickled.
+    """Function without arguments that finds the gait at a special point; it can be pickled.
 
-    - `finder`, `model`: of the gaits that were followed;
-    - `name`: of the parameter along which they were;
-    - `wheel`, `guess`: the wheel, and its gait where the branch begins;
-    - `z`, `p`: the point beside the border.
+    - `finder`, `model`: finder and model of the branch;
+    - `name`: name of the continued parameter;
+    - `wheel`, `guess`: the wheel, and its gait at the start of the branch;
+    - `z`, `p`: the point beside the special point.
     """
 
     finder: Any
@@ -69,7 +69,7 @@ class FindLimitCycle:
     p: Any
 
     def __call__(self) -> LimitCycle:
-        """Return the gait at the border."""
+        """Return the gait at the special point."""
         wheel, guess = jax.device_put((self.wheel, self.guess))
         collocation_state = guess.collocation_state._replace(
             solution=jax.tree.map(jnp.asarray, self.z)
@@ -78,8 +78,8 @@ class FindLimitCycle:
             guess, collocation_state=collocation_state, system=self.finder.system
         )
         _, wheel = self.model.with_parameter(wheel, self.name, jnp.asarray(self.p))
-        found: LimitCycle = self.finder.find_cycle(wheel, guess)
-        return found
+        cycle: LimitCycle = self.finder.find_cycle(wheel, guess)
+        return cycle
 
 
 def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
@@ -152,7 +152,7 @@ def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchSta
     params, options = request.params, request.step_options
     model: Any = request.model
     finder: Any = make_finder(model, params.n_legs, step_options=options, period_n=request.period_n)
-    if not finder.is_multistable:  # no batched engine: use the step
+    if not finder.is_multistable:  # There is no batched engine for this model.
         return start_from_walks(request, cycle)
     wheels = BranchWheel(
         params, jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)

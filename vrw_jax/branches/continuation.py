@@ -1,8 +1,8 @@
 """Branches of gaits along one parameter, stable or not, with all special points on them located.
 
-A special point is a bifurcation, or a border collision, where an indicator or a margin reaches
-zero. Each is solved for on the branch itself, with a new solution at every trial, so that it is as
-accurate as the gaits.
+A special point is a bifurcation, or a border collision, at which an indicator or a margin is zero.
+Each is solved for on the branch itself, with a new gait at every trial, so that it is as accurate
+as the gaits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vrw_jax.branches.branch_location import (
     continue_and_locate,
 )
 from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest
-from vrw_jax.branches.continuation_problems import SLIDES_AWAY, BranchWheel
+from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN, BranchWheel
 from vrw_jax.continuation import (
     ArclengthOptions,
     ContinuationPoint,
@@ -80,32 +80,47 @@ DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
 COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of an end where the mesh is too coarse: the gaits do not repeat in a walk."""
 
-ALIKE = 0.01
-"""Relative change of period and step length up to which a gait beyond a jump is the branch's;
-chosen because two impacts that change places move both by 1e-4."""
 
-REFINE_ABOVE_BRANCH_MESH_ERROR, MAX_BRANCH_REFINEMENTS = 1e-8, 3
-"""Estimate of the mesh's error on a branch above which a finer mesh is used, and largest number of
-refinements."""
+@dataclass(frozen=True)
+class GaitBranchOptions:
+    """Numbers of the continuation of gaits.
+
+    - `max_jump_change`: largest relative change of period and step length at a jump of the section
+      state within a branch, chosen because a change of the order of two impacts changes both by
+      1e-4;
+    - `max_mesh_error`: estimate of the mesh error above which a finer mesh is used;
+    - `max_refinements`: largest number of refinements of the mesh.
+    """
+
+    max_jump_change: float = 0.01
+    max_mesh_error: float = 1e-8
+    max_refinements: int = 3
+
+
+GAIT_BRANCH_OPTIONS = GaitBranchOptions()
+"""Options of all branches of gaits."""
 
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits: event-driven steps evaluate them, and they are admissible if these
-    repeat."""
+    """Continuation of gaits, which are admissible if their event-driven steps repeat."""
 
     model: AbstractWheel
     step_options: StepOptions
     n_legs: int
+    gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS
 
-    ending_quantities: ClassVar[tuple[str, ...]] = (*BRANCH_ENDING_QUANTITIES, SLIDES_AWAY)
+    ending_quantities: ClassVar[tuple[str, ...]] = (
+        *BRANCH_ENDING_QUANTITIES,
+        FRICTION_SURPLUS_COLUMN,
+    )
     linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
-    """Margins that vanish as a cube, with the quantity that vanishes at the same point linearly. A
-    foot that takes off less steeply dips less deeply, until it rises immediately. A solver cannot
-    resolve the last of these dips, but the linear quantity changes its sign."""
+    """Margins that vanish as a cube, with the quantity that vanishes linearly at the same point. A
+    foot that takes off less steeply dips less deeply, until it rises at once. A solver cannot
+    resolve the shallowest dips, but the linear quantity changes its sign."""
 
     def evaluate_points(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantityTable:
-        """Return the table, with one column more for each leg of a margin with several legs."""
+        """Return the table of measures, with a column for each leg of a margin of several legs."""
         problem: Any = self.problem
         measure_gaits = functools.partial(problem.measure_points, self.model, self.step_options)
         table = self.map_batched(measure_gaits, READ_BATCH_SIZE, wheels, points)
@@ -120,15 +135,16 @@ class GaitContinuation(AbstractContinuation):
             table["closure"] <= STATE_AGREEMENT_TOLERANCE
         )
 
-    def is_alike(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
-        """Return which gaits beyond a jump have the period and step length of those before."""
-        alike = super().is_alike(before, after)
+    def is_same_gait(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+        """Return for each row whether period and step length are about equal before and after."""
+        is_same = super().is_same_gait(before, after)
         for name in ("period", "step_length"):
-            alike &= np.abs(after[name] - before[name]) <= ALIKE * np.abs(before[name])
-        return alike
+            max_change = self.gait_options.max_jump_change * np.abs(before[name])
+            is_same &= np.abs(after[name] - before[name]) <= max_change
+        return is_same
 
     def describe_end(self, name: str, value: float) -> str:
-        if name != SLIDES_AWAY:
+        if name != FRICTION_SURPLUS_COLUMN:
             return super().describe_end(name, value)
         return (
             f"At {value:.9g} the friction coefficient is the tangent of the slope: with less no "
@@ -146,7 +162,7 @@ class GaitContinuation(AbstractContinuation):
 
     def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
         return COARSE_MESH_NAME in ends or bool(
-            np.max(table.get("mesh_error", 0.0)) > REFINE_ABOVE_BRANCH_MESH_ERROR
+            np.max(table.get("mesh_error", 0.0)) > self.gait_options.max_mesh_error
         )
 
 
@@ -163,44 +179,42 @@ def continue_branch(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> Branch:
-    """Return the branch of limit cycles through `params` along the parameter `name` within
-    `bounds`.
+    """Return the branch of limit cycles through `params` along a parameter within `bounds`.
 
-    The continuation starts from the limit cycle at `params` (or from `cycle`, found at the same
-    parameters). It goes both ways, through folds, on stable and unstable gaits alike, to the bounds
-    or the end of the branch. `Branch.ends` gives the reason. An end may belong to the wheel, if its
-    events change their order, or to the mesh (`mesh_too_coarse`). Without `cycle_options` the mesh
-    is first refined, up to eight times finer.
+    The continuation starts from the limit cycle at `params`, or from `cycle`, found at the same
+    parameters. It leads in both directions, through folds, over stable and unstable gaits, to the
+    bounds or to the end of the branch. `Branch.ends` gives the reasons. A branch ends if the events
+    change their order, or if the mesh is too coarse (`mesh_too_coarse`). Without `cycle_options`
+    the mesh is first refined, up to eight times.
 
-    Every special point is located to 1e-9 in the parameter, if the continuation step
-    (options.max_ds) does not hide it: two changes of sign within one step cancel. The gaits use the
-    cycle options, at least `CycleOptions.tight()` by default. Each is checked by
-    one event-driven step, which also gives indicators and margins.
+    Each special point is located to 1e-9 in the parameter, unless the continuation step
+    (options.max_ds) hides it: two changes of sign within one step cancel. The gaits use the cycle
+    options, at least `CycleOptions.tight()` by default. Each is checked by one event-driven step,
+    which also gives indicators and margins.
 
     For other models the gaits are fixed points of their return map, as accurate as `step_options`.
-    With unilateral contact `name` may be "friction" too. The start is then a `ReturnMapCycle` or,
-    without one, the end of a walk. A branch continues where the order of contacts changes, with a
-    kink or a jump that is marked as a special point, and ends where friction is tan(slope). "auto"
-    uses the model that is selected for the start. A violated margin of the paper's
-    model is a special point with the name of the margin, beyond which unilateral contact is
-    selected.
+    With unilateral contact `name` may also be "friction". The start is then a `ReturnMapCycle` or,
+    without one, the end of a walk. If the order of contacts changes, the branch continues with a
+    kink or a jump, which is a special point. It ends if friction equals tan(slope). "auto" uses the
+    model that is selected for the start. A violated margin of the paper's model is a special point
+    with the name of the margin, beyond which unilateral contact is selected.
 
     Args:
-        params: one wheel; the branch goes through its gait.
-        name: of the parameter.
+        params: one wheel; its gait is on the branch.
+        name: name of the parameter.
         bounds: range of the parameter.
         cycle: the gait at `params`, if it is known.
         period_n: number of steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branch.
-        cycle_options: of the gaits.
-        step_options: of the checking steps, and of the gaits of other models.
+        cycle_options: options of the gaits.
+        step_options: options of the checking steps, and of the gaits of other models.
 
     Returns:
-        A `Branch`; without a gait to start from, its `outcome` is the reason.
+        A `Branch`. If there is no gait to start from, its `outcome` is the reason.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
@@ -236,25 +250,25 @@ def continue_branches(
 ) -> tuple[Branch, ...]:
     """Return `continue_branch` of a batch of wheels; every parameter has one leading axis.
 
-    A wheel without a limit cycle to start from has a branch without points, whose outcome is the
+    If a wheel has no limit cycle to start from, its branch has no points, and its outcome is the
     reason.
 
     Args:
         params: the wheels; every field of shape (wheels,).
-        name: of the parameter.
+        name: name of the parameter.
         bounds: range of the parameter.
         cycle: the gaits at `params`, if they are known.
         period_n: number of steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branches.
-        cycle_options: of the gaits.
+        cycle_options: options of the gaits.
         step_options: as in `continue_branch`.
 
     Returns:
-        One `Branch` for each wheel.
+        One `Branch` per wheel.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> wheel = vrw.WheelParams(damping=np.array([205.0, 210.0]))
@@ -266,7 +280,13 @@ def continue_branches(
     check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = check_model(model), check_options(step_options or StepOptions.tight())
-    _check_continuation(model, name, check_int("period_n", period_n), cycle)
+    refuse_ladder(model, "followed")
+    check_parameter_name(name, model.parameter_names, "parameter")
+    if check_int("period_n", period_n) > 1 and cycle is None:
+        raise ValueError(
+            f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
+            "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
+        )
     (lower, upper), options = check_range("bounds", bounds), _check_arclength_options(options)
     finder = make_finder(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
@@ -289,49 +309,54 @@ def continue_branches(
     take_wheel = lambda wheel_index: jax.tree.map(lambda x: x[wheel_index], params)
     return tuple(
         _label_branch(
-            strand, take_wheel(wheel_index), name, model, step_options, int(outcomes[wheel_index])
+            data, take_wheel(wheel_index), name, model, step_options, int(outcomes[wheel_index])
         )
-        for wheel_index, strand in enumerate(branch_data)
+        for wheel_index, data in enumerate(branch_data)
     )
 
 
 def _continue_from_starts(
-    request: BranchRequest, cycle: Any, options: ArclengthOptions, limits: np.ndarray
+    request: BranchRequest,
+    cycle: Any,
+    options: ArclengthOptions,
+    bounds: np.ndarray,
+    gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
     """Return the outcomes of the starts, and the data of the branches from them.
 
     The mesh is that of the cycle options. Without options it is as fine as the branches need.
     """
     refines_mesh = request.cycle_options is None
-    for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
+    for refinement in range(1 + gait_options.max_refinements):
         branch_start = START_FUNCTIONS[request.model.capabilities.gait_method](request, cycle)
-        run = GaitContinuation(
-            branch_start.problem, options, branch_start.wheels, limits, request.model,
+        continuation = GaitContinuation(
+            branch_start.problem,
+            options,
+            branch_start.wheels,
+            bounds,
+            request.model,
             request.step_options,
             request.params.n_legs,
-        )  # fmt: skip
+            gait_options,
+        )
         has_start = branch_start.outcomes == Outcome.STEPPED
         is_finest = (
             not refines_mesh
             or branch_start.finer_options is None
-            or refinement == MAX_BRANCH_REFINEMENTS
+            or refinement == gait_options.max_refinements
         )
         branch_data = continue_and_locate(
-            run,
+            continuation,
             branch_start.unknowns,
             request.parameter_values,
             has_start,
             branch_start.make_cycle,
             is_finest,
         )
-        if is_finest or not any(
-            strand is not None and strand.is_mesh_limited for strand in branch_data
-        ):
+        if is_finest or not any(data is not None and data.is_mesh_limited for data in branch_data):
             break
-        request, cycle = (
-            request._replace(cycle_options=branch_start.finer_options),
-            branch_start.cycle,
-        )
+        request = request._replace(cycle_options=branch_start.finer_options)
+        cycle = branch_start.cycle
     return branch_start.outcomes, branch_data
 
 
@@ -339,17 +364,8 @@ OMITTED_MEASURES = ("outcome", "solver_steps")
 """Measures of the checking step that a branch omits."""
 
 
-def _check_continuation(model: AbstractWheel, name: str, period_n: int, cycle: Any) -> None:
-    refuse_ladder(model, "followed")
-    check_parameter_name(name, model.parameter_names, "parameter")
-    if period_n > 1 and cycle is None:
-        raise ValueError(
-            f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
-            "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
-        )
-
-
 def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
+    """Return the options of a continuation, by default `ArclengthOptions()`."""
     if options is not None:
         check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     return ArclengthOptions() if options is None else options
@@ -363,6 +379,7 @@ def _label_branch(
     options: StepOptions,
     outcome: int,
 ) -> Branch:
+    """Return the labeled branch of one wheel; `outcome` is that of its start."""
     origin = provenance(params, model, options)
     origin.pop(f"parameter_{name}", None)
     attrs = {"title": f"Branch of limit cycles along {name}"} | origin
@@ -403,8 +420,7 @@ def _label_branch(
 
 
 def _section_component_names(n_components: int, n_legs: int) -> list[str]:
-    """Return names of a section state's components: the paper's, or
-    `contact.FullState`."""
+    """Return the names of the components of a section state, the paper's or a full one."""
     if n_components == 3:
         return ["theta", "dtheta", "dL1"]
     legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n_legs + 1)]
@@ -457,23 +473,23 @@ def continue_map(
 ) -> Branch:
     """Return the branch of fixed points of any map x -> `function(constants, x, p)` through (x, p).
 
-    The map must be differentiable in forward mode, and NaN where it is undefined. Its bifurcations
-    are located as in `continue_branch`.
+    The map must be differentiable in forward mode, and return NaN if it is undefined. Its
+    bifurcations are located as in `continue_branch`.
 
     Args:
-        function: `function(constants, x, p)`, shape of `x`.
-        x: a fixed point, or near one, shape (n,).
-        p: the parameter there.
+        function: `function(constants, x, p)`, which returns the shape of `x`.
+        x: a fixed point or a state near one, shape (n,).
+        p: value of the parameter at `x`.
         bounds: range of the parameter.
         constants: any pytree, passed to the function.
-        name: of the parameter in the result.
+        name: name of the parameter in the result.
         options: `ArclengthOptions` of the branch.
 
     Returns:
         A `Branch`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.branches.multiplicity import CONTACT_ORDER
+from vrw_jax.branches.multiplicity import CONTACT_ORDER_COLUMN
 from vrw_jax.collocation import CollocationSolution, estimate_mesh_error
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.continuation import (
@@ -50,12 +50,13 @@ from vrw_jax.wheel import (
     wheel_from_parameters,
 )
 
-SLIDES_AWAY = "friction_above_slope"
-"""Column that is the friction coefficient above the tangent of the slope: the least with a gait."""
+FRICTION_SURPLUS_COLUMN = "friction_above_slope"
+"""Name of the column of the friction coefficient less the smallest one with a gait, which is the
+tangent of the slope."""
 
-LEAST_SURPLUS = 1e-9
-"""Share of the slope's tangent by which friction must exceed it; chosen because at the tangent
-itself gaits of every speed repeat, to the round-off of friction."""
+MIN_FRICTION_SURPLUS = 1e-9
+"""Smallest surplus of friction over the slope's tangent, as a fraction of it. It is chosen because
+at the tangent itself gaits of every speed repeat, but for the round-off of friction."""
 
 
 class BranchWheel(NamedTuple):
@@ -66,7 +67,7 @@ class BranchWheel(NamedTuple):
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
-    """Continuation problem of gaits of `n_steps` steps along the float parameter `name`."""
+    """Continuation problem of gaits of `n_steps` steps along a parameter of the wheel."""
 
     parameter_name: eqx.AbstractVar[str]
 
@@ -79,8 +80,10 @@ class AbstractGaitProblem(AbstractContinuationProblem):
     def read_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state before the first landing, and quantities that are defined beyond
-        a special point."""
+        """Return the section state before the first landing, and continued quantities by name.
+
+        Continued quantities are also defined beyond a special point.
+        """
 
     def measure_points(
         self,
@@ -89,8 +92,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
-        """Return all measures of the gaits at many points from event-driven steps, with those of
-        `read_state`."""
+        """Return all measures of the gaits at many points, by event-driven steps."""
         return _measure_points(self, model, options, wheels, points)
 
 
@@ -102,6 +104,8 @@ def _measure_points(
     wheels: BranchWheel,
     points: ContinuationPoint,
 ) -> dict[str, Array]:
+    """Return all measures of the gaits at many points; compiled once per problem."""
+
     def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
         section_state, continued_quantities = problem.read_state(wheel, z, p)
         model_at_point, params = model.with_parameter(wheel.params, problem.parameter_name, p)
@@ -112,24 +116,22 @@ def _measure_points(
 
 
 class CollocationProblem(AbstractGaitProblem):
-    """Continuation problem of limit cycles by collocation. z is a `CollocationSolution` without the
-    axis over lanes.
+    """Continuation problem of limit cycles by collocation; z is a `CollocationSolution`.
 
-    Beyond an indicator's zero the formal solution continues; the event-driven step rejects it as a
-    gait.
+    Beyond an indicator's zero the formal solution continues, but the event-driven step rejects it
+    as a gait. `additional_quantities` are functions of the first step's passages and of z.
     """
 
     system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
-    additional_quantities: Callable | None = eqx.field(
-        static=True
-    )  # of the first step's passages and z
+    additional_quantities: Callable | None = eqx.field(static=True)
 
     @property
     def n_steps(self) -> int:
         return self.system.period_n
 
     def _parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
+        """Return the wheel's parameters with the continued one at p."""
         return stack_parameters(
             eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
         )
@@ -143,10 +145,6 @@ class CollocationProblem(AbstractGaitProblem):
         )
         return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
 
-    def _mesh_error(self, z: CollocationSolution) -> Array:
-        solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
-        return estimate_mesh_error(self.system.sequence, self.system.meshes, solution_with_lane)[0]
-
     def section_state(self, z: Unknowns) -> SectionVector:
         return z.section_state
 
@@ -154,8 +152,7 @@ class CollocationProblem(AbstractGaitProblem):
         return unbatch(collocation_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether the durations are positive. The event-driven step checks everything
-        else."""
+        """Return whether the durations are positive; the event-driven step checks the rest."""
         return jnp.all((z.durations > 0.0) | (wheel.phase_active < 0.5))
 
     def read_state(
@@ -171,12 +168,14 @@ class CollocationProblem(AbstractGaitProblem):
         _, steps = self.system.evaluate_passages(parameters, z)
         takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
         end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
+        z_of_lane = jax.tree.map(lambda x: x[..., None], z)
+        mesh_error = estimate_mesh_error(self.system.sequence, self.system.meshes, z_of_lane)[0]
         continued_quantities = {
             "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
             "duration_sls2": min_durations[2],
             "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
-            "mesh_error": self._mesh_error(z),
+            "mesh_error": mesh_error,
         }
         if self.additional_quantities is not None:
             continued_quantities |= self.additional_quantities(s, steps[0], z)
@@ -193,12 +192,11 @@ def linearize_with_quantities(
     parameter_indices: tuple[int, ...],
     quantities_of: QuantityFunction | None = None,
 ) -> Any:
-    """Return a function for correction, tangents of the parameters and monodromy of one wheel's
-    trial.
+    """Return a function that linearizes one wheel's trial, and its quantities if they are given.
 
-    With `quantities_of` it also returns those quantities at the trial, and their derivatives along
-    the correction and along each tangent. Its arguments are (parameters, phase_active, solution);
-    `jax.vmap` maps it over lanes.
+    Its arguments are (parameters, phase_active, solution), over which `jax.vmap` maps it. It
+    returns the correction, the tangents of the parameters and the monodromy. With `quantities_of`
+    it also returns these quantities, and their derivatives along the correction and each tangent.
     """
 
     def linearize_trial(parameters: Array, phase_active: Array, z: CollocationSolution) -> tuple:
@@ -227,7 +225,7 @@ def linearize_with_quantities(
         tangent_along = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
         return *newton_data, evaluate(parameters, z), lax.map(tangent_along, directions)
 
-    make_output_template = lambda parameters, happens, z: (
+    make_output_template = lambda parameters, phase_active, z: (
         z,
         z,
         *(parameters,) * (1 if quantities_of is None else 3),
@@ -242,11 +240,10 @@ def linearize_with_quantities(
 
 
 class ReturnMapProblem(AbstractGaitProblem):
-    """Continuation problem of fixed points of `period_n` steps of any model; z is the section
-    state.
+    """Continuation problem of fixed points of `period_n` steps of any model.
 
-    The codes at its end (`AbstractWheel.n_continuous`) are those of the image of the last
-    iteration. Newton's method ends only if they agree.
+    z is the section state. Its last entries are codes (see `AbstractWheel.n_continuous`), which are
+    those of the image of the last iteration. Newton's method ends only if they are equal.
     """
 
     model: AbstractWheel
@@ -260,6 +257,7 @@ class ReturnMapProblem(AbstractGaitProblem):
         return self.period_n
 
     def _image(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
+        """Return the section state after `period_n` steps, NaN if one fails."""
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         for _ in range(self.period_n):
             advance = model.advance(params, z, self.options)
@@ -288,8 +286,7 @@ class ReturnMapProblem(AbstractGaitProblem):
 
 
 class GroundProblem(AbstractGaitProblem):
-    """Continuation problem with unilateral contact, by batched steps; z as in
-    `ReturnMapProblem`."""
+    """Continuation problem with unilateral contact by batched steps, as `ReturnMapProblem`."""
 
     model: UnilateralWheel
     options: StepOptions
@@ -318,34 +315,26 @@ class GroundProblem(AbstractGaitProblem):
         return jax.vmap(values_of_wheel)(wheels, p)
 
     def _period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
+        """Return the map of many wheels over a period."""
         values = np.asarray(self.parameter_values(wheels, p))
         return PeriodMap(self.model, self.n_legs, self.period_n, values)
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Array) -> NewtonStep:
         """Return the Newton steps of many wheels."""
         section_states, n_coordinates = np.asarray(z), self.n_coordinates
-        is_own_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
+        is_continued = np.asarray(self.model.parameter_names) == self.parameter_name
         period = self._period_map(wheel, p).evaluate_period(
-            self.options, section_states, is_own_parameter
+            self.options, section_states, is_continued
         )
         nan_if_invalid = np.where(period.is_valid, 0.0, np.nan)[:, None]
-        defect, return_jacobian = (
-            period.end_state - section_states + nan_if_invalid,
-            period.return_jacobian[:, :n_coordinates, :n_coordinates],
-        )
-        right_sides = np.concatenate(
-            [
-                defect[:, :n_coordinates, None],
-                period.value_jacobian[:, :n_coordinates, is_own_parameter],
-            ],
-            -1,
-        )
-        solutions, codes = (
-            solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides),
-            defect[:, n_coordinates:],
-        )
-        correction = np.concatenate([solutions[..., 0], codes], 1)
-        tangent = np.concatenate([solutions[..., 1], 0.0 * codes], 1)
+        defect = period.end_state - section_states + nan_if_invalid
+        return_jacobian = period.return_jacobian[:, :n_coordinates, :n_coordinates]
+        parameter_jacobian = period.value_jacobian[:, :n_coordinates, is_continued]
+        right_sides = np.concatenate([defect[:, :n_coordinates, None], parameter_jacobian], -1)
+        solutions = solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides)
+        code_changes = defect[:, n_coordinates:]
+        correction = np.concatenate([solutions[..., 0], code_changes], 1)
+        tangent = np.concatenate([solutions[..., 1], 0.0 * code_changes], 1)
         return NewtonStep(correction, tangent, jnp.asarray(return_jacobian))
 
     def section_state(self, z: Unknowns) -> SectionVector:
@@ -373,36 +362,32 @@ class GroundProblem(AbstractGaitProblem):
         period = self._period_map(wheels, points.p).evaluate_period(
             options, np.asarray(points.z), False, False
         )
-        beyond = {
+        additional_columns = {
             "section_state": jnp.asarray(points.z),
-            CONTACT_ORDER: order_of_contacts(period.steps, self.n_legs),
-            SLIDES_AWAY: np.asarray(self._grip(wheels, points.p)),
+            CONTACT_ORDER_COLUMN: hash_contact_orders(period.steps, self.n_legs),
+            FRICTION_SURPLUS_COLUMN: np.asarray(jax.vmap(self._friction_surplus)(wheels, points.p)),
         }
-        return _measure_periods(period.steps, points.z) | beyond
+        return _measure_periods(period.steps, points.z) | additional_columns
 
-    def _grip(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return how much friction exceeds what the weight along the slope needs; one or many.
+    def _friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
+        """Return the friction coefficient less the smallest one with a gait.
 
-        Over a period the ground's tangential impulse is the weight's along the slope, and friction
-        bounds it by the normal one: without a surplus no gait repeats.
+        Over a period the ground's tangential impulse equals that of the weight along the slope.
+        Friction limits it to a multiple of the normal impulse, so no gait repeats without surplus.
         """
-
-        def one(wheel: BranchWheel, p: Array) -> Array:
-            model: Any
-            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            return model.friction - jnp.tan(params.slope) * (1.0 + LEAST_SURPLUS)
-
-        return one(wheels, p) if jnp.ndim(p) == 0 else jax.vmap(one)(wheels, p)
+        model: Any
+        model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
+        return model.friction - jnp.tan(params.slope) * (1.0 + MIN_FRICTION_SURPLUS)
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
-        """Whether friction can carry the weight along the slope."""
-        return jnp.all(jnp.isfinite(z)) & (self._grip(wheel, p) > 0.0)
+        """Return whether friction can balance the weight along the slope."""
+        return jnp.all(jnp.isfinite(z)) & (self._friction_surplus(wheel, p) > 0.0)
 
 
-def order_of_contacts(steps: Any, n_legs: int) -> np.ndarray:
-    """Return a number for each order in which the contacts of many periods come.
+def hash_contact_orders(steps: Any, n_legs: int) -> np.ndarray:
+    """Return for each of many periods a number that identifies its order of contacts.
 
-    It stands for the modes that occur, the counts of events and the feet's modes at the end.
+    It is a checksum of the modes that occur, the counts of events and the final contact modes.
     """
     occurring = np.asarray(steps.mode_durations) > 0.0
     codes = np.asarray(steps.section_state)[..., -n_legs:]
@@ -415,13 +400,14 @@ def order_of_contacts(steps: Any, n_legs: int) -> np.ndarray:
 @jax.jit
 @jax.vmap
 def _measure_periods(steps: AbstractStep, x: AnySectionState) -> dict[str, Array]:
+    """Return the measures of many periods that begin at the section states x."""
     return combine_step_measures(
         steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x
     )
 
 
 def interpolate_states(left: Array, right: Array, fraction: Scalar, n_coordinates: int) -> Array:
-    """Interpolate section states. The codes are those of the nearer one."""
+    """Return a section state between two others, with the codes of the nearer one."""
     codes = jnp.where(fraction < 0.5, left, right)[n_coordinates:]
     return jnp.concatenate([(left + fraction * (right - left))[:n_coordinates], codes])
 
@@ -433,11 +419,11 @@ def measure_gait(
     options: StepOptions,
     period_n: int,
 ) -> dict[str, Array]:
-    """Return all measures of one period of a gait that passes the section at x, with `closure`.
+    """Return all measures of one period of a gait from its section state, with `closure`.
 
-    Indicators and margins are minima over the steps, durations and energies are sums. Section and
-    post-impact state are those of the last and first step. `outcome` is that of the first step that
-    failed. `closure` is the distance of the section state from x after the period.
+    Indicators and margins are minima over the steps; durations and energies are sums. Section and
+    post-impact state are those of the last and the first step. `outcome` is that of the first step
+    that fails. `closure` is the change of the section state over the period.
     """
 
     def measure_next_step(x: AnySectionState, _: None) -> tuple[AnySectionState, dict[str, Array]]:

@@ -1,7 +1,7 @@
-"""Continuation of special points as curves in two parameters, several side by side, each once.
+"""Continuation of special points as curves in two parameters, in batches, each curve once.
 
-A special point is solved for together with the gait, so that a point of a curve is as accurate as
-the gait. Where a curve meets another special point, a new curve starts.
+A special point is solved for together with its gait, so that a point of a curve is as accurate as
+the gait. If a curve meets another special point, a new curve starts there.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +22,7 @@ from vrw_jax.branches.branch_location import (
 )
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
-    MAX_BRANCH_REFINEMENTS,
+    GAIT_BRANCH_OPTIONS,
     GaitContinuation,
     continue_branches,
 )
@@ -55,42 +55,53 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
 
-EDGE_NAME = "edge of the box"
-"""Name of the column that is zero where the second parameter leaves its range."""
+EDGE_COLUMN = "edge of the box"
+"""Name of the column that is zero if the second parameter is at an end of its range."""
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
-"""Default options of curves. The first step is short because some curves are short."""
+"""Default options of curves, with a short first step because some curves are short."""
 
 CURVES_PER_BATCH = 8
-"""Number of curves in a batch, so that one shape is compiled."""
+"""Number of curves in a batch, fixed so that one shape is compiled."""
 
-SAME_CURVE_DISTANCE = 2e-3
-"""Largest distance of a point on a curve from that curve, with lengths as along the curve."""
 
-OVERRUN_DISTANCE = 3e-3
-"""Distance from a point of codimension two at which the continuation of the other curve starts."""
+@dataclass(frozen=True)
+class TracingOptions:
+    """Numbers of the tracing of curves; lengths are as along a curve.
 
-CODIM2_TOLERANCE = 1e-9
-"""Newton's last step to a point of codimension two, relative to the values of the parameters."""
+    - `same_curve_distance`: largest distance of a point from a curve that contains it;
+    - `overrun_distance`: distance from a point of codimension two at which the continuation of the
+      other curve starts;
+    - `codim2_tolerance`: Newton's last step to a point of codimension two, relative to the values
+      of the parameters;
+    - `max_zero_duration`: duration of double support that counts as zero, s. It is chosen above
+      round-off because the duration is ill-conditioned there;
+    - `duration_guess`: first guess of a nonzero duration of double support, s.
+    """
 
-NEGLIGIBLE_DURATION, DURATION_GUESS = 1e-4, 0.1
-"""Duration of double support that counts as zero despite ill-conditioning, and a first guess of a
-nonzero duration, s."""
+    same_curve_distance: float = 2e-3
+    overrun_distance: float = 3e-3
+    codim2_tolerance: float = 1e-9
+    max_zero_duration: float = 1e-4
+    duration_guess: float = 0.1
+
+
+TRACING_OPTIONS = TracingOptions()
+"""Options of all curves."""
 
 
 @dataclass(frozen=True)
 class CurveContinuation(AbstractContinuation):
-    """Continuation of special points, evaluated as gaits are, except for the special point
-    itself."""
+    """Continuation of special points, evaluated as gaits are except for the special point."""
 
     problem: TestFunctionCurve
-    second_parameter: str  # of the two parameters
+    second_parameter: str
     special_point_names: tuple[str, ...]  # one for each wheel
     gait_continuation: GaitContinuation  # along the first parameter
 
     ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
-        EDGE_NAME,
+        EDGE_COLUMN,
         FORCE_FALL_NAME,
     )
     linear_substitutes: ClassVar[Mapping[str, str]] = LINEAR_SUBSTITUTES
@@ -110,15 +121,13 @@ class CurveContinuation(AbstractContinuation):
             "lambda_4_plus": rear_force_sign * table["lambda_4_plus"],
             "second": second_values,
         }
-        return table | curve_quantities | {EDGE_NAME: np.minimum(fraction, 1.0 - fraction)}
+        return table | curve_quantities | {EDGE_COLUMN: np.minimum(fraction, 1.0 - fraction)}
 
     def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
-        """Mask quantities that vanish along the whole curve, which have no isolated zeros on it."""
+        """Return the table with NaN for quantities that are zero or undefined on a whole curve."""
         names_of_points = np.array(self.special_point_names)[wheel_indices]
-        is_discontinuous, is_dls_vanishing = (
-            np.isin(names_of_points, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHES)),
-            names_of_points == DLS_VANISHES,
-        )
+        is_dls_vanishing = names_of_points == DLS_VANISHES
+        is_discontinuous = np.isin(names_of_points, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHES))
         step_names = {name for name in table if name.partition("[")[0] in MARGIN_MEASURES} - set(
             CONTINUED_QUANTITIES
         )
@@ -164,7 +173,7 @@ class CurveSeed(NamedTuple):
 
 
 class TracedCurve(NamedTuple):
-    """Traced curve, with the special points met on it."""
+    """Traced curve, with seeds at the special points that it meets."""
 
     curve: SpecialPointCurve
     path: np.ndarray  # section state and both parameters' fractions, (point, coordinate)
@@ -180,6 +189,7 @@ class CurveTracer(NamedTuple):
     options: ArclengthOptions
     step_options: StepOptions
     on_stage: Callable[[str], None] | None = None
+    tracing_options: TracingOptions = TRACING_OPTIONS
 
     def report_stage(self, stage: str) -> None:
         """Call `on_stage`, if it is given, with a description of the next stage."""
@@ -187,6 +197,7 @@ class CurveTracer(NamedTuple):
             self.on_stage(stage)
 
     def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
+        """Return the wheel with other values of some parameters."""
         for name, value in values.items():
             params = self.model.with_parameter(params, name, jnp.asarray(value))[1]
         return params
@@ -196,8 +207,7 @@ class CurveTracer(NamedTuple):
         return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(self, axis: int, params: WheelParams) -> list[CurveSeed]:
-        """Return seeds at special points on the branches of these wheels along one of the
-        parameters."""
+        """Return seeds at special points on the branches of wheels along one of the parameters."""
         name, seeds = self.parameters[axis], []
         lower, upper = self.parameter_ranges[axis]
         self.report_stage(f"following {len(params.damping)} branches along {name}")
@@ -208,15 +218,14 @@ class CurveTracer(NamedTuple):
         return seeds
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
-        start = special_point.cycle
-        params = wheel_from_parameters(start.parameters, start.system.n_legs)
+        """Return the seed at a special point of a branch."""
+        cycle = special_point.cycle
+        params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
         first, second = (float(getattr(params, name)) for name in self.parameters)
-        gait, z = (
-            BranchWheel(params, start.collocation_state.phase_active),
-            start.collocation_state.solution,
-        )
-        name = special_point_name(special_point.name, gait, z)
-        return CurveSeed(name, (first, second), start.system, gait, z)
+        gait = BranchWheel(params, cycle.collocation_state.phase_active)
+        z = cycle.collocation_state.solution
+        name = special_point_name(special_point.name, gait, z, self.tracing_options)
+        return CurveSeed(name, (first, second), cycle.system, gait, z)
 
     def trace_curves(
         self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
@@ -235,14 +244,15 @@ class CurveTracer(NamedTuple):
             ]
             while remaining:
                 batch_seeds: list[CurveSeed] = []
-                for seed in remaining:  # each name once: others may be on its curve
+                # A batch has each name once, because other seeds of the name may be on its curve.
+                for seed in remaining:
                     if (
                         seed.name not in {s.name for s in batch_seeds}
                         and len(batch_seeds) < CURVES_PER_BATCH
                     ):
                         batch_seeds.append(seed)
                 accepted: list[TracedCurve] = []
-                for curve in self._trace_batch(group, batch_seeds):  # a curve may be known already
+                for curve in self._trace_batch(group, batch_seeds):
                     if not any(
                         self.is_same_curve(curve, other_curve)
                         for other_curve in (*known_curves, *new_curves, *accepted)
@@ -250,26 +260,30 @@ class CurveTracer(NamedTuple):
                         accepted.append(curve)
                 new_curves += accepted
                 remaining = [
-                    seed for seed in remaining
-                    if not any(seed is s for s in batch_seeds) and not any(self._is_on_curve(seed,
-                        t) for t in accepted)
-                ]  # fmt: skip
+                    seed
+                    for seed in remaining
+                    if not any(seed is other for other in batch_seeds)
+                    and not any(self._is_on_curve(seed, curve) for curve in accepted)
+                ]
         return new_curves
 
     def _is_on_curve(self, seed: CurveSeed, curve: TracedCurve) -> bool:
+        """Return whether a seed is on a curve of the same special point."""
         seed_point = np.append(
             seed.z.section_state, self.parameter_fractions(np.array(seed.parameter_values))
         )
-        same_name = seed.name == curve.curve.name
-        return same_name and bool(
-            distance_to_path(seed_point[None], curve.path)[0] < SAME_CURVE_DISTANCE
+        has_same_name = seed.name == curve.curve.name
+        max_distance = self.tracing_options.same_curve_distance
+        return has_same_name and bool(
+            distance_to_path(seed_point[None], curve.path)[0] < max_distance
         )
 
-    @staticmethod
-    def is_same_curve(curve: TracedCurve, other_curve: TracedCurve) -> bool:
-        same_name = curve.curve.name == other_curve.curve.name
-        return same_name and bool(
-            np.max(distance_to_path(curve.path, other_curve.path)) < SAME_CURVE_DISTANCE
+    def is_same_curve(self, curve: TracedCurve, other_curve: TracedCurve) -> bool:
+        """Return whether each point of a curve is on the other curve of the same special point."""
+        has_same_name = curve.curve.name == other_curve.curve.name
+        max_distance = self.tracing_options.same_curve_distance
+        return has_same_name and bool(
+            np.max(distance_to_path(curve.path, other_curve.path)) < max_distance
         )
 
     def _trace_batch(self, group: tuple[str, ...], seeds: list[CurveSeed]) -> list[TracedCurve]:
@@ -277,8 +291,9 @@ class CurveTracer(NamedTuple):
         curves: list[TracedCurve] = []
         names = ", ".join(sorted({seed.name for seed in seeds}))
         self.report_stage(f"following special points: {names}")
-        for refinement in range(1 + MAX_BRANCH_REFINEMENTS):
-            is_finest = refinement == MAX_BRANCH_REFINEMENTS
+        max_refinements = GAIT_BRANCH_OPTIONS.max_refinements
+        for refinement in range(1 + max_refinements):
+            is_finest = refinement == max_refinements
             branches = self._continue_batch(group, seeds, is_finest)
             mesh_limited = []
             for seed, (branch, system) in zip(seeds, branches, strict=True):
@@ -294,6 +309,7 @@ class CurveTracer(NamedTuple):
 
     @staticmethod
     def _transfer_seed(seed: CurveSeed, system: CollocationSystem) -> CurveSeed:
+        """Return a seed on the mesh of `system`."""
         if seed.system == system:
             return seed
         return seed._replace(system=system, z=transfer_to_mesh(seed.system, system, seed.z))
@@ -301,9 +317,9 @@ class CurveTracer(NamedTuple):
     def _continue_batch(
         self, group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
     ) -> list[tuple[BranchData | None, CollocationSystem]]:
+        """Return the data of a curve through each seed, with the finest system of the seeds."""
         system = max(
-            (seed.system for seed in seeds),
-            key=lambda first_values: first_values.options.mesh_intervals,
+            (seed.system for seed in seeds), key=lambda system: system.options.mesh_intervals
         )
         seeds = [self._transfer_seed(seed, system) for seed in seeds]
         padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % CURVES_PER_BATCH)]
@@ -318,35 +334,33 @@ class CurveTracer(NamedTuple):
         quantity_indices = [jnp.asarray(group.index(name)) for name in quantity_names]
         wheels = stack_trees(
             *(
-                TestFunctionArgs(one_seed.gait, quantity_index)
-                for one_seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
+                TestFunctionArgs(seed.gait, quantity_index)
+                for seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
             )
         )
         lower, upper = map(float, self.parameter_ranges[1])
         fraction_of = lambda seed: jnp.asarray((seed.parameter_values[1] - lower) / (upper - lower))
         z = stack_trees(*(TestFunctionPoint(seed.z, fraction_of(seed)) for seed in padded_seeds))
-        continuation_options = self.model, self.step_options, system.n_legs
         gait_continuation = GaitContinuation(
             test_function.gait_problem,
             self.options,
             wheels.gait,
             self.parameter_ranges[0],
-            *continuation_options,
+            self.model,
+            self.step_options,
+            system.n_legs,
         )
-        special_point_names = tuple(seed.name for seed in padded_seeds)
         continuation = CurveContinuation(
             TestFunctionCurve(test_function, (lower, upper)),
             self.options,
             wheels,
             self.parameter_ranges[0],
             self.parameters[1],
-            special_point_names,
+            tuple(seed.name for seed in padded_seeds),
             gait_continuation,
         )
-        first_values, is_requested = (
-            jnp.asarray([one_seed.parameter_values[0] for one_seed in padded_seeds]),
-            np.arange(len(padded_seeds)) < len(seeds),
-        )
+        first_values = jnp.asarray([seed.parameter_values[0] for seed in padded_seeds])
+        is_requested = np.arange(len(padded_seeds)) < len(seeds)
         branches = continue_and_locate(
             continuation,
             z,
@@ -358,11 +372,12 @@ class CurveTracer(NamedTuple):
         return [(branch, system) for branch in branches[: len(seeds)]]
 
     def _label_traced(self, seed: CurveSeed, branch: BranchData) -> TracedCurve:
+        """Return the labeled curve from its data, with seeds at the special points on it."""
         values = np.stack([branch.points.p, branch.table["second"]], -1)
         path = np.column_stack([branch.points.z.z.section_state, self.parameter_fractions(values)])
         codim2_points, new_seeds, ends = [], [], branch.ends
         for special_point in branch.special_points:
-            if special_point.name == EDGE_NAME:
+            if special_point.name == EDGE_COLUMN:
                 continue
             point_beside = special_point.cycle
             meeting_values = (
@@ -372,7 +387,9 @@ class CurveTracer(NamedTuple):
                     + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
                 ),
             )
-            name = special_point_name(special_point.name, seed.gait, point_beside.z.z)
+            name = special_point_name(
+                special_point.name, seed.gait, point_beside.z.z, self.tracing_options
+            )
             if {name, seed.name} == {"lambda_4_plus", DLS_VANISHES}:
                 meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
                 new_seeds.append(
@@ -394,13 +411,15 @@ class CurveTracer(NamedTuple):
     def _locate_jump_onset(
         self, seed: CurveSeed, z: CollocationSolution, start_values: Any
     ) -> tuple[float, float]:
+        """Return both parameters at the onset of the jump, or `start_values` if it is not found."""
         test_function = GaitTestFunction(
             seed.system, self.parameters, CONTINUED_QUANTITIES, self.model, self.step_options
         )
-        located, last_change = locate_jump_onset(
+        onset, last_change = locate_jump_onset(
             test_function, seed.gait, jax.device_put(z), jnp.asarray(start_values)
         )
-        first, second = located if last_change < CODIM2_TOLERANCE else start_values
+        is_found = last_change < self.tracing_options.codim2_tolerance
+        first, second = onset if is_found else start_values
         return float(first), float(second)
 
     def _seed_beyond_meeting(
@@ -412,37 +431,33 @@ class CurveTracer(NamedTuple):
         z: CollocationSolution,
         meeting_values: Any,
     ) -> CurveSeed:
-        """Return a seed beyond a point where the rear foot's force, zero along the curve, starts to
-        rise or fall.
+        """Return a seed beyond the point at which the rear foot's force starts to rise or fall.
 
-        Both curves cross there and continue in the same direction.
+        The force is zero along the curve. Both curves cross there and continue in the same
+        direction.
         """
-        direction = (
-            1
-            if abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
-            else -1
+        starts_at_meeting = (
+            abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
         )
-        path, values, z = (
-            path[::direction],
-            values[::direction],
-            jax.tree.map(lambda x: x[::direction], z),
-        )
+        direction = 1 if starts_at_meeting else -1
+        path, values = path[::direction], values[::direction]
+        z = jax.tree.map(lambda x: x[::direction], z)
+        overrun_distance = self.tracing_options.overrun_distance
         distances = np.linalg.norm(path - path[0], axis=1)
-        point_index = int(np.argmax(distances >= min(OVERRUN_DISTANCE, distances[-1])))
+        point_index = int(np.argmax(distances >= min(overrun_distance, distances[-1])))
         extrapolate = lambda x: (
-            x[0] + OVERRUN_DISTANCE / distances[point_index] * (x[0] - x[point_index])
+            x[0] + overrun_distance / distances[point_index] * (x[0] - x[point_index])
         )
-        z, (first, second) = (
-            jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z),
-            extrapolate(values),
-        )
-        dls_duration = 0.0 if name == DLS_VANISHES else DURATION_GUESS
+        z = jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z)
+        first, second = extrapolate(values)
+        dls_duration = 0.0 if name == DLS_VANISHES else self.tracing_options.duration_guess
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
         return CurveSeed(name, (first, second), seed.system, seed.gait, z)
 
     def _label_curve(
         self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
+        """Return the labeled curve from its data."""
         radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
         table = branch.table | {"spectral_radius": radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
@@ -461,7 +476,7 @@ class CurveTracer(NamedTuple):
 
 
 def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Return the distances of points from a polyline, both along the first axis."""
+    """Return the distance of each point from a polyline, whose vertices are rows of `path`."""
     segment_starts, chord = path[:-1], np.diff(path, axis=0)
     squared = np.maximum(np.sum(chord**2, 1), 1e-300)
     offsets = points[:, None] - segment_starts
@@ -470,21 +485,26 @@ def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
     return np.min(distances, axis=1, initial=np.inf)
 
 
-def special_point_name(name: str, gait: BranchWheel, z: CollocationSolution) -> str:
-    """Return the name of a special point of a curve or branch, given the gait there."""
-    if name == BRANCH_POINT_KIND:  # a curve of folds may not turn there
+def special_point_name(
+    name: str,
+    gait: BranchWheel,
+    z: CollocationSolution,
+    options: TracingOptions = TRACING_OPTIONS,
+) -> str:
+    """Return the name of a special point of a curve or branch, given its gait."""
+    if name == BRANCH_POINT_KIND:  # A curve of folds need not turn back there.
         return "fold"
     if (
         name not in ("lambda_4_plus", DLS_VANISHES, FORCE_FALL_NAME)
         or gait.phase_active[0, 0] < 0.5
     ):
         return name
-    dls_vanishes = name != FORCE_FALL_NAME and z.durations[0, 0] < NEGLIGIBLE_DURATION
+    dls_vanishes = name != FORCE_FALL_NAME and z.durations[0, 0] < options.max_zero_duration
     return DLS_VANISHES if dls_vanishes else "lambda_4_plus"
 
 
 def can_continue(name: str) -> bool:
-    """Return whether a special point's quantity is one of `GaitTestFunction`."""
+    """Return whether a special point can be continued as a curve by `GaitTestFunction`."""
     return (
         name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHES)
         or name.partition("[")[0] in MARGIN_MEASURES

@@ -1,10 +1,11 @@
 """Test functions of collocated gaits over two parameters, whose zeros are special points.
 
-Trial, tangents, quantities and their derivatives come from one call of machine code. Margins that
-need an event-driven step come from steps.
+Trial, tangents, quantities and their derivatives are computed by one call of machine code. Margins
+that need an event-driven step are computed by steps.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -49,20 +50,21 @@ from vrw_jax.wheel import (
 )
 
 LINEAR_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_substitutes
+"""Margins that vanish as a cube, with the quantity that vanishes linearly at the same point."""
+
 DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
 
 DLS_VANISHES = "duration_dls"
-"""Special point where the duration of double support reaches zero: the rear foot's force vanishes
-there and falls. If it vanishes and rises, at the zero of `lambda_4_plus`, the step jumps."""
+"""Name of the special point at which the duration of double support is zero. The rear foot's force
+is zero there and falls. At the zero of `lambda_4_plus` it is zero and rises, and the step jumps."""
 
-FORCE_FALL_NAME, MEAN_FORCE_FALL_NAME = (
-    "fall of the rear foot's force at first",
-    "its mean fall in double support",
-)
-"""Names of two rates, N/s. The first is positive on `DLS_VANISHES`, which ends at its zero. The
-second vanishes on the curve of `lambda_4_plus`, and not on `DLS_VANISHES`, which solves the same
-equations too."""
+FORCE_FALL_NAME = "fall of the rear foot's force at first"
+"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHES`, which ends at its zero."""
+
+MEAN_FORCE_FALL_NAME = "its mean fall in double support"
+"""Name of a rate in N/s that is zero on the curve of `lambda_4_plus`. It is not zero on that of
+`DLS_VANISHES`, which satisfies the same equations otherwise."""
 
 CONTINUED_QUANTITIES = (
     *DISCONTINUOUS_QUANTITIES,
@@ -73,17 +75,30 @@ CONTINUED_QUANTITIES = (
 """Quantities of the collocated gait itself, which continue beyond the special point."""
 
 
+@dataclass(frozen=True)
+class TestFunctionOptions:
+    """Numbers of the test functions of gaits.
+
+    - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
+    - `duration_roundoff`: round-off of a duration that is zero along a whole curve, s;
+    - `relative_difference`: finite difference of section state and relative parameters, for
+      derivatives of the quantities of a step.
+    """
+
+    n_codim2_iterations: int = 8
+    duration_roundoff: float = 1e-9
+    relative_difference: float = 1e-6
+
+
 def test_quantity_of(name: str, has_double_support: bool) -> str:
-    """Return the quantity whose zero is the special point; `has_double_support` refers to the
-    gaits."""
+    """Return the quantity whose zero is the special point, for gaits with double support or not."""
     if name == "lambda_4_plus" and has_double_support:
         return MEAN_FORCE_FALL_NAME
     return "lambda_4_plus" if name == DLS_VANISHES else LINEAR_SUBSTITUTES.get(name, name)
 
 
 def quantity_group_of(name: str, n_legs: int) -> tuple[str, ...]:
-    """Return the quantities that are evaluated together with the one that vanishes at a special
-    point."""
+    """Return the quantities that are evaluated together with that of a special point."""
     leg_suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
     step_quantities = [
         n + leg
@@ -113,6 +128,7 @@ class GaitTestFunction(AbstractTestFunction):
     quantities: tuple[str, ...] = eqx.field(static=True)  # of one quantity group
     model: ViscoelasticWheel
     step_options: StepOptions
+    options: TestFunctionOptions = eqx.field(static=True, default=TestFunctionOptions())
 
     def linearize(
         self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array
@@ -141,12 +157,12 @@ class GaitTestFunction(AbstractTestFunction):
             value, parameter_gradient = self._differentiate_steps(
                 gait, z, p, correction, (first_tangent, second_tangent)
             )
-        value, parameter_gradient = (
+        return TestFunctionNewtonStep(
+            correction,
+            (first_tangent, second_tangent),
+            monodromy,
             value[wheel.quantity_index],
             parameter_gradient[:, wheel.quantity_index],
-        )
-        return TestFunctionNewtonStep(
-            correction, (first_tangent, second_tangent), monodromy, value, parameter_gradient
         )
 
     def _differentiate_steps(
@@ -157,8 +173,7 @@ class GaitTestFunction(AbstractTestFunction):
         correction: CollocationSolution,
         tangents: tuple,
     ) -> tuple[Array, Array]:
-        """Return the step's quantities of the corrected gait, and their derivatives with respect to
-        both parameters.
+        """Return the step's quantities of the corrected gait, and their parameter derivatives.
 
         Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
         than derivatives of the step, and use the same machine code. Next to a fold the tangents
@@ -184,12 +199,11 @@ class GaitTestFunction(AbstractTestFunction):
                 gait, jax.tree.map(displace, z, correction, *tangents), p + parameter_change
             )
 
-        offsets = RELATIVE_DIFFERENCE * jnp.eye(3, 2, -1, p.dtype)
-        values = jax.vmap(measure_at_offset)(offsets)
-        gradient = (values[1:] - values[0]) / RELATIVE_DIFFERENCE
-        return values[0] + correction_coordinates @ gradient, triangular_factor.T @ gradient / p[
-            :, None
-        ]
+        difference = self.options.relative_difference
+        values = jax.vmap(measure_at_offset)(difference * jnp.eye(3, 2, -1, p.dtype))
+        gradient = (values[1:] - values[0]) / difference
+        parameter_gradient = triangular_factor.T @ gradient / p[:, None]
+        return values[0] + correction_coordinates @ gradient, parameter_gradient
 
     def with_parameters(self, gait: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with both parameters at p."""
@@ -208,7 +222,7 @@ class GaitTestFunction(AbstractTestFunction):
         )
 
     def measure_step(self, gait: BranchWheel, z: CollocationSolution, p: Array) -> Array:
-        """Return those quantities that come from the step, in order."""
+        """Return the quantities of an event-driven step from the gait, in order."""
         params = self.with_parameters(gait, p).params
         section_state = self.gait_problem.read_state(gait._replace(params=params), z, p[0])[0]
         measures = measure_gait(self.model, params, section_state, self.step_options, 1)
@@ -226,19 +240,19 @@ class GaitTestFunction(AbstractTestFunction):
         return unbatch(collocation_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array) -> Array:
-        return jnp.all((z.durations > -DURATION_ROUNDOFF) | (wheel.gait.phase_active < 0.5))
+        is_nonnegative = z.durations > -self.options.duration_roundoff
+        return jnp.all(is_nonnegative | (wheel.gait.phase_active < 0.5))
 
 
 @eqx.filter_jit
 def locate_jump_onset(
     test_function: GaitTestFunction, gait: BranchWheel, z: CollocationSolution, p: Array
 ) -> tuple[Array, Array]:
-    """Return both parameters where `DLS_VANISHES` meets the curve of `lambda_4_plus`, and the last
-    relative change.
+    """Return the parameters at which `DLS_VANISHES` meets `lambda_4_plus`, and their last change.
 
-    The start is a gait and parameters nearby. The equations of both curves are singular where
-    double support has zero duration. The equations of the same gait without double support are
-    regular, and the rear foot's force and its rate vanish there together.
+    The start is a gait and parameters nearby, and the change is relative. The equations of both
+    curves are singular if double support has zero duration. The equations of the same gait without
+    double support are regular, and the rear foot's force and its rate are both zero there.
     """
     gait = gait._replace(phase_active=gait.phase_active.at[0, 0].set(0.0))
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
@@ -249,8 +263,8 @@ def locate_jump_onset(
     def newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
         z, p = solution_and_parameters
         force, force_fall = (
-            test_function.linearize(TestFunctionArgs(gait, place), z, p)
-            for place in quantity_indices
+            test_function.linearize(TestFunctionArgs(gait, index), z, p)
+            for index in quantity_indices
         )
         gradients = jnp.stack([force.parameter_gradient, force_fall.parameter_gradient])
         parameter_change = -jnp.linalg.solve(gradients, jnp.stack([force.value, force_fall.value]))
@@ -262,19 +276,23 @@ def locate_jump_onset(
             p + parameter_change,
         ), parameter_change / p
 
-    (_, p), relative_changes = lax.scan(newton_step, (z, p), None, length=N_POINT_ITERATIONS)
+    (_, p), relative_changes = lax.scan(
+        newton_step, (z, p), None, length=test_function.options.n_codim2_iterations
+    )
     return p, jnp.max(jnp.abs(relative_changes[-1]))
 
 
 def _continued_quantities(
     system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
 ) -> Array:
+    """Return the `CONTINUED_QUANTITIES` of a collocated gait."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
     (passages,) = system.evaluate_passages(parameters, z)[1]
     return jnp.stack(list(_continued_by_name(s, passages, z).values()))
 
 
 def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dict[str, Array]:
+    """Return the `CONTINUED_QUANTITIES` of a step by name, from its passages through the phases."""
     dls, sls1, sls2 = passages
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
     fore, rear = transitions.landing_forces(s, landing)
@@ -290,6 +308,7 @@ def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dic
 
 
 def _force_falls(s: Symbols, dls: PhasePassage, dls_duration: Array) -> tuple[Array, Array]:
+    """Return the initial and the mean rate at which the rear foot's force falls in DLS, N/s."""
     phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 
     def instant_at(theta: Array, dtheta: Array) -> PhaseInstant:
@@ -308,21 +327,12 @@ def _force_falls(s: Symbols, dls: PhasePassage, dls_duration: Array) -> tuple[Ar
 def _trial_monodromy(
     system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
 ) -> Array:
+    """Return the monodromy matrix of a trial."""
     collocation_state = CollocationState(
         z, phase_active, *init_search_flags(system, z.section_state)
     )
     return system.linearize_at(parameters, collocation_state).monodromy
 
-
-N_POINT_ITERATIONS = 8
-"""Number of Newton iterations for one point."""
-
-DURATION_ROUNDOFF = 1e-9
-"""Round-off of a duration that is zero along a whole curve, s."""
-
-RELATIVE_DIFFERENCE = 1e-6
-"""Finite difference of section and relative parameters, for derivatives of quantities of the
-step."""
 
 QUANTITY_FUNCTIONS = {
     CONTINUED_QUANTITIES: _continued_quantities,

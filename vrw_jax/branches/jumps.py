@@ -1,104 +1,128 @@
-"""Branches whose section state jumps, as on unilateral contact where two impacts change places.
+"""Branches whose section state jumps, as on unilateral contact if two impacts change their order.
 
-The effects of two impacts do not commute, so that the gait beyond has another section state, and
-no step along the branch, however short, leads there.
+The effects of two impacts do not commute. The gait beyond the change of their order therefore has
+another section state, to which no step along the branch leads, however short it is.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
-from vrw_jax.continuation import ContinuationStatus, arclength
+from vrw_jax.continuation import ContinuationResult, ContinuationStatus
 from vrw_jax.numerics import take_rows
 
-MAX_JUMPS = 20
-"""Places at most where a direction of a branch goes on beyond a jump of the section state."""
 
-JUMP_SHARES = (1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3)
-"""Changes of the parameter, as shares of its range, after which a gait beyond a jump is sought;
-chosen because two impacts change places within a share of 1e-4 on unilateral contact."""
+@dataclass(frozen=True)
+class JumpOptions:
+    """Numbers of the continuation beyond jumps of the section state.
 
-JUMP_FACTOR = 5.0
-"""Factor by which the chord between two points must be steeper than both tangents for a jump,
-chosen because the slope of a chord is between those of the tangents to some tenths if a
-continuation step turns by at most 0.2 rad, also at a kink."""
-
-
-def follow_beyond_jumps(
-    run: Any, follow: Callable[..., Any], wheels: Any, tracks: arclength.ContinuationResult
-) -> arclength.ContinuationResult:
-    """Return tracks that go on where they stalled because the section state jumps.
-
-    The gait beyond is searched for from the last one, at the least change of the parameter that
-    finds one alike. `run` is an `AbstractRun`, `follow` its continuation.
+    - `max_jumps`: largest number of jumps beyond which one direction of a branch is continued;
+    - `parameter_changes`: changes of the parameter, as fractions of its range, after which a gait
+      beyond a jump is searched for. They are chosen because two impacts change their order within a
+      fraction of 1e-4 on unilateral contact;
+    - `min_steepness_factor`: factor by which the chord between two points is steeper than both
+      tangents at a jump. It is chosen because the slope of a chord is between those of the tangents
+      to some tenths if a continuation step turns by at most 0.2 rad, also at a kink.
     """
-    rows, bounds = np.arange(len(tracks.n_points)), np.asarray(run.bounds)
-    owners, given_up = rows // 2, np.zeros(len(rows), bool)
-    for _ in range(MAX_JUMPS):
-        n_points, endings = np.asarray(tracks.n_points), np.asarray(tracks.status)
-        open_ = (
-            (endings == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)) & (n_points > 1) & ~given_up
-        )
-        if not open_.any():
+
+    max_jumps: int = 20
+    parameter_changes: tuple[float, ...] = (
+        1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3,
+    )  # fmt: skip
+    min_steepness_factor: float = 5.0
+
+
+JUMP_OPTIONS = JumpOptions()
+"""Options of all branches."""
+
+
+def continue_beyond_jumps(
+    continuation: Any,
+    continue_all: Callable[..., Any],
+    wheels: Any,
+    results: ContinuationResult,
+    options: JumpOptions = JUMP_OPTIONS,
+) -> ContinuationResult:
+    """Return the results with the points beyond jumps of the section state, at which they stalled.
+
+    The gait beyond a jump is searched for from the last gait, at the smallest change of the
+    parameter that leads to a similar one. `continuation` is an `AbstractContinuation`, and
+    `continue_all` continues its branches.
+    """
+    rows, bounds = np.arange(len(results.n_points)), np.asarray(continuation.bounds)
+    wheel_indices, has_failed = rows // 2, np.zeros(len(rows), bool)
+    for _ in range(options.max_jumps):
+        n_points, status = np.asarray(results.n_points), np.asarray(results.status)
+        is_stalled = status == int(ContinuationStatus.STEP_SIZE_UNDERFLOW)
+        is_stalled = is_stalled & (n_points > 1) & ~has_failed
+        if not is_stalled.any():
             break
-        ends = take_rows(tracks.points, (rows, np.maximum(n_points - 1, 0)))
-        ways, before = np.sign(ends.fraction_rate), run.make_table(ends, owners)
-        for share in JUMP_SHARES:
-            p = ends.p + ways * share * (bounds[1] - bounds[0])
-            wanted = open_ & (p > bounds[0]) & (p < bounds[1])
-            if not wanted.any():
+        end_points = take_rows(results.points, (rows, np.maximum(n_points - 1, 0)))
+        directions = np.sign(end_points.fraction_rate)
+        end_table = continuation.make_table(end_points, wheel_indices)
+        for change in options.parameter_changes:
+            p = end_points.p + directions * change * (bounds[1] - bounds[0])
+            is_requested = is_stalled & (p > bounds[0]) & (p < bounds[1])
+            if not is_requested.any():
                 continue
-            given = jax.device_put((wheels, ends.z, p, bounds, ways, wanted))
-            more = jax.tree.map(np.asarray, follow(*given))
-            first = take_rows(more.points, (rows, 0))
-            found = wanted & (np.asarray(more.n_points) > 1)
-            found = found & run.is_alike(before, run.make_table(first, owners))
-            tracks = append_tracks(tracks, more, found)
-            open_ = open_ & ~found
-        given_up = given_up | open_
-    return tracks
+            arguments = jax.device_put((wheels, end_points.z, p, bounds, directions, is_requested))
+            new_results = jax.tree.map(np.asarray, continue_all(*arguments))
+            first_points = take_rows(new_results.points, (rows, 0))
+            is_found = is_requested & (np.asarray(new_results.n_points) > 1)
+            first_table = continuation.make_table(first_points, wheel_indices)
+            is_found = is_found & continuation.is_same_gait(end_table, first_table)
+            results = append_results(results, new_results, is_found)
+            is_stalled = is_stalled & ~is_found
+        has_failed = has_failed | is_stalled
+    return results
 
 
-def append_tracks(
-    tracks: arclength.ContinuationResult, more: arclength.ContinuationResult, which: np.ndarray
-) -> arclength.ContinuationResult:
-    """Return tracks, to those of which `which` is true the points of others are appended."""
-    if not which.any():
-        return tracks
-    n_points = tracks.n_points + np.where(which, more.n_points, 0)
-    length = max(int(np.max(n_points)), tracks.points.p.shape[1])
+def append_results(
+    results: ContinuationResult, new_results: ContinuationResult, is_appended: np.ndarray
+) -> ContinuationResult:
+    """Return the results with the points of `new_results` appended to the selected branches."""
+    if not is_appended.any():
+        return results
+    n_points = results.n_points + np.where(is_appended, new_results.n_points, 0)
+    buffer_length = max(int(np.max(n_points)), results.points.p.shape[1])
 
-    def together(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-        whole = np.zeros((len(old), length, *old.shape[2:]), old.dtype)
-        whole[:, : old.shape[1]] = old
-        for i in np.flatnonzero(which):
-            whole[i, tracks.n_points[i] : n_points[i]] = new[i, : more.n_points[i]]
-        return whole
+    def append_points(points: np.ndarray, new_points: np.ndarray) -> np.ndarray:
+        buffer = np.zeros((len(points), buffer_length, *points.shape[2:]), points.dtype)
+        buffer[:, : points.shape[1]] = points
+        for i in np.flatnonzero(is_appended):
+            buffer[i, results.n_points[i] : n_points[i]] = new_points[i, : new_results.n_points[i]]
+        return buffer
 
-    points: Any = jax.tree.map(together, tracks.points, more.points)
-    ending: Any = np.where(which, more.status, tracks.status)
-    counts: Any = n_points
-    return arclength.ContinuationResult(
-        points, counts, ending, tracks.n_linearizations + more.n_linearizations
-    )
+    points: Any = jax.tree.map(append_points, results.points, new_results.points)
+    status: Any = np.where(is_appended, new_results.status, results.status)
+    point_counts: Any = n_points
+    n_linearizations = results.n_linearizations + new_results.n_linearizations
+    return ContinuationResult(points, point_counts, status, n_linearizations)
 
 
 def find_jumps(
-    states: np.ndarray, shares: np.ndarray, share_slopes: np.ndarray, pairs: list[tuple[int, int]]
+    states: np.ndarray,
+    fractions: np.ndarray,
+    fraction_rates: np.ndarray,
+    pairs: list[tuple[int, int]],
+    options: JumpOptions = JUMP_OPTIONS,
 ) -> list[tuple[int, int]]:
-    """Return those pairs of points between which the section state jumps.
+    """Return the pairs of points between which the section state jumps.
 
-    `shares` are the parameter's as shares of its range, `share_slopes` theirs along the branch.
+    `fractions` are the parameter as a fraction of its range, and `fraction_rates` are the rates of
+    these along the branch.
     """
 
     def has_jump(i: int, j: int) -> bool:
-        change = shares[j] - shares[i]
-        chord = np.hypot(np.linalg.norm(states[j] - states[i]), change)
-        smallest_change = min(abs(share_slopes[i]), abs(share_slopes[j])) * chord
-        # Across a fold the slopes differ in sign, and the two ends may have the same parameter.
-        is_one_way = share_slopes[i] * share_slopes[j] > 0.0
-        return bool(is_one_way and JUMP_FACTOR * abs(change) < smallest_change)
+        change = fractions[j] - fractions[i]
+        chord_length = np.hypot(np.linalg.norm(states[j] - states[i]), change)
+        min_change = min(abs(fraction_rates[i]), abs(fraction_rates[j])) * chord_length
+        # Across a fold the rates differ in sign, and the two ends may have the same parameter.
+        has_one_direction = fraction_rates[i] * fraction_rates[j] > 0.0
+        is_steeper = options.min_steepness_factor * abs(change) < min_change
+        return bool(has_one_direction and is_steeper)
 
     return [pair for pair in pairs if has_jump(*pair)]

@@ -1,172 +1,215 @@
 """Bifurcations of several multipliers at once, which no sign of a determinant shows.
 
-Multipliers are ranked by modulus, the largest first. If their number outside the unit circle
-changes by more than the bifurcations found between two points account for, the modulus of each
-rank that passes 1 is a quantity to locate, and their mean where ranks pass at once.
+Multipliers are ranked by modulus, the largest first. The number of multipliers outside the unit
+circle may change by more than the located bifurcations explain. Then the modulus of each rank that
+crosses 1 is located, or the mean of the moduli of ranks that cross at once.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vrw_jax.continuation import ON_CIRCLE_TOLERANCE, SMALLEST_ANGLE
+from vrw_jax.continuation import MULTIPLIER_TOLERANCES, MultiplierTolerances
 
 BRANCH_POINT_KIND = "branch_point"
-"""A multiplier passes 1 but the branch does not turn back: another branch crosses it. There the
-equations are singular, and the place is only as good as the steps are short."""
+"""Kind of a special point at which a multiplier is 1 and the branch does not turn back. Another
+branch crosses it, and the equations are singular there. The accuracy of its location is limited by
+the continuation step."""
 
-MODULI = "multiplier_moduli"
-"""Column of the moduli, ranked."""
+MODULI_COLUMN = "multiplier_moduli"
+"""Name of the column of ranked moduli."""
 
-CONTACT_ORDER, ORDER_CHANGES = "contact_order", "order_of_contacts_changes"
-"""Column that is a number for each order of contacts, and the border where it becomes another."""
+CONTACT_ORDER_COLUMN = "contact_order"
+"""Name of the column with a number for each order of contacts."""
 
-ZERO_MARGIN = 1e-11
-"""Size of a fold's margin below which its sign is round-off; chosen because a determinant of
-numbers of order one is computed to 1e-15, and a point as near to a branch point is a chance."""
+CONTACT_ORDER_CHANGE = "order_of_contacts_changes"
+"""Name of the special point at which the order of contacts changes."""
 
-SAME_PLACE = 1e-3
-"""Share of a bracket within which ranks are taken to pass at once at first; chosen because three
-equal multipliers are computed to 1e-5, which is 1e-4 of a bracket."""
+NamedZero = tuple[str, Any, int]
+"""Name of a special point, its located zero, and its number of multipliers on the unit circle."""
 
-SAME_MODULUS = 1e-6
-"""Distance from modulus 1 of ranks that pass at once; chosen as for `ON_CIRCLE_TOLERANCE`."""
-
-LARGEST_SHARE_LEFT = 0.2
-"""Share of its value at a bracket's end that may be left of a quantity beside its zero: at a jump
-more is left. Chosen because a point may be found at nine tenths of the way only."""
-
-Found = tuple[str, Any, int]
-"""Name of a border, its zero, and how many multipliers pass the unit circle there."""
-
-ORDER_ACCURACY = 1e-7
-"""Relative distance below which two changes of the order of contacts are one; chosen because both
-searches may end beside it by the parameter's change over one shortest step."""
-
-WEIGHTS = {"fold": 1, BRANCH_POINT_KIND: 1, "period_doubling": 1, "neimark_sacker": 2}
-"""Multipliers that pass the unit circle at a bifurcation."""
+N_CROSSING_MULTIPLIERS = {
+    "fold": 1,
+    BRANCH_POINT_KIND: 1,
+    "period_doubling": 1,
+    "neimark_sacker": 2,
+}
+"""Number of multipliers that cross the unit circle at a bifurcation, by its name."""
 
 
-def moduli_of(jacobians: np.ndarray) -> np.ndarray:
-    """Return the moduli of the multipliers, ranked; NaN for a matrix that is not finite."""
-    finite = np.isfinite(jacobians).all((-1, -2))
-    values = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], jacobians, 0.0)))
-    return np.where(finite[..., None], np.sort(values, -1)[..., ::-1], np.nan)
+@dataclass(frozen=True)
+class ZeroTolerances:
+    """Tolerances at which located zeros of a branch are equal, or are no zeros.
+
+    - `zero_margin`: size of a fold's margin below which its sign is round-off, chosen because a
+      determinant of numbers of order one is computed to 1e-15, and points so near to a branch
+      point are rare;
+    - `equal_location`: fraction of a bracket within which ranks are assumed to cross at once,
+      chosen because three equal multipliers are computed to 1e-5, which is 1e-4 of a bracket;
+    - `max_remainder`: largest size of a quantity beside its zero, as a fraction of that at an end
+      of the bracket; at a jump more remains. It is chosen because the point beside may be at nine
+      tenths of the way to the zero;
+    - `equal_parameter`: relative distance below which two changes of the order of contacts are one,
+      chosen because the two searches may end apart by the parameter's change over a shortest step.
+    """
+
+    zero_margin: float = 1e-11
+    equal_location: float = 1e-3
+    max_remainder: float = 0.2
+    equal_parameter: float = 1e-7
 
 
-def name_ranks(first: int, last: int) -> str:
-    """Return the name of the quantity that is zero where ranks first … last - 1 pass 1 at once."""
-    return f"{MODULI}:{first}:{last}"
+ZERO_TOLERANCES = ZeroTolerances()
+"""Tolerances of all branches."""
 
 
-def name_order(order: float) -> str:
-    """Return the name of the quantity that is positive where contacts come in this order."""
-    return f"{CONTACT_ORDER}:{int(order)}"
+def rank_moduli(jacobians: np.ndarray) -> np.ndarray:
+    """Return the ranked moduli of the multipliers, NaN for a matrix that is not finite."""
+    is_finite = np.isfinite(jacobians).all((-1, -2))
+    moduli = np.abs(np.linalg.eigvals(np.where(is_finite[..., None, None], jacobians, 0.0)))
+    return np.where(is_finite[..., None], np.sort(moduli, -1)[..., ::-1], np.nan)
 
 
-def quantity_of(table: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """Return a column of a table, or a quantity of `name_ranks` or `name_order`."""
-    if name.startswith(CONTACT_ORDER + ":"):
-        order = table[CONTACT_ORDER]
+def rank_quantity_name(first: int, last: int) -> str:
+    """Return the name of the quantity that is zero if ranks first … last - 1 cross 1 at once."""
+    return f"{MODULI_COLUMN}:{first}:{last}"
+
+
+def contact_order_quantity_name(order: float) -> str:
+    """Return the name of the quantity that is positive for this order of contacts."""
+    return f"{CONTACT_ORDER_COLUMN}:{int(order)}"
+
+
+def evaluate_quantity(table: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """Return a column of a table, or a quantity of ranks or of an order of contacts."""
+    if name.startswith(CONTACT_ORDER_COLUMN + ":"):
+        order = table[CONTACT_ORDER_COLUMN]
         sign = np.where(order == int(name.split(":")[1]), 1.0, -1.0)
         return np.where(np.isnan(order), np.nan, sign)
-    if not name.startswith(MODULI + ":"):
+    if not name.startswith(MODULI_COLUMN + ":"):
         return table[name]
     first, last = map(int, name.split(":")[1:])
-    return np.asarray(np.mean(table[MODULI][:, first:last], -1) - 1.0)
+    return np.asarray(np.mean(table[MODULI_COLUMN][:, first:last], -1) - 1.0)
 
 
-def is_off_circle(moduli: np.ndarray) -> np.ndarray:
-    """Return for which points every multiplier is surely inside or outside the unit circle."""
-    return np.asarray((np.abs(moduli - 1.0) > ON_CIRCLE_TOLERANCE).all(-1))
+def is_off_circle(
+    moduli: np.ndarray, tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES
+) -> np.ndarray:
+    """Return for each point whether no multiplier is on the unit circle within its tolerance."""
+    return np.asarray((np.abs(moduli - 1.0) > tolerances.on_circle).all(-1))
 
 
-def ranks_left_over(before: np.ndarray, after: np.ndarray, names: list[str]) -> range:
-    """Return the ranks that pass 1 between two points if the bifurcations `names` miss some."""
-    first, last = sorted(int(np.sum(moduli > 1.0)) for moduli in (before, after))
-    explained = last - first <= sum(WEIGHTS[name] for name in names)
-    return range(0) if explained else range(first, last)
+def find_unexplained_ranks(
+    moduli_before: np.ndarray, moduli_after: np.ndarray, names: list[str]
+) -> range:
+    """Return the ranks that cross 1 between two points if the bifurcations `names` are too few."""
+    first, last = sorted(int(np.sum(moduli > 1.0)) for moduli in (moduli_before, moduli_after))
+    n_explained = sum(N_CROSSING_MULTIPLIERS[name] for name in names)
+    return range(0) if last - first <= n_explained else range(first, last)
 
 
-def kinds_of(jacobian: np.ndarray, ranks: range, turns_back: bool) -> dict[str, int]:
-    """Return which bifurcations ranks on the unit circle are, with how many multipliers."""
+def classify_ranks(
+    jacobian: np.ndarray,
+    ranks: range,
+    turns_back: bool,
+    tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
+) -> dict[str, int]:
+    """Return the names of the bifurcations of ranks on the unit circle, with their multiplicity."""
     values = np.linalg.eigvals(jacobian)
     values = values[np.argsort(-np.abs(values), kind="stable")][list(ranks)]
-    is_pair = np.abs(values.imag) > SMALLEST_ANGLE
-    at_one = "fold" if turns_back else BRANCH_POINT_KIND
+    is_pair = np.abs(values.imag) > tolerances.min_imaginary
+    name_at_one = "fold" if turns_back else BRANCH_POINT_KIND
     counts = {
-        at_one: int(np.sum(~is_pair & (values.real > 0.0))),
+        name_at_one: int(np.sum(~is_pair & (values.real > 0.0))),
         "period_doubling": int(np.sum(~is_pair & (values.real < 0.0))),
         "neimark_sacker": int(np.sum(is_pair)),
     }
-    return {kind: count for kind, count in counts.items() if count}
+    return {name: count for name, count in counts.items() if count}
 
 
-def is_zero(table: dict[str, np.ndarray], zero: Any) -> bool:
-    """Return whether a quantity vanishes at its zero; else it jumps there."""
+def vanishes_at(
+    table: dict[str, np.ndarray], zero: Any, tolerances: ZeroTolerances = ZERO_TOLERANCES
+) -> bool:
+    """Return whether a quantity vanishes at its located zero; otherwise it jumps there."""
     left, right, name = zero.bracket
-    ends = quantity_of(table, name)[[left, right]]
-    beside = float(np.abs(quantity_of(zero.table, name)[0]))
-    return not beside > LARGEST_SHARE_LEFT * float(np.max(np.abs(ends)))
+    end_values = evaluate_quantity(table, name)[[left, right]]
+    value_beside = float(np.abs(evaluate_quantity(zero.table, name)[0]))
+    return not value_beside > tolerances.max_remainder * float(np.max(np.abs(end_values)))
 
 
-def drop_twins(zeros: list[Found]) -> list[Found]:
-    """Return the borders without those found both as an order's end and as the next one's begin."""
-    kept: list[Found] = []
-    for name, zero, count in zeros:
-        twins = [z for n, z, _ in kept if n == name == ORDER_CHANGES]
-        twins = [z for z in twins if z.bracket[:2] == zero.bracket[:2]]
-        if not any(abs(zero.value - z.value) <= ORDER_ACCURACY * abs(z.value) for z in twins):
-            kept.append((name, zero, count))
-    return kept
+def drop_duplicate_order_changes(
+    zeros: list[NamedZero], tolerances: ZeroTolerances = ZERO_TOLERANCES
+) -> list[NamedZero]:
+    """Return the zeros with each change of the order of contacts once.
 
-
-def with_ranks(
-    table: dict[str, np.ndarray],
-    share_slopes: np.ndarray,
-    pairs: list[tuple[int, int]],
-    zeros: list[Found],
-    locate: Callable[[list[tuple[int, int, str]]], list[Any]],
-) -> list[Found]:
-    """Return the borders with bifurcations of several multipliers in place of what misses some.
-
-    `pairs` are neighbours on a branch, `locate` finds zeros of quantities between them.
+    A change is located both as the end of one order and as the begin of the next one.
     """
-    within = lambda zero, span: span[0] <= zero.bracket[0] and zero.bracket[1] <= span[1]
-    moduli, alone = table[MODULI], []
+    distinct: list[NamedZero] = []
+    for name, zero, count in zeros:
+        others = [z for n, z, _ in distinct if n == name == CONTACT_ORDER_CHANGE]
+        others = [z for z in others if z.bracket[:2] == zero.bracket[:2]]
+        max_distance = lambda other: tolerances.equal_parameter * abs(other.value)
+        if not any(abs(zero.value - other.value) <= max_distance(other) for other in others):
+            distinct.append((name, zero, count))
+    return distinct
+
+
+def add_multiple_bifurcations(
+    table: dict[str, np.ndarray],
+    fraction_rates: np.ndarray,
+    pairs: list[tuple[int, int]],
+    zeros: list[NamedZero],
+    locate: Callable[[list[tuple[int, int, str]]], list[Any]],
+    tolerances: ZeroTolerances = ZERO_TOLERANCES,
+    multiplier_tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
+) -> list[NamedZero]:
+    """Return the zeros, in which bifurcations of several multipliers replace incomplete ones.
+
+    `pairs` are neighbors on a branch, and `locate` returns zeros of quantities between them.
+    """
+    is_within = lambda zero, span: span[0] <= zero.bracket[0] and zero.bracket[1] <= span[1]
+    moduli, rank_requests = table[MODULI_COLUMN], []
     for left, right in pairs:
-        names = [name for name, z, _ in zeros if name in WEIGHTS and within(z, (left, right))]
-        for rank in ranks_left_over(moduli[left], moduli[right], names):
-            alone.append((left, right, name_ranks(rank, rank + 1)))
-    if not alone:
+        names = [
+            name
+            for name, zero, _ in zeros
+            if name in N_CROSSING_MULTIPLIERS and is_within(zero, (left, right))
+        ]
+        for rank in find_unexplained_ranks(moduli[left], moduli[right], names):
+            rank_requests.append((left, right, rank_quantity_name(rank, rank + 1)))
+    if not rank_requests:
         return zeros
-    groups: list[list[Any]] = []
-    for zero in locate(alone):
-        if not is_zero(table, zero):
+    groups: list[list[Any]] = []  # of ranks that may cross at once
+    for zero in locate(rank_requests):
+        if not vanishes_at(table, zero, tolerances):
             continue
-        last = groups[-1][-1] if groups else zero
-        apart = abs(zero.fraction - last.fraction) > SAME_PLACE
-        if not groups or last.bracket[:2] != zero.bracket[:2] or apart:
+        last_zero = groups[-1][-1] if groups else zero
+        is_apart = abs(zero.fraction - last_zero.fraction) > tolerances.equal_location
+        if not groups or last_zero.bracket[:2] != zero.bracket[:2] or is_apart:
             groups.append([])
         groups[-1].append(zero)
-    span = lambda group: (int(group[0].bracket[2].split(":")[1]), len(group))
-    several = [
-        (*group[0].bracket[:2], name_ranks(span(group)[0], sum(span(group)))) for group in groups
-    ]
-    found = []
-    for group, mean in zip(groups, locate(several), strict=True):
-        first, count = span(group)
-        off = np.abs(mean.table[MODULI][0, first : first + count] - 1.0)
-        members = [(mean, range(first, first + count))]
-        if count > 1 and not np.max(off) <= SAME_MODULUS:
+    first_rank_of = lambda group: int(group[0].bracket[2].split(":")[1])
+    mean_requests = []
+    for group in groups:
+        name = rank_quantity_name(first_rank_of(group), first_rank_of(group) + len(group))
+        mean_requests.append((*group[0].bracket[:2], name))
+    multiple_zeros = []
+    for group, mean_zero in zip(groups, locate(mean_requests), strict=True):
+        first, count = first_rank_of(group), len(group)
+        distances = np.abs(mean_zero.table[MODULI_COLUMN][0, first : first + count] - 1.0)
+        members = [(mean_zero, range(first, first + count))]
+        if count > 1 and not np.max(distances) <= multiplier_tolerances.equal_moduli:
             members = [(zero, range(first + i, first + i + 1)) for i, zero in enumerate(group)]
         for zero, ranks in members:
-            slopes = share_slopes[list(zero.bracket[:2])]
-            kinds = kinds_of(
-                np.asarray(zero.point_beside.jacobian[0]), ranks, bool(slopes[0] * slopes[1] < 0.0)
+            left_rate, right_rate = fraction_rates[list(zero.bracket[:2])]
+            names_and_counts = classify_ranks(
+                np.asarray(zero.point_beside.jacobian[0]), ranks, bool(left_rate * right_rate < 0.0)
             )
-            found += [(kind, zero, count) for kind, count in kinds.items()]
-    spans = {zero.bracket[:2] for _, zero, _ in found}
-    is_missed = lambda name, zero: name in WEIGHTS and any(within(zero, span) for span in spans)
-    return [z for z in zeros if not is_missed(z[0], z[1])] + found
+            multiple_zeros += [(name, zero, n) for name, n in names_and_counts.items()]
+    spans = {zero.bracket[:2] for _, zero, _ in multiple_zeros}
+    is_replaced = lambda name, zero: (
+        name in N_CROSSING_MULTIPLIERS and any(is_within(zero, span) for span in spans)
+    )
+    return [zero for zero in zeros if not is_replaced(zero[0], zero[1])] + multiple_zeros

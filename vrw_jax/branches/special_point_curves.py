@@ -35,32 +35,31 @@ def continue_special_point(
     options: ArclengthOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> SpecialPointCurve:
-    """Return the curve of the special point `name` over two parameters, starting nearest to a gait
-    of one step.
+    """Return the curve of the special point `name` over two parameters, near a gait of one step.
 
     `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
-    "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point is
-    searched for along the first parameter from the gait, then along the second. It is continued
+    as "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point
+    is searched for along the first parameter from the gait, then along the second. It is continued
     within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_BOUNDS`, through
     turning points. The curve ends when it closes or leaves the bounds, or when the gaits end. Each
-    point is accurate to 1e-9. `codim2_points` are the points where other special points occur. On
-    the curve of an indicator these are other indicators and bifurcations, on other curves margins
-    too.
+    point is accurate to 1e-9. `codim2_points` are the points at which other special points occur.
+    On the curve of an indicator these are other indicators and bifurcations, on other curves also
+    margins.
 
     Args:
-        name: of the special point.
+        name: name of the special point.
         parameters: names of the two parameters.
         cycle: the gait near which the search starts.
-        bounds: of the parameters, by name.
+        bounds: bounds of the parameters, by name.
         options: `ArclengthOptions` of the curve.
-        step_options: of the steps that evaluate margins.
+        step_options: options of the steps that evaluate margins.
 
     Returns:
         A `SpecialPointCurve`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, or a special point that does not occur on the
-            branches.
+        TypeError, ValueError: if an argument is invalid, or if the special point does not occur on
+            the branches.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
@@ -75,10 +74,7 @@ def continue_special_point(
 
 
 def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """Return the two parameters and their ranges.
-
-    Raises: TypeError, ValueError: the parameters or bounds are invalid.
-    """
+    """Return the two parameters and their ranges; raise if they are invalid."""
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
     all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
     parameter_pair = check_names("parameters", parameters)

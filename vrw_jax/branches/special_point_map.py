@@ -1,12 +1,13 @@
 """Map of all special points of gaits over two parameters, with a check against a scan.
 
-If a quantity has different signs at neighboring samples of a scan, a curve of special points runs
-between them. If no traced curve does, branches through these samples find it.
+If a quantity has different signs at neighboring samples of a scan, there is a curve of special
+points between them. If it is not traced yet, it is found on branches through these samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -31,26 +32,36 @@ from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams
 
-MAX_MEETING_ROUNDS = 3
-"""Number of rounds in which special points met on the curves are continued in turn."""
 
-N_LINES = 5
-"""Number of parallel branches along each parameter on which a map starts."""
+@dataclass(frozen=True)
+class MapOptions:
+    """Numbers of the map; distances are in cells of the scan.
 
-MAX_EXPLAINED_DISTANCE, MIN_CHANGE_DISTANCE = 1.0, 5.0
-"""Distances in cells of the scan. The first is the largest one of a change of sign from a curve
-that explains it. The second is the smallest one between changes that are examined in the same
-round."""
+    - `n_lines`: number of parallel branches along each parameter on which the map starts;
+    - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
+    - `max_search_rounds`: largest number of rounds in which changes of sign are examined;
+    - `max_explained_distance`: largest distance of a change of sign from a curve that explains it;
+    - `min_change_distance`: smallest distance between changes that are examined.
+    """
 
-MAX_SEARCH_ROUNDS = 8
-"""Largest number of rounds in which changes of sign are examined."""
+    n_lines: int = 5
+    n_meeting_rounds: int = 3
+    max_search_rounds: int = 8
+    max_explained_distance: float = 1.0
+    min_change_distance: float = 5.0
 
-GAIT_CHANGE, STABILITY_CHANGE = "gait", "spectral_radius"
-"""Names of changes between a gait and none, and between a stable and an unstable gait."""
+
+MAP_OPTIONS = MapOptions()
+"""Options of all maps."""
+
+GAIT_CHANGE = "gait"
+"""Name of a change between a gait and none."""
+
+STABILITY_CHANGE = "spectral_radius"
+"""Name of a change between a stable and an unstable gait."""
 
 SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE)
-"""Measures of a scan that indicate special points, in addition to the margins that every scan
-has."""
+"""Measures of a scan that indicate special points, in addition to the margins of every scan."""
 
 EXPLAINING_CURVES: Mapping[str, tuple[str, ...]] = {
     GAIT_CHANGE: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
@@ -76,11 +87,12 @@ def trace_special_points(
     params: WheelParams,
     model: ViscoelasticWheel,
     on_stage: Callable[[str], None] | None = None,
+    options: MapOptions = MAP_OPTIONS,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[UnexplainedChange, ...]]:
-    """Return all curves of special points over the two parameters of a scan.
+    """Return all curves of special points over the parameters of a scan, and unexplained changes.
 
-    The scan contains `SPECIAL_POINT_MEASURES` and margins. Return also the changes between its
-    samples that no curve explains. `on_stage` is called with a description of each stage.
+    The scan contains `SPECIAL_POINT_MEASURES` and margins. A change between its samples is
+    unexplained if no curve is near it. `on_stage` is called with a description of each stage.
     """
     names = tuple(map(str, scan.outcome.dims))
     parameter_ranges = np.array(
@@ -94,87 +106,77 @@ def trace_special_points(
         StepOptions.tight(),
         on_stage,
     )
-    curves = _trace_all(tracer, find_seeds_on_middle_lines(tracer, params), [])
+    seeds = find_seeds_on_middle_lines(tracer, params, options)
+    curves = _trace_all(tracer, seeds, [], options)
     changes = find_sign_change_cells(scan, tracer.parameters)
     examined: list[UnexplainedChange] = []
     remaining_changes = lambda: find_unexplained_changes(
-        changes, [curve.curve for curve in curves], scan
+        changes, [curve.curve for curve in curves], scan, options
     )
-    for _ in range(MAX_SEARCH_ROUNDS):
-        new_changes = _thin_changes(remaining_changes(), examined)
+    for _ in range(options.max_search_rounds):
+        new_changes = _select_distant_changes(remaining_changes(), examined, options)
         if not new_changes:
             break
         examined += new_changes
-        curves = _trace_all(
-            tracer, _find_seeds_at_changes(tracer, params, scan, new_changes), curves
-        )
+        seeds = []
+        for axis in range(2):
+            wheels = []
+            for change in new_changes:
+                if change.axis == axis:
+                    indices = zip(tracer.parameters, change.sample, strict=True)
+                    values = {name: float(scan[name][i]) for name, i in indices}
+                    wheels.append(tracer.with_parameters(params, values))
+            seeds += _find_seeds_on_branches(tracer, axis, wheels, options.n_lines)
+        curves = _trace_all(tracer, seeds, curves, options)
     return tuple(curve.curve for curve in curves), tuple(remaining_changes())
 
 
 def _trace_all(
-    tracer: CurveTracer, seeds: list[CurveSeed], curves: list[TracedCurve]
+    tracer: CurveTracer, seeds: list[CurveSeed], curves: list[TracedCurve], options: MapOptions
 ) -> list[TracedCurve]:
-    """Return the known curves, the curves through the seeds, and the curves through special points
-    on these."""
-    for _ in range(MAX_MEETING_ROUNDS):
+    """Return the known curves, and those through the seeds and through special points on these."""
+    for _ in range(options.n_meeting_rounds):
         new_curves = tracer.trace_curves(seeds, curves)
         kept_curves = [
             curve
             for curve in curves
             if not any(tracer.is_same_curve(curve, new_curve) for new_curve in new_curves)
         ]
-        curves, seeds = (
-            [*kept_curves, *new_curves],
-            [seed for curve in new_curves for seed in curve.new_seeds],
-        )
+        curves = [*kept_curves, *new_curves]
+        seeds = [seed for curve in new_curves for seed in curve.new_seeds]
     return curves
 
 
-def find_seeds_on_middle_lines(tracer: CurveTracer, params: WheelParams) -> list[CurveSeed]:
-    """Return seeds on the branches through wheels on the middle lines of the box."""
-    seeds, midpoints = [], tracer.parameter_ranges.mean(1)
+def find_seeds_on_middle_lines(
+    tracer: CurveTracer, params: WheelParams, options: MapOptions = MAP_OPTIONS
+) -> list[CurveSeed]:
+    """Return seeds on the branches through wheels on the middle lines of both ranges."""
+    seeds, midpoints, n_lines = [], tracer.parameter_ranges.mean(1), options.n_lines
     for axis, name in enumerate(tracer.parameters):
         lower, upper = tracer.parameter_ranges[1 - axis]
-        line_values = lower + (np.arange(N_LINES) + 0.5) / N_LINES * (upper - lower)
+        line_values = lower + (np.arange(n_lines) + 0.5) / n_lines * (upper - lower)
         other_parameter = tracer.parameters[1 - axis]
         wheels = [
             tracer.with_parameters(params, {name: midpoints[axis], other_parameter: x})
             for x in line_values
         ]
-        seeds += _find_seeds_on_branches(tracer, axis, wheels)
+        seeds += _find_seeds_on_branches(tracer, axis, wheels, n_lines)
     return seeds
 
 
 def _find_seeds_on_branches(
-    tracer: CurveTracer, axis: int, wheels: list[WheelParams]
+    tracer: CurveTracer, axis: int, wheels: list[WheelParams], batch_size: int
 ) -> list[CurveSeed]:
-    """Return seeds on branches, always the same number side by side, so that they are compiled
-    once."""
+    """Return seeds on branches, which are continued in batches of one size and compiled once."""
     seeds = []
-    for group_start in range(0, len(wheels), N_LINES):
-        group = wheels[group_start : group_start + N_LINES]
-        padded_group = [*group, *group[-1:] * (N_LINES - len(group))]
+    for start in range(0, len(wheels), batch_size):
+        group = wheels[start : start + batch_size]
+        padded_group = [*group, *group[-1:] * (batch_size - len(group))]
         seeds += tracer.find_seeds(axis, jax.tree.map(lambda *x: jnp.stack(x), *padded_group))
     return seeds
 
 
-def _find_seeds_at_changes(
-    tracer: CurveTracer, params: WheelParams, scan: xr.Dataset, changes: Sequence[UnexplainedChange]
-) -> list[CurveSeed]:
-    """Return seeds on branches through the samples at which changes begin."""
-    seeds = []
-    for axis in range(2):
-        changes_on_axis = [change for change in changes if change.axis == axis]
-        sample_values = [{n: float(scan[n][i]) for n, i in zip(tracer.parameters, c.sample,
-            strict=True)}
-              for c in changes_on_axis]  # fmt: skip
-        seeds += _find_seeds_on_branches(
-            tracer, axis, [tracer.with_parameters(params, values) for values in sample_values]
-        )
-    return seeds
-
-
-def _signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
+def _select_signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
     """Return the quantities whose signs may change, over the two parameters."""
     quantities = {"lambda_4_plus": scan.lambda_4_plus.transpose(*dims).values}
     quantities[STABILITY_CHANGE] = 1.0 - scan[STABILITY_CHANGE].transpose(*dims).values
@@ -188,10 +190,13 @@ def _signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.
 
 
 def find_sign_change_cells(scan: xr.Dataset, dims: tuple[str, str]) -> list[UnexplainedChange]:
-    """Return the changes between all neighbors. Both samples, or none, must have double support."""
+    """Return the changes of sign between all neighboring samples.
+
+    Changes of measures count only if both samples, or none, have double support.
+    """
     outcome = scan.outcome.transpose(*dims).values
     is_found, is_coarse = outcome == Outcome.STEPPED, outcome == Outcome.MESH_TOO_COARSE
-    quantities, changes = _signed_quantities(scan, dims), []
+    quantities, changes = _select_signed_quantities(scan, dims), []
     quantities[GAIT_CHANGE] = np.where(is_found, 1.0, np.where(is_coarse, np.nan, -1.0))
     quantities[COARSE_MESH_NAME] = np.where(is_found, 1.0, np.where(is_coarse, -1.0, np.nan))
     for axis in range(2):
@@ -216,19 +221,20 @@ def find_sign_change_cells(scan: xr.Dataset, dims: tuple[str, str]) -> list[Unex
 
 
 def find_unexplained_changes(
-    changes: Sequence[UnexplainedChange], curves: Sequence[SpecialPointCurve], scan: xr.Dataset
+    changes: Sequence[UnexplainedChange],
+    curves: Sequence[SpecialPointCurve],
+    scan: xr.Dataset,
+    options: MapOptions = MAP_OPTIONS,
 ) -> list[UnexplainedChange]:
-    """Return the changes that are not near any curve that could explain them."""
+    """Return the changes that are near no curve that can explain them."""
     remaining = []
     for name in sorted({change.name for change in changes}):
         changes_of_name = [change for change in changes if change.name == name]
         explaining_curves = [
             curve for curve in curves if curve.name in EXPLAINING_CURVES.get(name, (name,))
         ]
-        change_cells, distances = (
-            np.array([change.cell_position for change in changes_of_name]),
-            np.full(len(changes_of_name), np.inf),
-        )
+        change_cells = np.array([change.cell_position for change in changes_of_name])
+        distances = np.full(len(changes_of_name), np.inf)
         for curve in explaining_curves:
             axes = zip(curve.values.T, curve.parameters, strict=True)
             curve_cells = [np.interp(v, scan[n].values, np.arange(scan.sizes[n])) for v, n in axes]
@@ -238,15 +244,17 @@ def find_unexplained_changes(
         remaining += [
             change
             for change, distance_to_curve in zip(changes_of_name, distances, strict=True)
-            if distance_to_curve > MAX_EXPLAINED_DISTANCE
+            if distance_to_curve > options.max_explained_distance
         ]
     return remaining
 
 
-def _thin_changes(
-    remaining: Sequence[UnexplainedChange], examined: Sequence[UnexplainedChange]
+def _select_distant_changes(
+    remaining: Sequence[UnexplainedChange],
+    examined: Sequence[UnexplainedChange],
+    options: MapOptions,
 ) -> list[UnexplainedChange]:
-    """Return changes of each name that are apart from each other and from those examined before."""
+    """Return changes of each name that are distant from each other and from the examined ones."""
     selected: list[UnexplainedChange] = []
     for change in remaining:
         similar = [
@@ -256,7 +264,7 @@ def _thin_changes(
         ]
         if all(
             np.hypot(*np.subtract(other_change.cell_position, change.cell_position))
-            > MIN_CHANGE_DISTANCE
+            > options.min_change_distance
             for other_change in similar
         ):
             selected.append(change)

@@ -6,6 +6,7 @@ from vrw_jax.continuation.arclength import (
     ArclengthOptions,
     ConstraintPlane,
     ContinuationPoint,
+    ContinuationResult,
     ContinuationStatus,
     FixedPointProblem,
     NewtonStep,
@@ -17,16 +18,18 @@ from vrw_jax.continuation.batched_continuation import (
     solve_many_on_planes,
     solve_on_plane,
 )
-from vrw_jax.continuation.crossings import ON_CIRCLE_TOLERANCE
 from vrw_jax.continuation.fixed_points import (
     FixedPointResult,
     solve_fixed_point,
     solve_fixed_point_implicit,
 )
-from vrw_jax.continuation.floquet import floquet_multipliers
+from vrw_jax.continuation.floquet import (
+    MULTIPLIER_TOLERANCES,
+    MultiplierTolerances,
+    floquet_multipliers,
+)
 from vrw_jax.continuation.sign_changes import (
     BIFURCATION_NAMES,
-    SMALLEST_ANGLE,
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,

@@ -48,7 +48,12 @@ class ArclengthOptions:
     - `max_points`: limit of points in each direction;
     - `max_newton_iterations`: limit of Newton's iterations for one point;
     - `tolerance`: limit of the norm of Newton's last correction;
-    - `max_turn_angle`: largest turn of the branch in one continuation step, rad.
+    - `max_turn_angle`: largest turn of the branch in one continuation step, rad;
+    - `kink_step_factor`: steps below this multiple of `min_ds` may pass a kink of the branch, at
+      any angle. It is chosen because three halvings then remain for failures of Newton's method
+      between two smooth pieces;
+    - `jacobian_reuse_fraction`: share of `tolerance` below which a correction converges without
+      another iteration. It is chosen because the Jacobian of the trial is then exact.
 
     Examples:
         >>> vrw.ArclengthOptions(max_ds=0.05).max_points
@@ -62,23 +67,20 @@ class ArclengthOptions:
     max_newton_iterations: int = 10
     tolerance: float = 1e-10
     max_turn_angle: float = 0.2
+    kink_step_factor: float = 8.0
+    jacobian_reuse_fraction: float = 1e-2
 
     def __post_init__(self) -> None:
-        for name in ("max_points", "max_newton_iterations"):
-            object.__setattr__(self, name, check_int(name, getattr(self, name)))
-        for name in ("initial_ds", "max_ds", "min_ds", "tolerance", "max_turn_angle"):
-            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        integer_names = ("max_points", "max_newton_iterations")
+        for name in self.__dataclass_fields__:
+            check = check_int if name in integer_names else check_positive
+            object.__setattr__(self, name, check(name, getattr(self, name)))
         if not self.min_ds <= self.initial_ds <= self.max_ds:
             raise ValueError(
                 f"the steps are {self.min_ds:g} (smallest), {self.initial_ds:g} (first) and "
                 f"{self.max_ds:g} (largest), but they must not fall in this order: "
                 "give min_ds <= initial_ds <= max_ds."
             )
-
-
-KINK_STEPS = 8.0
-"""Smallest steps below which a branch with kinks may turn at once; chosen because three halvings
-are then left for where Newton's method fails between the pieces."""
 
 
 class NewtonStep(NamedTuple):
@@ -90,44 +92,36 @@ class NewtonStep(NamedTuple):
 
 
 class AbstractContinuationProblem(eqx.Module):
-    """Base class of continuation problems; `args` is a pytree with all other inputs of the
-    equations.
-    """
+    """Base class of continuation problems; `args` is a pytree with all other inputs."""
 
     is_traceable: ClassVar[bool] = True
-    """Whether `linearize` can be compiled into a loop; otherwise it is called for many points at
-    once from outside of compiled code."""
+    """Whether `linearize` can be compiled into a loop. If not, it is called for a batch of points
+    from outside of compiled code."""
 
     has_multipliers: ClassVar[bool] = True
-    """Whether the Jacobians are those of the equations that are followed."""
+    """Whether the Jacobians are those of the equations that are continued."""
 
     has_kinks: ClassVar[bool] = False
-    """Whether a branch may have kinks, where its tangent jumps."""
+    """Whether a branch may have kinks, at which its tangent jumps."""
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
-        """Return correction, tangent and Jacobian; they are not finite where the map
-        is undefined.
-        """
+        """Return correction, tangent and Jacobian; not finite if the map is undefined there."""
 
     @abc.abstractmethod
     def section_state(self, z: Unknowns) -> SectionVector:
         """Return the section state, a part of z."""
 
     def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
-        """Return the initial guess of Newton's method at a fraction in [0, 1] between
-        two points.
-        """
+        """Return the guess of Newton's method at a fraction in [0, 1] between two points."""
         return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
 
     def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
-        """Whether the branch has no kink between two points, as far as these show."""
+        """Return whether the branch has no kink between two points, as far as they show it."""
         return jnp.asarray(True)
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
-        """Return the norm of a correction, its largest entry, which is compared with
-        the tolerance.
-        """
+        """Return the norm of a correction that is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
@@ -138,10 +132,10 @@ class AbstractContinuationProblem(eqx.Module):
 def fixed_point_newton_step(
     return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
 ) -> NewtonStep:
-    """Return the Newton step of `return_map(z, p)` = z, whose first `n_continuous` entries are
-    continuous.
+    """Return the Newton step of the equation `return_map(z, p)` = z.
 
-    The other entries are codes, which are copied from the image.
+    Its first `n_continuous` entries are continuous. The others are codes, which are copied from the
+    image.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
     image_point, jacobians = value_and_jacobian(continuous_map, z[:n_continuous], p)
@@ -157,7 +151,7 @@ def fixed_point_newton_step(
 class FixedPointProblem(AbstractContinuationProblem):
     """Fixed points of a map x -> `function(args, x, p)` that JAX differentiates in forward mode.
 
-    The map returns NaN where it is not defined.
+    The map returns NaN if it is not defined.
     """
 
     function: Callable[[Any, SectionVector, Scalar], SectionVector] = eqx.field(static=True)
@@ -193,9 +187,7 @@ class ContinuationPoint(NamedTuple):
 
 
 class ContinuationResult(NamedTuple):
-    """Points of one or more branches in buffers of `max_points`, of which the first `n_points` are
-    set.
-    """
+    """Points of branches in buffers of `max_points`, of which the first `n_points` are set."""
 
     points: ContinuationPoint
     n_points: Int[Array, " branches"]
@@ -204,9 +196,7 @@ class ContinuationResult(NamedTuple):
 
 
 class ConstraintPlane(NamedTuple):
-    """The condition that selects a point: the projection on the normal equals that of the given
-    point.
-    """
+    """Condition that selects a point of a branch: it lies on this plane through a given point."""
 
     section_state: SectionVector
     fraction: Scalar
@@ -239,7 +229,7 @@ def correct_point(
     z: Unknowns,
     fraction: Scalar,
 ) -> CorrectorState:
-    """Apply one Newton iteration to the branch's equations and the constraint plane together."""
+    """Apply one Newton iteration to the equations of the branch and of the constraint plane."""
     scale = bounds[1] - bounds[0]
     tangent = jax.tree.map(lambda section_state: scale * section_state, newton_step.tangent)
     section_state = problem.section_state(z) + problem.section_state(newton_step.correction)
@@ -261,6 +251,7 @@ def correct_point(
 
 
 def _fraction_from_parameter(p: Array, bounds: Array) -> Array:
+    """Return the parameter as a fraction of its range."""
     return (p - bounds[0]) / (bounds[1] - bounds[0])
 
 
@@ -271,6 +262,8 @@ def parameter_from_fraction(fraction: Array, bounds: Array) -> Array:
 
 
 class _TrialPoint(NamedTuple):
+    """Predicted point of a branch, with the plane on which Newton's method solves for it."""
+
     plane: ConstraintPlane
     z: Unknowns
     fraction: Scalar
@@ -286,17 +279,14 @@ def _predict_point(
     ds: Scalar,
     bounds: Array,
 ) -> _TrialPoint:
-    """Return the predicted point one step along the tangent, or on the end of the range if it is
-    nearer.
+    """Return the predicted point: one step along the tangent, or the nearer end of the range.
 
     With `has_two_points`, Newton's method starts on the cubic through the last two points and along
     their tangents. The cubic is nearer to the branch by two orders and saves one iteration of
     three.
     """
-    fraction, fraction_rate = (
-        _fraction_from_parameter(current_point.p, bounds),
-        current_point.fraction_rate,
-    )
+    fraction = _fraction_from_parameter(current_point.p, bounds)
+    fraction_rate = current_point.fraction_rate
     bound = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
     is_stationary = fraction_rate == 0.0
     bound_distance = jnp.where(
@@ -304,10 +294,8 @@ def _predict_point(
     )
     is_final = bound_distance <= ds
     length = jnp.where(is_final, bound_distance, ds)
-    section_tangent, section_state = (
-        problem.section_state(current_point.tangent),
-        problem.section_state(current_point.z),
-    )
+    section_tangent = problem.section_state(current_point.tangent)
+    section_state = problem.section_state(current_point.z)
     target_fraction = jnp.where(is_final, bound, fraction + length * fraction_rate)
     plane = ConstraintPlane(
         section_state + length * section_tangent,
@@ -320,9 +308,8 @@ def _predict_point(
         section_state - problem.section_state(previous_point.z), fraction - previous_fraction
     )
     has_two_points = has_two_points & problem.is_smooth_between(previous_point.z, current_point.z)
-    has_two_points = has_two_points & (
-        displacement @ displacement > (1e-9 * ds) ** 2
-    )  # after a kink both are one, to round-off
+    # After a kink the two points are equal but for round-off.
+    has_two_points = has_two_points & (displacement @ displacement > (1e-9 * ds) ** 2)
     chord = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
 
     def extrapolate(a: Array, da: Array, b: Array, db: Array) -> Array:
@@ -363,14 +350,12 @@ class ContinuationState(NamedTuple):
 
 
 class _TrialAssessment(NamedTuple):
-    """Assessment of a trial after one Newton iteration; if neither flag is set, the iteration goes
-    on.
-    """
+    """Assessment of a trial after one Newton iteration; without a flag the iteration continues."""
 
     is_accepted: Bool[Array, ""]
     has_failed: Bool[Array, ""]
-    is_kink: Bool[Array, ""]  # accepted, although the branch turns by more than a step may
-    fraction_rate: Scalar  # along the branch, the way it is followed
+    is_kink: Bool[Array, ""]  # accepted, although the branch turns by more than `max_turn_angle`
+    fraction_rate: Scalar  # in the direction of continuation
 
 
 def _assess_trial(
@@ -380,9 +365,7 @@ def _assess_trial(
     corrector: CorrectorState,
     direction: Scalar,
 ) -> _TrialAssessment:
-    """Return whether a trial is accepted or has failed, and the parameter's rate along
-    the branch.
-    """
+    """Return whether a trial is accepted or has failed, and the parameter's rate there."""
     current_point, trial, is_first = state.current_point, state.trial, state.n_points == 0
     distance = jnp.maximum(
         jnp.max(jnp.abs(problem.section_state(corrector.z) - trial.plane.section_state)),
@@ -397,8 +380,8 @@ def _assess_trial(
     alignment = jnp.where(is_first, direction, alignment)
     norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
     is_straight = is_first | (jnp.abs(alignment) >= norm * jnp.cos(options.max_turn_angle))
-    # No step is short enough for a kink: it is passed once the step is all but the shortest.
-    is_kink = is_converged & ~is_straight & (state.ds < KINK_STEPS * options.min_ds)
+    # A branch turns by more than the limit at a kink, however short the step is.
+    is_kink = is_converged & ~is_straight & (state.ds < options.kink_step_factor * options.min_ds)
     is_kink = is_kink & problem.has_kinks
     is_accepted = is_converged & (is_straight | is_kink)
     has_failed = ~is_accepted & (
@@ -414,17 +397,21 @@ def _is_doubtful(
     options: ArclengthOptions,
     state: ContinuationState,
     assessment: _TrialAssessment,
-    reached: ContinuationPoint,
+    new_point: ContinuationPoint,
 ) -> Bool[Array, ""]:
-    """Whether an accepted trial may lie on another branch, and a shorter step may show it."""
+    """Return whether an accepted trial may lie on another branch, which a shorter step may show."""
     if not problem.has_multipliers:
         return jnp.asarray(False)
-    turns_back = state.current_point.fraction_rate * reached.fraction_rate < 0.0
-    explained = is_accounted_for(state.current_point.jacobian, reached.jacobian, turns_back)
-    open_ = (
-        assessment.is_accepted & (state.n_points > 0) & ~state.doubt.is_over & reached.is_admissible
+    current_point = state.current_point
+    turns_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
+    is_explained = is_accounted_for(current_point.jacobian, new_point.jacobian, turns_back)
+    can_be_doubtful = (
+        assessment.is_accepted
+        & (state.n_points > 0)
+        & ~state.doubt.is_resolved
+        & new_point.is_admissible
     )
-    return open_ & ~explained
+    return can_be_doubtful & ~is_explained
 
 
 def _choose_next_ds(
@@ -449,14 +436,12 @@ def _is_curve_closed(
     next_point: ContinuationPoint,
     bounds: Array,
 ) -> Bool[Array, ""]:
-    """Return whether the segment from one point to the next passes over the branch's start."""
+    """Return whether the segment from one point to the next passes the branch's start."""
     coordinates_of = lambda point: jnp.append(
         problem.section_state(point.z), _fraction_from_parameter(point.p, bounds)
     )
-    chord, start_offset = (
-        coordinates_of(next_point) - coordinates_of(current_point),
-        coordinates_of(start) - coordinates_of(current_point),
-    )
+    chord = coordinates_of(next_point) - coordinates_of(current_point)
+    start_offset = coordinates_of(start) - coordinates_of(current_point)
     chord_squared = chord @ chord
     fraction = start_offset @ chord / jnp.where(chord_squared > 0.0, chord_squared, 1.0)
     deviation = start_offset - fraction * chord
@@ -472,7 +457,7 @@ def _update_status(
     next_length: Scalar,
     is_closed: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Whether and why it ends with the trial as judged; `ahead`: length of what follows."""
+    """Return the status after a trial; `next_length` is the length of the next step."""
     is_accepted, has_failed = assessment.is_accepted, assessment.has_failed
     n_points, status = state.n_points + is_accepted, state.status
     for has_occurred, code in (
@@ -498,6 +483,7 @@ def _init_branch(
     p: Scalar,
     direction: Scalar,
 ) -> ContinuationState:
+    """Return the initial state of one branch, whose first trial is the given point."""
     x = problem.section_state(z)
     n, dtype = x.shape[0], x.dtype
     zero, zero_count, false = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
@@ -514,11 +500,11 @@ def _init_branch(
 
 
 MAX_CONCURRENT_BRANCHES = 8
-"""Branches that are continued concurrently, chosen because they fill one group of lanes of machine
-code."""
+"""Number of branches that are continued concurrently, chosen because they fill one group of lanes
+of machine code."""
 
 BranchBatch = tuple[ContinuationState, ContinuationPoint]
-"""States of concurrent branches, and the buffers of points that they have reached."""
+"""States of concurrent branches, and the buffers of their points."""
 
 
 def init_branches(
@@ -539,7 +525,7 @@ def init_branches(
 
 
 def is_active(branches: BranchBatch) -> Array:
-    """Return which branches still run."""
+    """Return for each branch whether its continuation still runs."""
     return branches[0].status == int(ContinuationStatus.RUNNING)
 
 
@@ -555,7 +541,7 @@ def iterate_branches(
 ) -> BranchBatch:
     """Advance each branch by one linearization of its trial, and store the accepted points.
 
-    The branches own the rows `buffer_rows` of the buffers.
+    The points of the branches are stored in the rows `buffer_rows` of the buffers.
     """
 
     def iterate_branch(
@@ -574,25 +560,22 @@ def iterate_branches(
         new_point = ContinuationPoint(
             corrector.z, p, tangent, assessment.fraction_rate, corrector.jacobian, is_admissible
         )
-        doubtful = _is_doubtful(problem, options, state, assessment, new_point)
+        is_doubtful = _is_doubtful(problem, options, state, assessment, new_point)
         assessment = assessment._replace(
-            is_accepted=assessment.is_accepted & ~doubtful,
-            has_failed=assessment.has_failed | doubtful,
+            is_accepted=assessment.is_accepted & ~is_doubtful,
+            has_failed=assessment.has_failed | is_doubtful,
         )
         current_point = tree_where(assessment.is_accepted, new_point, state.current_point)
         first_point = tree_where(
             assessment.is_accepted & (state.n_points == 0), new_point, state.first_point
         )
-        previous_point = tree_where(
-            assessment.is_kink, new_point, state.current_point
-        )  # none that a cubic could lead from
+        # The cubic of the prediction must not cross a kink.
+        previous_point = tree_where(assessment.is_kink, new_point, state.current_point)
         previous_point = tree_where(assessment.is_accepted, previous_point, state.previous_point)
         n_points = state.n_points + assessment.is_accepted
-        ds, doubt = (
-            _choose_next_ds(options, state, assessment),
-            state.doubt.raised(doubtful, state.ds),
-        )
-        doubt, ds = doubt.resolved(assessment.is_accepted, ds, options.min_ds)
+        ds = _choose_next_ds(options, state, assessment)
+        doubt = state.doubt.record_trial(is_doubtful, state.ds)
+        doubt, ds = doubt.resolve(assessment.is_accepted, ds, options.min_ds)
         next_trial = _predict_point(
             problem, previous_point, current_point, n_points > 1, ds, bounds
         )
@@ -644,10 +627,10 @@ def continue_from(
     """Continue the branches from the points near (z, p) in the given directions.
 
     The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
-    several with a leading axis, of which only those that are requested run. Each branch ends at the
-    end of the range, or with its first point that is not admissible, which is kept. Groups of
-    branches run concurrently with one linearization of each per iteration; when a branch ends, the
-    next one starts.
+    several with a leading axis, of which only the requested ones run. Each branch ends at the end
+    of the range, or with its first point that is not admissible, which is kept. Groups of branches
+    run concurrently with one linearization of each per iteration. When a branch ends, the next one
+    starts.
     """
     if p.ndim == 0:
         add_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)

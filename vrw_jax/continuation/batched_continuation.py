@@ -1,7 +1,7 @@
 """Points of branches on constraint planes, and concurrent branches outside of compiled code.
 
-Where a map is machine code for many points together, nothing is traced: linearizations are called
-from outside of compiled code, and `arclength` performs the rest of each iteration.
+If a map is machine code for a batch of points, it is not traced: linearizations are called from
+outside of compiled code, and `arclength` performs the rest of each iteration.
 """
 
 import functools
@@ -33,12 +33,6 @@ from vrw_jax.continuation.arclength import (
 )
 from vrw_jax.numerics import take_rows, tree_where
 
-JACOBIAN_REUSE_FRACTION = 1e-2
-"""Fraction of the tolerance below which the last Jacobian is reused.
-
-It is chosen because after a correction this small, the Jacobian of the trial before it is exact.
-"""
-
 
 class PlaneSolveState(NamedTuple):
     """State of Newton's method for a point on a plane."""
@@ -50,11 +44,8 @@ class PlaneSolveState(NamedTuple):
 
 def init_plane_solve(z: Unknowns, plane: ConstraintPlane) -> PlaneSolveState:
     """Return the initial state of Newton's method on a plane."""
-    n_section, zero_tangent, zero_count = (
-        plane.section_state.shape[0],
-        jax.tree.map(jnp.zeros_like, z),
-        jnp.zeros((), jnp.int32),
-    )
+    n_section = plane.section_state.shape[0]
+    zero_tangent, zero_count = jax.tree.map(jnp.zeros_like, z), jnp.zeros((), jnp.int32)
     zero_jacobian = jnp.zeros((n_section, n_section), plane.section_state.dtype)
     initial_corrector = CorrectorState(
         z, plane.fraction, jnp.ones_like(plane.fraction), zero_tangent, zero_jacobian
@@ -89,9 +80,9 @@ def iterate_plane_solve(
     next_corrector = tree_where(is_valid, next_corrector, corrector)._replace(
         correction_norm=next_corrector.correction_norm
     )
-    n_counted = jnp.where(
-        next_corrector.correction_norm < JACOBIAN_REUSE_FRACTION * options.tolerance, 2, 1
-    )
+    # The last Jacobian is exact if the correction is negligible; then no other iteration follows.
+    negligible_correction = options.jacobian_reuse_fraction * options.tolerance
+    n_counted = jnp.where(next_corrector.correction_norm < negligible_correction, 2, 1)
     n_converged = jnp.where(
         next_corrector.correction_norm < options.tolerance, state.n_converged + n_counted, 0
     )
@@ -105,17 +96,15 @@ def finish_plane_solve(
     plane: ConstraintPlane,
     state: PlaneSolveState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """The point with its tangent, which leads the way that the plane's row points."""
+    """Return the point, and whether it converged; its rate is positive along the plane's normal."""
     corrector, p = state.corrector, parameter_from_fraction(state.corrector.fraction, bounds)
-    is_admissible, by_share = (
-        problem.is_admissible(args, corrector.z, p),
-        problem.section_state(corrector.tangent),
-    )
-    ahead = plane.normal_section @ by_share + plane.normal_fraction
-    slope = jnp.where(ahead >= 0.0, 1.0, -1.0) / jnp.sqrt(1.0 + by_share @ by_share)
-    return ContinuationPoint(
-        corrector.z, p, (), slope, corrector.jacobian, is_admissible
-    ), state.n_converged >= 1
+    is_admissible = problem.is_admissible(args, corrector.z, p)
+    section_tangent = problem.section_state(corrector.tangent)
+    alignment = plane.normal_section @ section_tangent + plane.normal_fraction
+    direction = jnp.where(alignment >= 0.0, 1.0, -1.0)
+    fraction_rate = direction / jnp.sqrt(1.0 + section_tangent @ section_tangent)
+    point = ContinuationPoint(corrector.z, p, (), fraction_rate, corrector.jacobian, is_admissible)
+    return point, state.n_converged >= 1
 
 
 @eqx.filter_jit
@@ -127,11 +116,11 @@ def solve_on_plane(
     plane: ConstraintPlane,
     bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Solve for the point of the branch on a plane, from z near it; return it and whether it
+    """Return the point of the branch on a plane, from z near it, and whether Newton's method
     converged.
 
-    Once converged, Newton's method takes one more iteration, unless its correction is negligible:
-    the Jacobian is then as exact as the point.
+    After convergence Newton's method takes one more iteration unless its correction is negligible.
+    The Jacobian is then as accurate as the point.
     """
 
     def iterate_once(state: PlaneSolveState) -> PlaneSolveState:
@@ -156,19 +145,17 @@ def continue_many_from(
     is_requested: Bool[Array, " branches"],
 ) -> ContinuationResult:
     """Continue branches as `arclength.continue_from` does, outside of compiled code."""
-    state, row_indices = (
-        init_branches(problem, options, z, p, bounds, directions, is_requested),
-        jnp.arange(len(p)),
-    )
-    while np.any(is_open := np.asarray(_is_active_jit(state))):
-        trial = state[0].trial
+    branches = init_branches(problem, options, z, p, bounds, directions, is_requested)
+    buffer_rows = jnp.arange(len(p))
+    while np.any(is_unfinished := np.asarray(_is_active_jit(branches))):
+        trial = branches[0].trial
         newton_steps = _linearize_selected(
-            problem, batch_args, bounds, trial.z, trial.fraction, is_open
+            problem, batch_args, bounds, trial.z, trial.fraction, is_unfinished
         )
-        state = _iterate_branches_jit(
-            problem, options, batch_args, bounds, directions, row_indices, state, newton_steps
+        branches = _iterate_branches_jit(
+            problem, options, batch_args, bounds, directions, buffer_rows, branches, newton_steps
         )
-    return to_continuation_result(state)
+    return to_continuation_result(branches)
 
 
 def _linearize_selected(
@@ -179,7 +166,7 @@ def _linearize_selected(
     fraction: Array,
     is_selected: Any,
 ) -> NewtonStep:
-    """Return the Newton steps of the selected branches; those of the others are NaN."""
+    """Return the Newton steps of the selected branches, and NaN for the others."""
     lower_bound, upper_bound = np.asarray(bounds)
     p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
     selected_steps = problem.linearize(*jax.device_put(take_rows((batch_args, z, p), is_selected)))
@@ -198,11 +185,11 @@ def solve_many_on_planes(
     planes: ConstraintPlane,
     bounds: Float[Array, "2"],
 ) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
-    """Solve for many points as `solve_on_plane` does; all arrays have a leading axis."""
+    """Return many points as `solve_on_plane` does; all arrays have a leading axis."""
     state = _init_plane_solves(z, planes)
-    while np.any(is_open := np.asarray(_needs_iteration_jit(options, state))):
+    while np.any(is_unfinished := np.asarray(_needs_iteration_jit(options, state))):
         newton_step = _linearize_selected(
-            problem, batch_args, bounds, state.corrector.z, state.corrector.fraction, is_open
+            problem, batch_args, bounds, state.corrector.z, state.corrector.fraction, is_unfinished
         )
         state = _iterate_plane_solves(problem, options, bounds, planes, state, newton_step)
     return _finish_plane_solves(problem, batch_args, bounds, planes, state)
@@ -216,10 +203,15 @@ _needs_iteration_jit: Any = eqx.filter_jit(needs_iteration)
 
 @eqx.filter_jit
 def _finish_plane_solves(
-    problem: AbstractContinuationProblem, batch_args: Any, bounds: Array, *of: Any
-) -> Any:
-    one = lambda args, plane, state: finish_plane_solve(problem, args, bounds, plane, state)
-    return jax.vmap(one)(batch_args, *of)
+    problem: AbstractContinuationProblem,
+    batch_args: Any,
+    bounds: Array,
+    planes: ConstraintPlane,
+    states: PlaneSolveState,
+) -> tuple[ContinuationPoint, Bool[Array, " many"]]:
+    """Return the points of many solves, and whether each converged."""
+    finish_one = lambda args, plane, state: finish_plane_solve(problem, args, bounds, plane, state)
+    return jax.vmap(finish_one)(batch_args, planes, states)
 
 
 @eqx.filter_jit
@@ -228,12 +220,15 @@ def _iterate_plane_solves(
     options: Any,
     bounds: Array,
     planes: ConstraintPlane,
-    *states_and_steps: Any,
+    states: PlaneSolveState,
+    newton_steps: NewtonStep,
 ) -> PlaneSolveState:
+    """Return the states of many solves after one iteration of those that need it."""
+
     def iterate_one(
         plane: ConstraintPlane, state: PlaneSolveState, newton_step: NewtonStep
     ) -> PlaneSolveState:
         next_state = iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
         return tree_where(needs_iteration(options, state), next_state, state)
 
-    return jax.vmap(iterate_one)(planes, *states_and_steps)
+    return jax.vmap(iterate_one)(planes, states, newton_steps)

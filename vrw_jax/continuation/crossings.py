@@ -1,8 +1,8 @@
-"""Whether the special points between two points of a branch account for their multipliers.
+"""Whether two neighboring points are on one branch, by their multipliers.
 
-A continuation may step over several special points at once, or onto another branch nearby. Either
-shows in the number of multipliers outside the unit circle, or in the sign of the determinant of
-Newton's equations along the branch, which changes at branch points alone.
+A continuation step may pass several special points, or reach another branch nearby. Both change the
+number of multipliers outside the unit circle, or the sign of the determinant of Newton's equations
+along the branch, which changes at branch points alone.
 """
 
 from typing import NamedTuple
@@ -13,65 +13,68 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.continuation.floquet import (
     MAX_CLOSED_FORM_SIZE,
+    MULTIPLIER_TOLERANCES,
+    MultiplierTolerances,
     bifurcation_margins,
     floquet_multipliers,
 )
 from vrw_jax.numerics import Scalar
 
-ON_CIRCLE_TOLERANCE = 1e-6
-"""Distance from modulus 1 within which a multiplier counts to either side; chosen because
-multipliers of maps that keep areas lie on the circle to their round-off, 1e-8 where two meet."""
-
 
 def is_accounted_for(
-    before: Float[Array, "n n"], after: Float[Array, "n n"], turns_back: Bool[Array, ""]
+    jacobian_before: Float[Array, "n n"],
+    jacobian_after: Float[Array, "n n"],
+    turns_back: Bool[Array, ""],
+    tolerances: MultiplierTolerances = MULTIPLIER_TOLERANCES,
 ) -> Bool[Array, ""]:
-    """Return whether folds, period doublings and pairs explain all that changes between two points.
+    """Return whether bifurcations explain the change of the multipliers between two points.
 
-    `before` and `after` are the Jacobians of the map there; `turns_back`: the parameter turns back
-    between them.
+    `turns_back` is whether the parameter turns back between the points.
     """
-    changes = bifurcation_margins(before) * bifurcation_margins(after) < 0.0
-    crosses_branch = changes[0] != turns_back
-    if before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
-        return ~crosses_branch  # eigenvalues of larger matrices are computed on CPUs alone
-    most = changes[0].astype(int) + changes[1] + (2 * changes[2] if len(changes) > 2 else 0)
-    (least_before, most_before), (least_after, most_after) = map(_count_outside, (before, after))
-    change = jnp.maximum(least_after - most_before, least_before - most_after)
-    return ~crosses_branch & (change <= most)
+    margins_before, margins_after = map(bifurcation_margins, (jacobian_before, jacobian_after))
+    has_sign_change = margins_before * margins_after < 0.0
+    crosses_branch = has_sign_change[0] != turns_back
+    if jacobian_before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
+        return ~crosses_branch  # Eigenvalues of larger matrices are computed on CPUs alone.
+    n_explained = has_sign_change[0].astype(int) + has_sign_change[1]
+    n_explained = n_explained + (2 * has_sign_change[2] if len(has_sign_change) > 2 else 0)
 
+    def count_outside(jacobian: Array) -> tuple[Array, Array]:
+        """Return the least and the largest number of multipliers outside the unit circle."""
+        moduli, tolerance = jnp.abs(floquet_multipliers(jacobian)), tolerances.on_circle
+        return jnp.sum(moduli > 1.0 + tolerance), jnp.sum(moduli > 1.0 - tolerance)
 
-def _count_outside(matrix: Float[Array, "n n"]) -> tuple[Array, Array]:
-    """Return the least and the largest number of multipliers that lie outside the unit circle."""
-    moduli = jnp.abs(floquet_multipliers(matrix))
-    return (
-        jnp.sum(moduli > 1.0 + ON_CIRCLE_TOLERANCE),
-        jnp.sum(moduli > 1.0 - ON_CIRCLE_TOLERANCE),
-    )
+    min_before, max_before = count_outside(jacobian_before)
+    min_after, max_after = count_outside(jacobian_after)
+    n_changed = jnp.maximum(min_after - max_before, min_before - max_after)
+    return ~crosses_branch & (n_changed <= n_explained)
 
 
 class Doubt(NamedTuple):
-    """Whether steps of a continuation are shortened because the last one may leave the branch.
+    """Doubt whether the last step of a continuation left the branch, which shortens the next ones.
 
-    - `step`: the first that was shortened, 0 if none is;
-    - `is_over`: no shorter step helped, and the next one counts whatever its multipliers.
+    - `step`: length of the first doubtful step, 0 if there is no doubt;
+    - `is_resolved`: whether no shorter step helped, so that the next step is accepted whatever its
+      multipliers are.
     """
 
     step: Scalar
-    is_over: Bool[Array, ""]
+    is_resolved: Bool[Array, ""]
 
-    def raised(self, doubtful: Bool[Array, ""], step: Scalar) -> "Doubt":
-        """Return the doubt after a trial of length `step` that was or was not doubtful."""
-        first = doubtful & (self.step == 0.0)
-        return self._replace(step=jnp.where(first, step, self.step))
+    def record_trial(self, is_doubtful: Bool[Array, ""], step: Scalar) -> "Doubt":
+        """Return the doubt after a trial of length `step`."""
+        is_first = is_doubtful & (self.step == 0.0)
+        return self._replace(step=jnp.where(is_first, step, self.step))
 
-    def resolved(
-        self, accepted: Bool[Array, ""], step: Scalar, smallest: float
+    def resolve(
+        self, is_accepted: Bool[Array, ""], step: Scalar, min_step: float
     ) -> tuple["Doubt", Scalar]:
-        """Return the doubt before the next trial and its length: of `step` if none is left."""
-        ends = (self.step > 0.0) & ~self.is_over & (step < smallest)
-        following = jnp.where(ends, self.step, step)
-        clear = accepted & (self.is_over | (following >= self.step))
-        return Doubt(
-            jnp.where(clear, 0.0, self.step), jnp.where(accepted, False, self.is_over | ends)
-        ), following
+        """Return the doubt before the next trial, and the length of its step.
+
+        The length is `step`, or that of the first doubtful step if `step` is too short.
+        """
+        is_too_short = (self.step > 0.0) & ~self.is_resolved & (step < min_step)
+        next_step = jnp.where(is_too_short, self.step, step)
+        has_passed = is_accepted & (self.is_resolved | (next_step >= self.step))
+        is_resolved = jnp.where(is_accepted, False, self.is_resolved | is_too_short)
+        return Doubt(jnp.where(has_passed, 0.0, self.step), is_resolved), next_step

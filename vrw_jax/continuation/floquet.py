@@ -2,11 +2,12 @@
 
 Matrices are Jacobians of a return map, shape (..., n, n) with n = 1, 2 or 3. For larger matrices,
 LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU.
-Eigenvalues are not differentiable where two of them meet; the Jury margins, polynomials of the
-matrix, are.
+Eigenvalues are not differentiable if two of them meet; the Jury margins, polynomials of the matrix,
+are.
 """
 
 import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -21,8 +22,33 @@ MAX_CLOSED_FORM_SIZE = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SMOOTH_MIN_SHARPNESS = 50.0
-"""Sharpness of the smooth minimum in `stability_margin`, which is at most
-log(4)/SMOOTH_MIN_SHARPNESS below the minimum."""
+"""Sharpness of the smooth minimum in `stability_margin`, chosen because it is then at most
+log(4)/50 below the minimum."""
+
+
+@dataclass(frozen=True)
+class MultiplierTolerances:
+    """Distances at which multipliers count as equal, real or on the unit circle.
+
+    - `on_circle`: distance from modulus 1 within which a multiplier counts to either side, chosen
+      because multipliers of maps that preserve areas are on the circle but for round-off, which is
+      1e-8 if two meet;
+    - `located_on_circle`: largest distance from modulus 1 of the pair of a located Neimark-Sacker
+      bifurcation;
+    - `min_imaginary`: imaginary part below which multipliers on the unit circle count as real,
+      chosen because three equal real ones are computed with imaginary parts of 1e-5;
+    - `equal_moduli`: distance between moduli of ranks that cross the circle at once, chosen as
+      `on_circle`.
+    """
+
+    on_circle: float = 1e-6
+    located_on_circle: float = 1e-4
+    min_imaginary: float = 1e-3
+    equal_moduli: float = 1e-6
+
+
+MULTIPLIER_TOLERANCES = MultiplierTolerances()
+"""Tolerances of all continuations."""
 
 
 def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
@@ -48,15 +74,13 @@ def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
 
 
 def _safe_sqrt(x: Array) -> Array:
-    """Return the square root of max(x, 0), with derivative zero where x <= 0."""
+    """Return the square root of max(x, 0), with derivative zero if x <= 0."""
     is_positive = x > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 class _EigenvaluePair(NamedTuple):
-    """Two eigenvalues: mean +- real_offset if they are real, otherwise mean +-
-    i imaginary_offset.
-    """
+    """Two eigenvalues: mean ± real_offset if they are real, else mean ± i imaginary_offset."""
 
     mean: Array
     real_offset: Array
@@ -64,7 +88,7 @@ class _EigenvaluePair(NamedTuple):
 
     @property
     def modulus(self) -> Array:
-        """Modulus of both eigenvalues if they are complex."""
+        """Return the modulus of both eigenvalues if they are complex."""
         return _safe_sqrt(self.mean * self.mean + self.imaginary_offset * self.imaginary_offset)
 
 
@@ -78,8 +102,8 @@ def _solve_quadratic(a0: Array, a1: Array) -> _EigenvaluePair:
 def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the others.
 
-    The root is found without derivative; then Newton's method makes it exact, including derivatives
-    to order 3.
+    The root is computed without derivative. Newton's method then makes it exact, with derivatives
+    up to order 3.
     """
     b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
     shift = -b2 / 3.0
@@ -87,10 +111,10 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     q = b0 + shift * (b1 + shift * (b2 + shift))
     discriminant = 0.25 * q * q + p * p * p / 27.0
     has_three_real_roots = discriminant < 0.0
-    # One real root: the sum of cube roots without cancellation.
+    # If there is one real root, it is the sum of cube roots without cancellation.
     larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant))
     one_root = larger - jnp.where(larger == 0.0, 0.0, p / (3.0 * jnp.where(larger == 0, 1, larger)))
-    # Three real roots: the extreme one on the side where it is isolated.
+    # If there are three real roots, it is the extreme one on the side where it is isolated.
     radius = 2.0 * _safe_sqrt(-p / 3.0)
     cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
     extreme = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
@@ -147,7 +171,7 @@ def _sort_by_modulus(values: Array) -> Array:
 def spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of an eigenvalue.
 
-    Where two eigenvalues meet, its derivative is one-sided or zero.
+    If two eigenvalues meet, its derivative is one-sided or zero.
     """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return jnp.abs(floquet_multipliers(matrix)[..., 0])
@@ -161,11 +185,10 @@ def spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
 
 @jax.jit
 def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
-    """Return polynomials of the matrix, all positive exactly if all multipliers are inside the
-    circle.
+    """Return polynomials of the matrix that are positive exactly if all multipliers are stable.
 
-    The first vanishes at a fold (multiplier 1), the second at a period doubling (-1), the third,
-    for n > 1, where a pair crosses the circle; for n = 3 the fourth completes the criterion.
+    The first vanishes at a fold (multiplier 1), the second at a period doubling (-1). The third,
+    for n > 1, vanishes if a pair crosses the circle. For n = 3 the fourth completes the criterion.
     """
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
@@ -199,8 +222,9 @@ def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
 
 @jax.jit
 def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
-    """Return a smooth minimum of the Jury margins, never above the smallest: positive
-    means stable.
+    """Return a smooth minimum of the Jury margins, which is never above the smallest one.
+
+    A positive value means stable.
     """
     margins = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
     lowest = lax.stop_gradient(jnp.min(margins, -1))
@@ -210,11 +234,10 @@ def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
 
 @jax.jit
 def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
-    """Return whether the two largest moduli agree to `tolerance`: the spectral radius has a kink
-    there.
+    """Return whether the two largest moduli agree within `tolerance`.
 
-    The moduli of a complex pair always agree and are smooth; the pair counts only where it is about
-    to become real.
+    The spectral radius has a kink there. The moduli of a complex pair always agree and are smooth,
+    so that a pair counts only if it is about to become real.
     """
     isolated_values, pair = _split_eigenvalues(matrix)
     if pair is None:

@@ -44,16 +44,14 @@ class AbstractTestFunction(eqx.Module):
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: Unknowns, p: ParameterPair) -> TestFunctionNewtonStep:
-        """Return all that one iteration needs; it is not finite where the map is undefined."""
+        """Return the Newton step; it is not finite if the map is undefined there."""
 
     @abc.abstractmethod
     def section_state(self, z: Unknowns) -> SectionVector:
         """Return the section state, a part of z."""
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
-        """Return the norm of a correction, its largest entry, which is compared with
-        the tolerance.
-        """
+        """Return the norm of a correction that is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: Unknowns, p: ParameterPair) -> Bool[Array, ""]:
@@ -69,10 +67,10 @@ class TestFunctionPoint(NamedTuple):
 
 
 class TestFunctionCurve(AbstractContinuationProblem):
-    """The curve on which a test function is zero, along the first of its parameters.
+    """Curve on which a test function is zero, continued along the first of its parameters.
 
-    Lengths along it include the second parameter as a fraction of its range, which it must not
-    leave.
+    Lengths along it include the second parameter as a fraction of its range. The curve ends if this
+    fraction leaves [0, 1].
     """
 
     test_function: AbstractTestFunction
@@ -90,23 +88,18 @@ class TestFunctionCurve(AbstractContinuationProblem):
         newton_step = self.test_function.linearize(
             args, z.z, jnp.stack([p, self.second_parameter(z)])
         )
-        derivative_first, derivative_fraction = (
-            newton_step.parameter_gradient[0],
-            scale * newton_step.parameter_gradient[1],
-        )
-        fraction_change, fraction_tangent = (
-            -newton_step.value / derivative_fraction,
-            -derivative_first / derivative_fraction,
-        )
+        derivative_first = newton_step.parameter_gradient[0]
+        derivative_fraction = scale * newton_step.parameter_gradient[1]
+        fraction_change = -newton_step.value / derivative_fraction
+        fraction_tangent = -derivative_first / derivative_fraction
         first_tangent, second_tangent = newton_step.tangents
         add_second = lambda change: lambda a, b: a + scale * change * b
         correction = jax.tree.map(
             add_second(fraction_change), newton_step.correction, second_tangent
         )
         tangent = jax.tree.map(add_second(fraction_tangent), first_tangent, second_tangent)
-        jacobian = jnp.pad(
-            newton_step.jacobian, (0, 1)
-        )  # a zero multiplier for the fraction has no effect
+        # The fraction gets a zero multiplier, which has no effect.
+        jacobian = jnp.pad(newton_step.jacobian, (0, 1))
         return NewtonStep(
             TestFunctionPoint(correction, fraction_change),
             TestFunctionPoint(tangent, fraction_tangent),
@@ -131,8 +124,8 @@ class TestFunctionCurve(AbstractContinuationProblem):
 FOLD_MARGIN_OFFSET = 1e-6
 """Value of the fold's margin on the curve that represents the fold.
 
-It is chosen because the equations are singular at the fold itself. The parameters turn at the fold
-and are wrong by the square of this value.
+It is chosen above zero because the equations are singular at the fold itself. The parameters turn
+at the fold, so their error is the square of this value.
 """
 
 
