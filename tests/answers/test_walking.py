@@ -6,13 +6,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
-from vrw_jax.tolerance.settling import (
-    MAX_LEAPS,
-    REST_DRIFT,
-    STEPS_PER_LEAP,
-    WARMUP_STEPS,
-    walk_until_settled,
-)
+from vrw_jax.tolerance.settling import LEAP_OPTIONS, walk_until_settled
 
 
 def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float] = (0.0, 0.0)):
@@ -33,8 +27,10 @@ def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float
 def test_a_walk_that_drifts_for_a_thousand_steps_settles_in_ninety():
     walk = walk_scalar_map(lambda x: 0.3 + 0.995 * (x - 0.3), 1.3)
     assert walk.is_settled[0]
-    assert abs(walk.section_states[0, 0] - 0.3) < REST_DRIFT  # the map's fixed point
-    assert walk.n_steps[0] <= WARMUP_STEPS + MAX_LEAPS * STEPS_PER_LEAP
+    fixed_point = 0.3
+    assert abs(walk.section_states[0, 0] - fixed_point) < LEAP_OPTIONS.settled_drift
+    max_steps = LEAP_OPTIONS.n_warmup_steps + LEAP_OPTIONS.max_leaps * LEAP_OPTIONS.steps_per_leap
+    assert walk.n_steps[0] <= max_steps
 
 
 def test_divergent_and_alternating_walks_never_settle():

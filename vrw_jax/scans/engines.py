@@ -35,7 +35,7 @@ from vrw_jax.scans.collocation_engine import (
 )
 from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
 from vrw_jax.selection import ModelCode, find_selection_reason
-from vrw_jax.tolerance import RIGID_MODEL_INDEX, measure_to_tolerance
+from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
 SAMPLES_PER_TASK = 512
@@ -204,7 +204,7 @@ class ToleranceEngine:
             error_variable_name(name): measured.errors[:, i]
             for i, name in enumerate(self._measures)
         }
-        rung = np.maximum(measured.models - RIGID_MODEL_INDEX, 0).astype(np.int8)
+        rung = np.maximum(measured.models - ModelIndex.RIGID, 0).astype(np.int8)
         return mask_failures(measured.outcomes, results | {"rung": rung})
 
 

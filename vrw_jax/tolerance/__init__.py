@@ -1,6 +1,6 @@
 """Measures to a given tolerance by the cheapest model, and multifidelity means."""
 
-from vrw_jax.tolerance.lower_fidelity import RIGID_MODEL_INDEX
+from vrw_jax.tolerance.lower_fidelity import ModelIndex
 from vrw_jax.tolerance.measure_result import MeasureResult
 from vrw_jax.tolerance.multifidelity import MultifidelityMean, multifidelity_mean
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS

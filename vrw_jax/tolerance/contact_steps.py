@@ -1,4 +1,4 @@
-"""Steps of the highest model, unilateral contact, in batches and without derivatives."""
+"""Batched steps with unilateral contact, without derivatives."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -17,17 +17,29 @@ from vrw_jax.contact import (
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
-TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE = 1e-10, 1e-12
-"""Tolerances of steps. Looser ones save a seventh of the time but miss events; the tighter one
-costs a third more."""
-WALK_TOLERANCE = 3e-6
-"""Tolerance of walks by Tsit5, whose steps cost a quarter. At 1e-5, three gaits in 118 are
-missed."""
-COMPARISON_TOLERANCES = {
-    TIGHT_TOLERANCE: (VERY_TIGHT_TOLERANCE, 1e-11, 3e-11),
-    VERY_TIGHT_TOLERANCE: (1e-13, 3e-12, 1e-11),
-}
-"""Other tolerances for comparison if feet may dip."""
+
+@dataclasses.dataclass(frozen=True)
+class StepTolerances:
+    """Tolerances of steps with unilateral contact.
+
+    - `tight`: tolerance of most steps, chosen because looser ones save a seventh of the time but
+      miss events;
+    - `very_tight`: tolerance for measures with a small error, which costs a third more;
+    - `walk`: tolerance of walks by Tsit5, whose steps cost a quarter. It is chosen because at 1e-5
+      three gaits in 118 are missed;
+    - `tight_comparisons`, `very_tight_comparisons`: other tolerances, with which steps are compared
+      if feet may dip.
+    """
+
+    tight: float = 1e-10
+    very_tight: float = 1e-12
+    walk: float = 3e-6
+    tight_comparisons: tuple[float, ...] = (1e-12, 1e-11, 3e-11)
+    very_tight_comparisons: tuple[float, ...] = (1e-13, 3e-12, 1e-11)
+
+
+STEP_TOLERANCES = StepTolerances()
+"""Tolerances of all measures."""
 
 
 class StepQuantities(NamedTuple):
@@ -46,11 +58,13 @@ class GroundBatch:
     n_legs: int  # number of legs
     model: UnilateralWheel
     options: StepOptions
+    tolerances: StepTolerances = STEP_TOLERANCES
 
     @classmethod
     def from_params(
         cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: StepOptions
     ) -> "GroundBatch":
+        """Return the batch of wheels with one axis on ground of this friction."""
         parameter_columns = [
             *(np.asarray(getattr(params, name)) for name in PARAMETER_NAMES),
             friction,
@@ -61,8 +75,10 @@ class GroundBatch:
     def embed_states(
         self, indices: np.ndarray, section_states: np.ndarray, is_rigid: Any = False
     ) -> np.ndarray:
-        """Return full section states from the paper's, (elements, 3), with Leg 1 on its stopper
-        where `is_rigid`."""
+        """Return full section states from the paper's, (elements, 3).
+
+        Leg 1 is on its stopper if `is_rigid`.
+        """
         full_states = np.array(
             embed_section_states(self.parameter_columns[:, indices], section_states, self.n_legs)
         )
@@ -82,21 +98,19 @@ class GroundBatch:
 
     def with_loose_steps(self) -> "GroundBatch":
         """Return the batch with steps for walks."""
-        return dataclasses.replace(
-            self, options=StepOptions(solver="Tsit5", rtol=WALK_TOLERANCE, atol=WALK_TOLERANCE)
-        )
+        tolerance = self.tolerances.walk
+        options = StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
+        return dataclasses.replace(self, options=options)
 
     def with_other_tolerances(self) -> list["GroundBatch"]:
         """Return the batch with steps at other tolerances."""
-        own_tolerance = (
-            VERY_TIGHT_TOLERANCE
-            if float(self.options.rtol) < 0.5 * TIGHT_TOLERANCE
-            else TIGHT_TOLERANCE
+        is_very_tight = float(self.options.rtol) < 0.5 * self.tolerances.tight
+        comparisons = (
+            self.tolerances.very_tight_comparisons
+            if is_very_tight
+            else self.tolerances.tight_comparisons
         )
-        options = [
-            StepOptions(rtol=tolerance, atol=tolerance)
-            for tolerance in COMPARISON_TOLERANCES[own_tolerance]
-        ]
+        options = [StepOptions(rtol=tolerance, atol=tolerance) for tolerance in comparisons]
         return [dataclasses.replace(self, options=step_options) for step_options in options]
 
     def min_dip_duration(self, indices: np.ndarray) -> np.ndarray:
@@ -106,8 +120,7 @@ class GroundBatch:
         return np.sqrt(8.0 * dip_depth / parameter("gravity"))[indices]
 
     def free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
-        """Return which numbers of section states are free for the given legs' codes, (elements, 4 +
-        2 n).
+        """Return for each number of section states whether it is free, (elements, 4 + 2 n).
 
         The other numbers are determined by them. The hub's rates follow from a sticking foot, Leg
         1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
@@ -123,23 +136,17 @@ class GroundBatch:
         return is_free
 
     def complete_states(self, section_states: np.ndarray) -> np.ndarray:
-        """Return section states with the numbers that follow from the free ones: see
-        `free_coordinates`."""
+        """Return section states with the numbers that the free ones determine.
+
+        See `free_coordinates`.
+        """
         n_legs, section_states = self.n_legs, section_states.copy()
-        theta, leg_1_code = (
-            section_states[:, 0],
-            np.round(section_states[:, 4 + 2 * n_legs]).astype(int),
-        )
+        theta, hub_rate = section_states[:, 0], section_states[:, 1]
+        leg_1_code = np.round(section_states[:, 4 + 2 * n_legs]).astype(int)
         foot_code = leg_1_code % LOCKED_CODE_OFFSET
-        height = section_states[:, 3 + n_legs] * np.cos(
-            theta - 2.0 * np.pi / n_legs
-        )  # of the hub, from the landing leg
-        sin, cos, hub_rate, leg_1_rate = (
-            np.sin(theta),
-            np.cos(theta),
-            section_states[:, 1],
-            section_states[:, 4 + n_legs],
-        )
+        # The landing leg determines the height of the hub.
+        height = section_states[:, 3 + n_legs] * np.cos(theta - 2.0 * np.pi / n_legs)
+        sin, cos, leg_1_rate = np.sin(theta), np.cos(theta), section_states[:, 4 + n_legs]
         section_states[:, 4] = np.where(
             (foot_code != 0) & (leg_1_code < LOCKED_CODE_OFFSET), height / cos, section_states[:, 4]
         )

@@ -1,6 +1,6 @@
-"""Gaits of the models below unilateral contact, with the matrices that propagate a defect to
-measures."""
+"""Gaits of the simpler models, with the matrices that propagate a defect to measures."""
 
+import enum
 from typing import NamedTuple
 
 import jax
@@ -15,7 +15,16 @@ from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
 from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.wheel import Outcome, WheelParams
 
-NO_MODEL, RIGID_MODEL_INDEX, PAPER_MODEL_INDEX, UNILATERAL_MODEL_INDEX = 0, 1, 2, 3
+
+class ModelIndex(enum.IntEnum):
+    """Index of the model of a gait, in the order of fidelity."""
+
+    NONE = 0
+    RIGID = 1
+    VISCOELASTIC = 2
+    UNILATERAL = 3
+
+
 MODEL_NAMES = (
     "none",
     *(entry.model_name for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)),
@@ -30,10 +39,9 @@ has another order of phases, walks lead 3 to a gait."""
 
 
 class LowerFidelityGait(NamedTuple):
-    """One gait of each element, in a model whose section state is the paper's; the batch axis comes
-    first."""
+    """One gait per element, of a model with the paper's section state; the batch axis is first."""
 
-    model_index: np.ndarray  # NO_MODEL if there is no gait
+    model_index: np.ndarray  # ModelIndex.NONE if there is no gait
     section_state: np.ndarray  # (elements, 3)
     quantities: np.ndarray  # (elements, 7): quantities of the step from it
     newton_matrix: np.ndarray  # (elements, 3, 3): (I - DP)^-1
@@ -45,7 +53,7 @@ class LowerFidelityGait(NamedTuple):
 def empty_gaits(n_elements: int) -> LowerFidelityGait:
     """Return empty gaits for a batch."""
     return LowerFidelityGait(
-        np.full(n_elements, NO_MODEL),
+        np.full(n_elements, ModelIndex.NONE),
         np.zeros((n_elements, 3)),
         np.zeros((n_elements, N_STEP_QUANTITIES)),
         np.zeros((n_elements, 3, 3)),
@@ -70,7 +78,7 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
     cycles = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
     section_states, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
     (missing,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
-    if len(missing):  # one mesh for all keeps digits independent of the batch
+    if len(missing):  # One mesh for all keeps digits independent of the batch.
         cycles = retry_from_walks(finder, *jax.device_put(take_rows((params, cycles), missing)))
         section_states[missing], outcome[missing] = cycles.section_state, cycles.outcome
     all_gaits = empty_gaits(len(section_states))
@@ -88,7 +96,9 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
     step_jacobian = jax.tree.map(np.asarray, step.derivatives[SECTION_STATE_NAME])
     end_states, durations = np.asarray(step.section_state), np.asarray(step.durations)
     has_stepped = np.asarray(step.outcome) == Outcome.STEPPED
-    foot_distance = _foot_distance_factor(found_params) / np.cos(end_states[:, 0])
+    # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
+    leg_span = np.asarray(found_params.locked_length) * np.sin(found_params.leg_angle)
+    foot_distance = leg_span / np.cos(end_states[:, 0])
     zeros = np.zeros(len(found_indices))
     quantities = np.column_stack(
         [durations[:, 0], durations[:, 1] + durations[:, 2], zeros, foot_distance, end_states]
@@ -100,7 +110,7 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
     rows = [dls_jacobian, sls1_jacobian + sls2_jacobian, 0.0 * dls_jacobian, length_jacobian]
     quantity_jacobian = np.concatenate([np.stack(rows, 1), step_jacobian.section_state], 1)
     gaits = _make_gaits(
-        PAPER_MODEL_INDEX,
+        ModelIndex.VISCOELASTIC,
         section_states[found_indices],
         end_states,
         quantities,
@@ -117,8 +127,7 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
 
 
 def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
-    """Return the rigid gaits in closed form: rolling with the classic landing, whose rear foot
-    leaves.
+    """Return the rigid gaits in closed form: the classic landing, in which the rear foot leaves.
 
     Stiff legs with unilateral contact approach this gait. The paper's landing, whose rear foot is
     held, has a gait half as fast again.
@@ -133,20 +142,14 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
         [np.stack([zero_row, duration_jacobian, zero_row, zero_row], 1), jacobian], 1
     )
     return _make_gaits(
-        RIGID_MODEL_INDEX, section_states, end_states, quantities, jacobian, quantity_jacobian
+        ModelIndex.RIGID, section_states, end_states, quantities, jacobian, quantity_jacobian
     )
 
 
 def static_contraction(params: WheelParams) -> np.ndarray:
-    """Return the static contraction of a leg over its length, which is the order of the rigid
-    model's error."""
+    """Return the relative static contraction of a leg, the order of the rigid model's error."""
     s = jax.tree.map(np.asarray, params.symbols())
     return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
-
-
-def _foot_distance_factor(params: WheelParams) -> np.ndarray:
-    """Return the distance between both feet at touchdown, times cos(theta-): L0 sin(alpha), m."""
-    return np.asarray(params.locked_length) * np.sin(params.leg_angle)
 
 
 def _make_gaits(
@@ -157,6 +160,7 @@ def _make_gaits(
     jacobian: np.ndarray,
     quantity_jacobian: np.ndarray,
 ) -> LowerFidelityGait:
+    """Return the gaits of one model from the states and derivatives of their steps."""
     with np.errstate(all="ignore"):
         newton_matrix = np.linalg.inv(np.eye(3) - jacobian)
     defect = np.einsum("ijk,ik->ij", newton_matrix, end_states - section_states)
@@ -174,6 +178,7 @@ def _make_gaits(
 
 @jax.jit
 def _rolling_gaits(params: WheelParams) -> tuple:
+    """Return states, length, duration and their Jacobians of the rigid gaits of a batch."""
     model, options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
     def rolling_gait(params: WheelParams) -> tuple:

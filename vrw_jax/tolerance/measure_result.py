@@ -1,4 +1,4 @@
-"""Result of a measure to within a tolerance, and how it prints itself."""
+"""Result of a measure to within a tolerance."""
 
 import math
 from typing import Any
@@ -78,6 +78,7 @@ class MeasureResult(AbstractPrintable):
     seconds: float = eqx.field(static=True)  # of the whole call, s
 
     def _by_name(self, values: np.ndarray) -> Any:
+        """Return the values by measure, or the values of the only measure."""
         values_by_name = {name: values[..., i] for i, name in enumerate(self.names)}
         if not self.models.ndim:
             values_by_name = {name: float(x) for name, x in values_by_name.items()}  # type: ignore[misc]
@@ -156,6 +157,7 @@ class MeasureResult(AbstractPrintable):
         ]
 
     def _format_measure(self, measure_index: int) -> str:
+        """Return a measure with its unit and errors as text."""
         measure = MEASURES[self.names[measure_index]]
         if not self.found:
             return f"no {measure.name}"
@@ -171,6 +173,7 @@ class MeasureResult(AbstractPrintable):
 
 
 def _explain(model_index: int, status: int, n_steps: int, outcome: int, n_gaits: int) -> str:
+    """Return the sentence about the selected model of one element."""
     meaning = MeasureStatus(int(status)).meaning
     if status == MeasureStatus.NO_GAIT:
         gaits_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
@@ -183,8 +186,7 @@ def _explain(model_index: int, status: int, n_steps: int, outcome: int, n_gaits:
 
 
 def _format_short(value: float) -> str:
-    """Format a value as one digit and a power of ten, or as a plain number of up to three
-    digits."""
+    """Return a value as one digit and a power of ten, or as a number of up to three digits."""
     if value == 0.0 or 0.1 <= abs(value) < 1e4:
         return f"{value:.3g}"
     digit, power = f"{value:.0e}".split("e")

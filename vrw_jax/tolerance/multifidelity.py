@@ -1,5 +1,4 @@
-"""Means over many wheels with unilateral contact, from few of its gaits and many of the lower
-model's.
+"""Means over many wheels with unilateral contact, with a lower model as a control variate.
 
 The lower model is a control variate. Its values are known for all wheels, and only the difference
 from unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
@@ -12,6 +11,7 @@ wheels.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.printing import AbstractPrintable, TextRow
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.tolerance.contact_steps import GroundBatch
-from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, find_paper_gaits
+from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, ModelIndex, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult
 from vrw_jax.tolerance.refinement import BroydenIteration
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
@@ -38,31 +38,55 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import WheelParams, convert_friction
 
-N_STANDARD_ERRORS = 2.0
-"""Number of standard errors in the stated error of a mean."""
-GAIT_ERROR_SHARE = 0.1
-"""Share of the mean's error that is allowed for each gait."""
-MIN_PILOT_GAITS = 8
-"""Smallest number of wheels with a gait for an estimate of the variance."""
-SINGULAR_VALUE_TOLERANCE = 1e-12
-"""Share of the largest singular value below which the pilot does not determine a direction."""
-CONTROL_NAMES = ("no control", "the paper's gaits", "the paper's gaits with one contact step")
-CONTROL_COSTS = (0.0, 1.0, 2.0)
-"""Cost of a control in steps with unilateral contact: in batches, the paper's gait costs as much as
-one step."""
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Numbers of the sampling of a mean.
+
+    - `n_standard_errors`: number of standard errors in the stated error of a mean;
+    - `gait_error_share`: share of the mean's error that is allowed for each gait;
+    - `min_pilot_gaits`: smallest number of wheels with a gait for an estimate of the variance;
+    - `singular_value_tolerance`: share of the largest singular value below which the pilot does not
+      determine a direction.
+    """
+
+    n_standard_errors: float = 2.0
+    gait_error_share: float = 0.1
+    min_pilot_gaits: int = 8
+    singular_value_tolerance: float = 1e-12
+
+
+SAMPLING_OPTIONS = SamplingOptions()
+"""Options of `vrw.multifidelity_mean`."""
+
+
+class _Control(NamedTuple):
+    """Control variate with its cost in steps with unilateral contact."""
+
+    name: str
+    cost: float
+
+
+CONTROLS = (
+    _Control("no control", 0.0),
+    _Control("the paper's gaits", 1.0),
+    _Control("the paper's gaits with one contact step", 2.0),
+)
+"""Control variates, of which the cheapest is used. In batches the paper's gait costs as much as one
+step."""
 
 
 class MultifidelityMean(AbstractPrintable):
     """Mean of a measure over wheels with unilateral contact.
 
-    - `measure`: its name;
-    - `value`: the mean, in the measure's unit;
-    - `error`: two of its standard errors, plus the mean error of the gaits;
+    - `measure`: name of the measure;
+    - `value`: mean, in the measure's unit;
+    - `error`: two standard errors of the mean, plus the mean error of the gaits;
     - `n_gaits`: number of sampled wheels with a gait with unilateral contact;
     - `n_high_fidelity`: number of wheels computed with unilateral contact, the pilot included;
-    - `control`: the control variate for the others, one of CONTROL_NAMES;
-    - `weight`: the weight of the control;
-    - `cost`: steps with unilateral contact, with the equivalent cost of the control included;
+    - `control`: name of the control variate for the others;
+    - `weight`: weight of the control;
+    - `cost`: number of steps with unilateral contact, including the equivalent cost of the control;
     - `cost_high_fidelity_only`: expected cost of a mean of the same error without a control.
 
     Examples:
@@ -106,8 +130,8 @@ class MultifidelityMean(AbstractPrintable):
 class _SamplingPlan(NamedTuple):
     """Sampling plan for a mean with one of the controls."""
 
-    expected_cost: float  # expected
-    n_wheels: int  # number of wheels to draw
+    expected_cost: float  # in steps with unilateral contact
+    n_wheels: int  # to draw
     weights: np.ndarray  # of the control's value, and of the flag that it has one
     control_index: int
 
@@ -125,8 +149,8 @@ def multifidelity_mean(
 ) -> MultifidelityMean:
     """Return the mean of a measure over these wheels with unilateral contact, to within `tol`.
 
-    Fields of `params` and `friction` have one axis, of wheels: a design, or draws from
-    manufacturing tolerances. Wheels without a gait with unilateral contact are left out.
+    Fields of `params` and `friction` have one axis of wheels, such as a design or samples of
+    manufacturing tolerances. Wheels without a gait with unilateral contact do not count.
 
     Args:
         measure: one of the measures of `measure_to_tolerance`.
@@ -134,14 +158,14 @@ def multifidelity_mean(
         tol: allowed error (two standard errors), in the measure's unit.
         friction: friction coefficient of the ground.
         pilot: number of wheels in the pilot sample.
-        seed: of the random sample.
-        stoppers: of the wheels, "bilateral" or "one-sided".
+        seed: seed of the random sample.
+        stoppers: stoppers of the wheels, "bilateral" or "one-sided".
 
     Returns:
         A `MultifidelityMean`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, or too few wheels with a gait.
+        TypeError, ValueError: if an argument is invalid, or if too few wheels have a gait.
 
     Examples:
         >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
@@ -155,10 +179,9 @@ def multifidelity_mean(
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     check_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    tol, pilot = (
-        check_positive("tol", tol),
-        check_int("pilot", pilot, MIN_PILOT_GAITS, ", to tell a spread"),
-    )
+    options, min_pilot_gaits = SAMPLING_OPTIONS, SAMPLING_OPTIONS.min_pilot_gaits
+    tol = check_positive("tol", tol)
+    pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
     params, mu, shape = check_batch(params, convert_friction(friction))
     n_wheels = len(mu)
@@ -170,24 +193,25 @@ def multifidelity_mean(
     wheels = _WheelSample(measure, params, mu, stoppers)
     permutation = np.random.default_rng(seed).permutation(n_wheels)
     pilot_indices, other_indices = permutation[:pilot], permutation[pilot:]
-    pilot_results = wheels.measure_wheels(pilot_indices, GAIT_ERROR_SHARE * tol)
+    gait_tol = options.gait_error_share * tol
+    pilot_results = wheels.measure_wheels(pilot_indices, gait_tol)
     is_found = pilot_results.found
-    if np.sum(is_found) < MIN_PILOT_GAITS:
+    if np.sum(is_found) < min_pilot_gaits:
         raise ValueError(
             f"{np.sum(is_found)} of the pilot's {pilot} wheels have a gait with contact, but a "
-            f"mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
+            f"mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
         )
     pilot_sample = _SampledMeasures.from_results(pilot_results)
     control_columns = [
         _control_columns(wheels.evaluate_control(pilot_indices, control))
-        for control in range(len(CONTROL_NAMES))
+        for control in range(len(CONTROLS))
     ]
     plans = [
-        _plan_sampling(i, pilot_sample, x, tol, len(other_indices))
+        _plan_sampling(i, pilot_sample, x, tol, len(other_indices), options)
         for i, x in enumerate(control_columns)
     ]
     plan = min(plans, key=lambda plan: plan.expected_cost)
-    drawn_results = wheels.measure_wheels(other_indices[: plan.n_wheels], GAIT_ERROR_SHARE * tol)
+    drawn_results = wheels.measure_wheels(other_indices[: plan.n_wheels], gait_tol)
     value, standard_error = _estimate_mean(
         plan,
         pilot_sample,
@@ -199,15 +223,15 @@ def multifidelity_mean(
     )
     return MultifidelityMean(
         value=value,
-        error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_errors)),
+        error=options.n_standard_errors * standard_error + float(np.mean(gait_errors)),
         n_gaits=float(len(gait_errors)),
         n_high_fidelity=float(pilot + plan.n_wheels),
         weight=float(plan.weights[0]),
         cost=float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
-        + CONTROL_COSTS[plan.control_index] * n_wheels,
+        + CONTROLS[plan.control_index].cost * n_wheels,
         cost_high_fidelity_only=pilot_sample.mean_cost * pilot + plans[0].expected_cost,
         measure=measure,
-        control=CONTROL_NAMES[plan.control_index],
+        control=CONTROLS[plan.control_index].name,
     )
 
 
@@ -220,6 +244,7 @@ class _SampledMeasures(NamedTuple):
 
     @classmethod
     def from_results(cls, results: MeasureResult) -> "_SampledMeasures":
+        """Return the measures of these results."""
         has_gait = results.found.astype(float)
         return cls(
             np.where(results.found, results.value, 0.0), has_gait, float(np.mean(results.n_steps))
@@ -235,6 +260,7 @@ class _WheelSample(NamedTuple):
     stoppers: str
 
     def take_wheels(self, indices: np.ndarray) -> WheelParams:
+        """Return some of the wheels."""
         return jax.device_put(take_rows(self.params, indices))
 
     def measure_wheels(self, indices: np.ndarray, tol: float) -> MeasureResult:
@@ -245,16 +271,16 @@ class _WheelSample(NamedTuple):
         )
 
     def evaluate_control(self, indices: np.ndarray, control_index: int) -> np.ndarray:
-        """Return the values of a control; NaN where it has none."""
+        """Return the values of a control, NaN for wheels without one."""
         control_values = np.full(len(indices), np.nan)
         if not control_index:
             return control_values
         options = StepOptions()
         lower_gaits = find_paper_gaits(self.take_wheels(indices), options)
-        (has_gait,) = np.nonzero(lower_gaits.model_index)
+        (has_gait,) = np.nonzero(lower_gaits.model_index != ModelIndex.NONE)
         lower_gaits = LowerFidelityGait(*(part[has_gait] for part in lower_gaits))
         values = evaluate_measures([self.measure_name], lower_gaits.quantities)[:, 0]
-        if control_index == len(CONTROL_NAMES) - 1:
+        if control_index == len(CONTROLS) - 1:
             gait_indices = indices[has_gait]
             ground = GroundBatch.from_params(
                 self.take_wheels(gait_indices), self.friction[gait_indices], self.stoppers, options
@@ -284,6 +310,7 @@ def _plan_sampling(
     control_columns: np.ndarray,
     tol: float,
     n_other: int,
+    options: SamplingOptions,
 ) -> _SamplingPlan:
     """Return weights and number of wheels from the pilot, for a mean to within `tol`.
 
@@ -296,20 +323,19 @@ def _plan_sampling(
     )
     centered_columns = control_columns - np.mean(control_columns, axis=0)
     weights, _, rank, _ = np.linalg.lstsq(
-        centered_columns, centered_values, rcond=SINGULAR_VALUE_TOLERANCE
+        centered_columns, centered_values, rcond=options.singular_value_tolerance
     )
     squares = float(np.sum((centered_values - centered_columns @ weights) ** 2)) + _unseen_variance(
         pilot_sample, centered_values
     )
     residual_variance = squares / (len(centered_values) - 1 - int(rank))
-    n_required = (
-        residual_variance * (N_STANDARD_ERRORS / ((1.0 - GAIT_ERROR_SHARE) * tol * gait_share)) ** 2
-    )
+    sampling_tol = (1.0 - options.gait_error_share) * tol
+    n_required = residual_variance * (options.n_standard_errors / (sampling_tol * gait_share)) ** 2
     n_wheels = min(
-        n_other, max(MIN_PILOT_GAITS, math.ceil(n_required / (1.0 + n_required / n_other)))
+        n_other, max(options.min_pilot_gaits, math.ceil(n_required / (1.0 + n_required / n_other)))
     )
     return _SamplingPlan(
-        n_wheels * pilot_sample.mean_cost + CONTROL_COSTS[control_index] * n_other,
+        n_wheels * pilot_sample.mean_cost + CONTROLS[control_index].cost * n_other,
         n_wheels,
         weights,
         control_index,
@@ -322,8 +348,10 @@ def _estimate_mean(
     drawn_sample: _SampledMeasures,
     control_columns: np.ndarray,
 ) -> tuple[float, float]:
-    """Return the mean and its standard error. `control_columns` are of all wheels but the pilot;
-    the first ones were drawn."""
+    """Return the mean and its standard error.
+
+    `control_columns` are of all wheels but the pilot's; the first ones are of the drawn wheels.
+    """
     n_wheels, control_values = len(control_columns), control_columns @ plan.weights
     gait_count = np.sum(pilot_sample.has_gait) + n_wheels * np.mean(drawn_sample.has_gait)
     differences = drawn_sample.values - control_values[: plan.n_wheels]

@@ -28,64 +28,91 @@ from vrw_jax.tolerance.step_quantities import (
 )
 from vrw_jax.wheel import Outcome
 
-REFRESH_ABOVE, MAX_TRUSTED_RATE, MIN_RATE = 0.5, 0.25, 0.1
-"""Contraction rates. Above the first, matrices are recomputed. Above the second, the rate is not
-trusted to bound the remaining error. The third is the smallest rate that is assumed. A slow
-direction is hidden behind quick ones: when corrections decreased by a third each, one gait was four
-times as far away as its bound."""
-CURVATURE_PER_LENGTH = 5.0
-"""Smallest assumed contraction rate over the length of a correction, a measure of the curvature of
-the maps."""
-MAX_CORRECTION = 1.0
-"""Longest accepted correction, rad, rad/s, m/s; beyond it the linearization is unknown."""
-MAX_FAILURES = 4
-"""Number of corrections that do not contract, or of changes of the legs' codes, before an element
-fails."""
-STEP_ERROR_PER_TOLERANCE = 30.0
-"""Error of a step over the tolerance of its solver steps; 99 of 100 are within a third of it."""
 ErrorGoal = Callable[[np.ndarray], np.ndarray]
-"""Allowed errors of measures with about these values, (elements, measures)."""
-MIN_UPDATE_SHARE = 1e-3
-"""Smallest share of a direction that must remain after a step for an update of the inverse."""
-DIFFERENCE_STEP = 1e-5
-"""Step of finite differences in a coordinate of the section state, rad, rad/s, m, m/s."""
-MAX_FD_DERIVATIVE = 10.0
-"""Derivative by differences above which they may cross a jump. Of 1,042 derivatives at gaits one in
-a hundred is steeper. Across a jump a correction gives no information about the remaining error."""
-MAX_ITERATIONS, REFRESH_INTERVAL = 24, 8
-"""Largest number of corrections of one iteration, and the number after which matrices are
-recomputed."""
-ROUNDOFF_LEVEL, STALL_LEVEL = 1e2, 1e4
-"""Lengths of corrections in tolerances: the level of the integrator's errors, and the level below
-which corrections may stall."""
-N_PRESUMED_DIPS = 3.0
-"""Number of shortest dips of a foot that a step may miss or add."""
-MAX_PRESUMED_SHARE = 0.1
-"""Largest share of the allowed error that is assumed for such dips; otherwise it is measured."""
-STALL_SAFETY_FACTOR = 6.0
-"""Safety factor of stalled corrections, relative to their own effect, and of the difference between
-steps at two tolerances. A factor of four was too small for 4 of 10,365 results."""
-MAX_GAIT_DISTANCE, MAX_WALK_DRIFT = 1e-3, 1e-3
-"""Largest distance of a gait from a walk's end without a second walk, and largest drift of that
-second walk, rad, rad/s, m, m/s."""
-MIN_RESOLVED_CHANGE = 1e-13
-"""Length below which a change is not resolved."""
+"""Function that returns the allowed errors of measures with about these values."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BroydenOptions:
+    """Numbers of the quasi-Newton iteration; section states are in rad, rad/s, m, m/s.
+
+    - `refresh_above`: contraction rate above which matrices are recomputed;
+    - `max_trusted_rate`: largest contraction rate that is trusted to bound the remaining error;
+    - `min_rate`: smallest contraction rate that is assumed. It is chosen because slow directions
+      are hidden behind quick ones: corrections of one gait decreased by a third each, and it was
+      four times as far away as its bound;
+    - `curvature_per_length`: smallest assumed contraction rate over the length of a correction,
+      which measures the curvature of the maps;
+    - `max_correction`: longest accepted correction, chosen because the linearization is unknown
+      beyond;
+    - `max_failures`: number of corrections that do not contract, or of changes of the legs' codes,
+      before an element fails;
+    - `max_iterations`: largest number of corrections;
+    - `refresh_interval`: number of corrections after which matrices are recomputed;
+    - `step_error_factor`: error of a step over the tolerance of its solver steps, chosen because 99
+      of 100 errors are within a third of it;
+    - `min_update_share`: smallest share of a direction that must remain after a step for an update
+      of the inverse;
+    - `difference_step`: step of finite differences in a coordinate of the section state;
+    - `max_difference`: derivative by differences above which these may cross a jump. It is chosen
+      because of 1,042 derivatives at gaits one in a hundred is steeper. Across a jump a correction
+      gives no information about the remaining error;
+    - `roundoff_level`, `stall_level`: lengths of corrections, in tolerances, at the level of the
+      integrator's errors, and below which corrections may stall;
+    - `n_presumed_dips`: number of shortest dips of a foot that a step may miss or add;
+    - `max_presumed_share`: largest share of the allowed error that is assumed for such dips;
+      otherwise their error is measured;
+    - `stall_safety_factor`: safety factor of stalled corrections, relative to their own effect, and
+      of the difference between steps at two tolerances. It is chosen because a factor of four was
+      too small for 4 of 10,365 results;
+    - `max_gait_distance`: largest distance of a gait from a walk's end without a second walk;
+    - `max_walk_drift`: largest drift of the second walk;
+    - `min_resolved_change`: length below which a change is not resolved.
+    """
+
+    refresh_above: float = 0.5
+    max_trusted_rate: float = 0.25
+    min_rate: float = 0.1
+    curvature_per_length: float = 5.0
+    max_correction: float = 1.0
+    max_failures: int = 4
+    max_iterations: int = 24
+    refresh_interval: int = 8
+    step_error_factor: float = 30.0
+    min_update_share: float = 1e-3
+    difference_step: float = 1e-5
+    max_difference: float = 10.0
+    roundoff_level: float = 1e2
+    stall_level: float = 1e4
+    n_presumed_dips: float = 3.0
+    max_presumed_share: float = 0.1
+    stall_safety_factor: float = 6.0
+    max_gait_distance: float = 1e-3
+    max_walk_drift: float = 1e-3
+    min_resolved_change: float = 1e-13
+
+
+BROYDEN_OPTIONS = BroydenOptions()
+"""Options of all measures."""
 
 
 class StepEstimate(NamedTuple):
-    """Estimate of a gait's measures from one step of the highest model; the batch axis comes
-    first."""
+    """Estimates of gaits' measures from one step of the highest model; the batch axis is first.
 
-    same_codes: np.ndarray  # whether the legs' codes are unchanged by the step
-    values: np.ndarray  # (elements, measures): estimated measures of the gait
-    correction_effect: (
-        np.ndarray
-    )  # (elements, measures): sum of the absolute effects of the correction
-    quantity_jacobian: (
-        np.ndarray
-    )  # (elements, measures, 7): derivatives with respect to the step's quantities
-    numerical_error: np.ndarray  # (elements, measures): bound of the integrator's error
-    dip_error: np.ndarray  # (elements, measures): bound of the error from unresolved short dips
+    - `same_codes`: whether the step does not change the legs' codes;
+    - `values`: estimated measures of the gait, (elements, measures), as are the errors below;
+    - `correction_effect`: sum of the absolute effects of the correction;
+    - `quantity_jacobian`: derivatives by the step's quantities, (elements, measures, 7);
+    - `numerical_error`: bound of the integrator's error;
+    - `dip_error`: bound of the error from unresolved short dips.
+    """
+
+    same_codes: np.ndarray
+    values: np.ndarray
+    correction_effect: np.ndarray
+    quantity_jacobian: np.ndarray
+    numerical_error: np.ndarray
+    dip_error: np.ndarray
 
 
 class RefinementResult(NamedTuple):
@@ -102,16 +129,14 @@ class RefinementResult(NamedTuple):
 
 @dataclasses.dataclass
 class BroydenIteration:
-    """Quasi-Newton iteration of a batch to a fixed point of the highest model, with Broyden
-    updates."""
+    """Quasi-Newton iteration of a batch to fixed points of the highest model."""
 
     ground: GroundBatch
+    options: BroydenOptions
     indices: np.ndarray
     section_states: np.ndarray
     newton_matrix: np.ndarray  # (elements, m, m): inverse of I - DP
-    quantity_jacobian: (
-        np.ndarray
-    )  # (elements, 7, m): derivatives of the quantities with respect to x
+    quantity_jacobian: np.ndarray  # (elements, 7, m): derivatives of the quantities by the state
     has_current_matrices: np.ndarray  # whether the matrices are those of this motion
     is_free: np.ndarray
     has_previous: np.ndarray  # whether the previous step had the same codes
@@ -125,14 +150,12 @@ class BroydenIteration:
         indices: np.ndarray,
         section_states: np.ndarray,
         lower_gaits: LowerFidelityGait | None,
+        options: BroydenOptions = BROYDEN_OPTIONS,
     ) -> "BroydenIteration":
-        """Start from `section_states`, with the matrices of the lower model's gaits if there are
-        any."""
+        """Return the iteration from states, with the matrices of lower gaits if they are given."""
         n_elements, n_numbers = len(indices), section_states.shape[1] - ground.n_legs
-        newton_matrix, quantity_jacobian = (
-            np.tile(np.eye(n_numbers), (n_elements, 1, 1)),
-            np.zeros((n_elements, N_STEP_QUANTITIES, n_numbers)),
-        )
+        newton_matrix = np.tile(np.eye(n_numbers), (n_elements, 1, 1))
+        quantity_jacobian = np.zeros((n_elements, N_STEP_QUANTITIES, n_numbers))
         if lower_gaits is not None:
             plane_indices = ground.plane_indices()
             newton_matrix[:, plane_indices[:, None], plane_indices] = lower_gaits.newton_matrix
@@ -142,34 +165,29 @@ class BroydenIteration:
             np.zeros((n_elements, n_numbers)),
             np.zeros((n_elements, N_STEP_QUANTITIES)),
         )
-        has_current_matrices, has_previous = (
-            np.full(n_elements, lower_gaits is not None),
-            np.zeros(n_elements, bool),
-        )
-        is_free = ground.free_coordinates(section_states)
         return cls(
             ground,
+            options,
             indices,
             section_states.copy(),
             newton_matrix,
             quantity_jacobian,
-            has_current_matrices,
-            is_free,
-            has_previous,
-            previous,
-            np.zeros((n_elements, n_numbers)),
+            has_current_matrices=np.full(n_elements, lower_gaits is not None),
+            is_free=ground.free_coordinates(section_states),
+            has_previous=np.zeros(n_elements, bool),
+            previous=previous,
+            correction=np.zeros((n_elements, n_numbers)),
         )
 
     def select(self, selected: np.ndarray) -> "BroydenIteration":
         """Return the iteration of the selected elements."""
-        ground, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return BroydenIteration(ground, *jax.tree.map(lambda x: x[selected], arrays))
+        ground, options, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return BroydenIteration(ground, options, *jax.tree.map(lambda x: x[selected], arrays))
 
     def observe(
         self, positions: np.ndarray, step: StepQuantities, names: Sequence[str]
     ) -> StepEstimate:
-        """Update the matrices from a step of some elements, and return the estimate of their
-        gaits."""
+        """Update the matrices from a step of some elements, and return estimates of their gaits."""
         n_numbers = self.is_free.shape[1]
         section_states, end_states = self.section_states[positions], step.section_states
         same_codes = self.has_same_codes(positions, step)
@@ -181,10 +199,8 @@ class BroydenIteration:
         self._update_matrices(
             positions, section_states[:, :n_numbers], defect, step.quantities, same_codes
         )
-        newton_matrix, quantity_jacobian = (
-            self.newton_matrix[positions],
-            self.quantity_jacobian[positions],
-        )
+        newton_matrix = self.newton_matrix[positions]
+        quantity_jacobian = self.quantity_jacobian[positions]
         correction = np.where(
             self.is_free[positions], np.einsum("ijk,ik->ij", newton_matrix, defect), 0.0
         )
@@ -198,14 +214,14 @@ class BroydenIteration:
             measure_jacobian = measure_derivatives(names, estimate)
             state_sensitivity = np.abs(measure_jacobian @ quantity_jacobian)
             correction_effect = np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction))
-            tolerance = STEP_ERROR_PER_TOLERANCE * float(self.ground.options.rtol)
+            tolerance = self.options.step_error_factor * float(self.ground.options.rtol)
             total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
                 state_sensitivity @ np.abs(newton_matrix), axis=-1
             )
             # A dip moves time from one duration to another.
             spread = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
             dip_error = (
-                N_PRESUMED_DIPS
+                self.options.n_presumed_dips
                 * self.ground.min_dip_duration(self.indices[positions])[:, None]
                 * spread
             )
@@ -233,17 +249,19 @@ class BroydenIteration:
         )
         state_change = np.where(self.is_free[positions], x - previous_x, 0.0)
         defect_change = previous_defect - defect
-        newton_matrix, quantity_jacobian = (
-            self.newton_matrix[positions],
-            self.quantity_jacobian[positions],
-        )
+        newton_matrix = self.newton_matrix[positions]
+        quantity_jacobian = self.quantity_jacobian[positions]
         squared_length = np.einsum("ij,ij->i", state_change, state_change)
         predicted_change = np.einsum("ijk,ik->ij", newton_matrix, defect_change)
         projection = np.einsum("ij,ij->i", state_change, predicted_change)
         can_update = (
-            self.has_previous[positions] & same_codes & (squared_length > MIN_RESOLVED_CHANGE**2)
+            self.has_previous[positions]
+            & same_codes
+            & (squared_length > self.options.min_resolved_change**2)
         )
-        is_well_conditioned = can_update & (np.abs(projection) > MIN_UPDATE_SHARE * squared_length)
+        is_well_conditioned = can_update & (
+            np.abs(projection) > self.options.min_update_share * squared_length
+        )
         update_row = (
             np.einsum("ij,ijk->ik", state_change, newton_matrix)
             / np.where(is_well_conditioned, projection, 1.0)[:, None]
@@ -281,8 +299,7 @@ class BroydenIteration:
     def dip_errors_by_comparison(
         self, positions: np.ndarray, names: Sequence[str], refinement: "RefinementResult"
     ) -> np.ndarray:
-        """Return numerical errors from steps at other tolerances, which replace the assumed error
-        of dips.
+        """Return numerical errors from steps at other tolerances, which include those of dips.
 
         At another tolerance the shortest resolved dips are shorter or longer. The error is infinite
         if one of these steps has another motion.
@@ -299,7 +316,7 @@ class BroydenIteration:
                 other_iteration.step_elements(np.arange(len(positions))),
                 names,
             )
-            difference_bound = STALL_SAFETY_FACTOR * np.abs(
+            difference_bound = self.options.stall_safety_factor * np.abs(
                 estimate.values - refinement.values[positions]
             )
             error = difference_bound + np.minimum(
@@ -311,10 +328,10 @@ class BroydenIteration:
         return worst_error
 
     def is_attracting(self) -> np.ndarray:
-        """Return whether nearby walks converge to the current states: no multiplier is outside the
-        unit circle.
+        """Return whether nearby walks converge to the current states.
 
-        Equivalently, no eigenvalue of (I - DP)^-1 has a real part below a half.
+        No multiplier is then outside the unit circle. Equivalently, no eigenvalue of (I - DP)^-1
+        has a real part below a half.
         """
         return np.linalg.eigvals(self.newton_matrix).real.min(-1) > 0.5
 
@@ -323,11 +340,14 @@ class BroydenIteration:
         return np.abs(self.section_states - section_states)[:, : self.is_free.shape[1]].max(-1)
 
     def stays_near(self, n_steps: int) -> np.ndarray:
-        """Return whether a walk stays at the current states, because finite differences across a
-        dip give wrong multipliers."""
+        """Return whether a walk stays at the current states.
+
+        It is a check of `is_attracting`, because finite differences across a dip give wrong
+        multipliers.
+        """
         end = self.ground.take_steps(self.indices, self.section_states, n_steps)
         return (end.outcome == Outcome.STEPPED) & (
-            self.distance_to(end.section_states) <= MAX_WALK_DRIFT
+            self.distance_to(end.section_states) <= self.options.max_walk_drift
         )
 
     def apply_correction(
@@ -357,7 +377,7 @@ class BroydenIteration:
         """Recompute both matrices by finite differences, one more step for each free coordinate.
 
         `step` is the one from the current states. Return the number of steps taken for each
-        element. A difference above MAX_FD_DERIVATIVE is also taken on the other side, and the
+        element. A difference above `max_difference` is also taken on the other side, and the
         smaller one is used.
         """
         n_numbers = self.is_free.shape[1]
@@ -365,36 +385,32 @@ class BroydenIteration:
         if not len(element_positions):
             return np.zeros(0, int)
         differences = self._finite_differences(
-            positions, step, element_positions, coordinate_indices, DIFFERENCE_STEP
+            positions, step, element_positions, coordinate_indices, self.options.difference_step
         )
-        steep_pairs = np.flatnonzero(np.abs(differences).max(-1) > MAX_FD_DERIVATIVE)
+        steep_pairs = np.flatnonzero(np.abs(differences).max(-1) > self.options.max_difference)
         if len(steep_pairs):
             reverse_differences = self._finite_differences(
                 positions,
                 step,
                 element_positions[steep_pairs],
                 coordinate_indices[steep_pairs],
-                -DIFFERENCE_STEP,
+                -self.options.difference_step,
             )
             is_smaller = np.abs(reverse_differences).max(-1) < np.abs(differences[steep_pairs]).max(
                 -1
             )
             differences[steep_pairs[is_smaller]] = reverse_differences[is_smaller]
-        jacobian, quantity_jacobian = (
-            np.zeros((len(positions), n_numbers, n_numbers)),
-            np.zeros((len(positions), N_STEP_QUANTITIES, n_numbers)),
-        )
+        jacobian = np.zeros((len(positions), n_numbers, n_numbers))
+        quantity_jacobian = np.zeros((len(positions), N_STEP_QUANTITIES, n_numbers))
         jacobian[element_positions, :, coordinate_indices] = np.where(
             self.is_free[positions][element_positions], differences[:, :n_numbers], 0.0
         )
         quantity_jacobian[element_positions, :, coordinate_indices] = differences[:, n_numbers:]
         newton_system = np.eye(n_numbers) - jacobian
-        is_singular = np.abs(np.linalg.det(newton_system)) < MIN_RESOLVED_CHANGE
+        is_singular = np.abs(np.linalg.det(newton_system)) < self.options.min_resolved_change
         newton_system[is_singular] = np.eye(n_numbers)
-        self.newton_matrix[positions], self.quantity_jacobian[positions] = (
-            np.linalg.inv(newton_system),
-            quantity_jacobian,
-        )
+        self.newton_matrix[positions] = np.linalg.inv(newton_system)
+        self.quantity_jacobian[positions] = quantity_jacobian
         self.has_previous[positions], self.has_current_matrices[positions] = False, True
         return np.bincount(
             np.concatenate([element_positions, element_positions[steep_pairs]]),
@@ -409,8 +425,7 @@ class BroydenIteration:
         coordinate_indices: np.ndarray,
         difference_step: float,
     ) -> np.ndarray:
-        """Return derivatives of section state and quantities, (pairs, m + 7), for changes of single
-        coordinates.
+        """Return derivatives of section state and quantities by single coordinates, (pairs, m + 7).
 
         A pair is an element position and a coordinate. The derivatives are zero if the step ends
         with other codes.
@@ -440,56 +455,59 @@ class BroydenIteration:
 class _ErrorBound:
     """Bounds of the remaining error from the measured contraction of each element's corrections."""
 
-    def __init__(self, n_elements: int, n_measures: int, tolerance: float) -> None:
-        self.tolerance = tolerance
-        self.correction_length, self.contraction_rate = (
-            np.full(n_elements, np.inf),
-            np.zeros(n_elements),
-        )
-        self.correction_effect, self.measures = (
-            np.full((n_elements, n_measures), np.inf),
-            np.full((n_elements, n_measures), np.nan),
-        )
+    def __init__(
+        self, n_elements: int, n_measures: int, tolerance: float, options: BroydenOptions
+    ) -> None:
+        self.tolerance, self.options = tolerance, options
+        self.correction_length = np.full(n_elements, np.inf)
+        self.contraction_rate = np.zeros(n_elements)
+        self.correction_effect = np.full((n_elements, n_measures), np.inf)
+        self.measures = np.full((n_elements, n_measures), np.nan)
 
     def reset(self, positions: np.ndarray, contraction_rate: float) -> None:
         """Reset these elements after their matrices have been replaced."""
-        self.correction_length[positions], self.contraction_rate[positions] = (
-            np.inf,
-            contraction_rate,
-        )
+        self.correction_length[positions] = np.inf
+        self.contraction_rate[positions] = contraction_rate
 
     def remaining_error(
         self, positions: np.ndarray, estimate: StepEstimate, correction_length: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Return the bound of the remaining error, (elements, measures), the contraction rates, and
-        which stall.
+        """Return the bound of the remaining error, the contraction rate, and whether it stalls.
 
-        Corrections stall if they stop decreasing and are as small as the integrator's errors allow.
+        The bound has the shape (elements, measures). Corrections stall if they stop decreasing and
+        are as small as the integrator's errors allow.
         """
+        options = self.options
         previous_length = self.correction_length[positions]
         with np.errstate(all="ignore"):
             rate = np.where(estimate.same_codes, correction_length / previous_length, np.inf)
             # With differences across a dip, shorter corrections change measures as much as before.
             effect_rate = np.max(
                 estimate.correction_effect
-                / np.maximum(self.correction_effect[positions], MIN_RESOLVED_CHANGE),
+                / np.maximum(self.correction_effect[positions], options.min_resolved_change),
                 axis=1,
             )
             is_stalled = (
                 estimate.same_codes
-                & (np.maximum(rate, effect_rate) > REFRESH_ABOVE)
+                & (np.maximum(rate, effect_rate) > options.refresh_above)
                 & np.isfinite(previous_length)
             )
             is_stalled &= (
-                np.maximum(correction_length, previous_length) <= STALL_LEVEL * self.tolerance
+                np.maximum(correction_length, previous_length)
+                <= options.stall_level * self.tolerance
             )
             rate = np.where(
-                estimate.same_codes & (correction_length <= ROUNDOFF_LEVEL * self.tolerance),
+                estimate.same_codes
+                & (correction_length <= options.roundoff_level * self.tolerance),
                 0.0,
                 rate,
             )
             # No rate is trusted before there is a previous correction.
-            min_rate = np.clip(CURVATURE_PER_LENGTH * previous_length, MIN_RATE, MAX_TRUSTED_RATE)
+            min_rate = np.clip(
+                options.curvature_per_length * previous_length,
+                options.min_rate,
+                options.max_trusted_rate,
+            )
             min_rate = np.where(np.isfinite(previous_length), min_rate, np.inf)
             worst_rate = np.maximum(np.maximum(rate, self.contraction_rate[positions]), min_rate)
             worst_rate = np.maximum(worst_rate, np.where(rate > 0.0, effect_rate, 0.0))
@@ -498,10 +516,12 @@ class _ErrorBound:
                 np.fmax(estimate.correction_effect, self.correction_effect[positions]), change
             )
             error_share = np.where(
-                worst_rate <= MAX_TRUSTED_RATE, 2.0 * worst_rate / (1.0 - worst_rate), np.inf
+                worst_rate <= options.max_trusted_rate,
+                2.0 * worst_rate / (1.0 - worst_rate),
+                np.inf,
             )
             error_share = np.where(
-                is_stalled, np.minimum(error_share, STALL_SAFETY_FACTOR), error_share
+                is_stalled, np.minimum(error_share, options.stall_safety_factor), error_share
             )
             remaining_error = np.nan_to_num(
                 error_share[:, None] * effect, nan=np.inf, posinf=np.inf
@@ -511,10 +531,8 @@ class _ErrorBound:
             has_previous, np.where(estimate.same_codes, rate, 0.0), self.contraction_rate[positions]
         )
         self.correction_length[positions] = np.where(estimate.same_codes, correction_length, np.inf)
-        self.correction_effect[positions], self.measures[positions] = (
-            estimate.correction_effect,
-            estimate.values,
-        )
+        self.correction_effect[positions] = estimate.correction_effect
+        self.measures[positions] = estimate.values
         return remaining_error, rate, is_stalled
 
 
@@ -525,7 +543,7 @@ def refine(
     n_steps_before_differences: int,
     first_step_and_estimate: tuple[StepQuantities, StepEstimate] | None = None,
 ) -> RefinementResult:
-    """Apply corrections until the remaining error is below the goal, at most MAX_ITERATIONS.
+    """Apply corrections until the remaining error is below the goal, and return the result.
 
     Finite differences replace the matrices after `n_steps_before_differences` steps, and
     immediately if the matrices are those of another motion. `first_step_and_estimate` is the step
@@ -541,14 +559,14 @@ def refine(
         iteration.section_states,
         np.full(n_elements, np.nan),
     )
-    error_bound = _ErrorBound(n_elements, n_measures, float(iteration.ground.options.rtol))
-    n_failures, n_steps_since_refresh, active = (
-        np.zeros(n_elements, int),
-        np.full(n_elements, REFRESH_INTERVAL - n_steps_before_differences),
-        np.arange(n_elements),
+    options, tolerance = iteration.options, float(iteration.ground.options.rtol)
+    error_bound = _ErrorBound(n_elements, n_measures, tolerance, options)
+    n_failures, active = np.zeros(n_elements, int), np.arange(n_elements)
+    n_steps_since_refresh = np.full(
+        n_elements, options.refresh_interval - n_steps_before_differences
     )
     needs_comparison = np.zeros(n_elements, bool)
-    for iteration_index in range(MAX_ITERATIONS):
+    for iteration_index in range(options.max_iterations):
         if not len(active):
             break
         if first_step_and_estimate is not None and iteration_index == 0:
@@ -557,7 +575,7 @@ def refine(
             step = iteration.step_elements(active)
             result.n_steps[active] += 1
             needs_refresh = iteration.has_same_codes(active, step) & (
-                (n_steps_since_refresh[active] >= REFRESH_INTERVAL)
+                (n_steps_since_refresh[active] >= options.refresh_interval)
                 | ~iteration.has_current_matrices[active]
             )
             positions = active[needs_refresh]
@@ -577,27 +595,26 @@ def refine(
             <= np.maximum(error_goals - estimate.numerical_error, estimate.numerical_error),
             axis=1,
         )
-        result.values[active], result.remaining_error[active], result.is_done[active] = (
-            estimate.values,
-            remaining_error,
-            is_done,
-        )
+        result.values[active], result.is_done[active] = estimate.values, is_done
+        result.remaining_error[active] = remaining_error
         result.numerical_error[active] = estimate.numerical_error + estimate.dip_error
         result.speed[active] = evaluate_measures(("speed",), step.quantities)[:, 0]
         # A walk may end at a gait whose feet dip more often than assumed.
         needs_comparison[active] = is_done & (
-            np.any(estimate.dip_error > MAX_PRESUMED_SHARE * error_goals, axis=1)
+            np.any(estimate.dip_error > options.max_presumed_share * error_goals, axis=1)
             | (n_steps_before_differences == 0)
         )
-        is_slow = np.isfinite(rate) & (rate > REFRESH_ABOVE)
+        is_slow = np.isfinite(rate) & (rate > options.refresh_above)
         n_failures[active] += ~estimate.same_codes | is_slow
         n_steps_since_refresh[active] = np.where(
-            is_slow, REFRESH_INTERVAL, n_steps_since_refresh[active] + 1
+            is_slow, options.refresh_interval, n_steps_since_refresh[active] + 1
         )
         continues = (
-            ~is_done & (step.outcome == Outcome.STEPPED) & (correction_length <= MAX_CORRECTION)
+            ~is_done
+            & (step.outcome == Outcome.STEPPED)
+            & (correction_length <= options.max_correction)
         )
-        continues &= n_failures[active] < MAX_FAILURES
+        continues &= n_failures[active] < options.max_failures
         iteration.apply_correction(
             active[continues], step.section_states[continues], estimate.same_codes[continues]
         )

@@ -7,6 +7,7 @@ Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the pre
 drift. The end of a walk is not a gait but the start of corrections by exact steps.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,20 +15,36 @@ import numpy as np
 from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
 from vrw_jax.wheel import Outcome
 
-WARMUP_STEPS, MAX_LEAPS, STEPS_PER_LEAP = 20, 10, 7
-"""Number of steps of a walk before the first leap, largest number of leaps, and number of steps
-after each. With five steps after a leap, three gaits in 118 are missed, among 451 wheels without a
-gait of the paper's model."""
-MAX_LEAP = 0.15
-"""Longest leap, rad, rad/s, m, m/s. Pairs of gaits that are closer to each other can be passed
-over."""
-GIVE_UP_FACTOR, GIVE_UP_LEAPS_LEFT = 2.0, 3
-"""A walk ends if its drift would fade beyond the first factor times the remaining leaps, and at
-most the second number of leaps is left. Earlier, drifts may grow for a while and yet fade."""
-REST_DRIFT = 5e-4
-"""Drift per step, and distance to its predicted limit, below which a walk has settled."""
-NOISE_DRIFT = 1e-5
-"""Drift at the level of the steps' own error."""
+
+@dataclass(frozen=True)
+class LeapOptions:
+    """Numbers of walks with leaps; states are in rad, rad/s, m, m/s.
+
+    - `n_warmup_steps`: number of steps before the first leap;
+    - `max_leaps`: largest number of leaps;
+    - `steps_per_leap`: number of steps after a leap, chosen because with five three gaits in 118
+      are missed, among 451 wheels without a gait of the paper's model;
+    - `max_leap`: longest leap, chosen because longer ones pass over pairs of close gaits;
+    - `give_up_factor`, `give_up_leaps_left`: a walk ends if its drift would fade beyond this factor
+      times the remaining leaps, and at most so many leaps are left. They are chosen because before
+      that a drift may grow for a while and yet fade;
+    - `settled_drift`: drift per step, and distance to its predicted limit, below which a walk has
+      settled;
+    - `noise_drift`: drift at the level of the steps' own error.
+    """
+
+    n_warmup_steps: int = 20
+    max_leaps: int = 10
+    steps_per_leap: int = 7
+    max_leap: float = 0.15
+    give_up_factor: float = 2.0
+    give_up_leaps_left: int = 3
+    settled_drift: float = 5e-4
+    noise_drift: float = 1e-5
+
+
+LEAP_OPTIONS = LeapOptions()
+"""Options of all walks."""
 
 
 class WalkEnd(NamedTuple):
@@ -40,14 +57,14 @@ class WalkEnd(NamedTuple):
 
 
 def walk_until_settled(
-    ground: GroundBatch, indices: np.ndarray, section_states: np.ndarray
+    ground: GroundBatch,
+    indices: np.ndarray,
+    section_states: np.ndarray,
+    options: LeapOptions = LEAP_OPTIONS,
 ) -> WalkEnd:
-    """Walk from section states until each walk settles or ends."""
-    n_elements, n_numbers, loose_ground = (
-        len(indices),
-        section_states.shape[1] - ground.n_legs,
-        ground.with_loose_steps(),
-    )
+    """Walk from section states until each walk settles or ends, and return the ends."""
+    n_elements, n_numbers = len(indices), section_states.shape[1] - ground.n_legs
+    loose_ground = ground.with_loose_steps()
     walk_end = WalkEnd(
         np.zeros(n_elements, bool),
         section_states.copy(),
@@ -55,20 +72,26 @@ def walk_until_settled(
         np.zeros(n_elements, int),
     )
     active, start = np.arange(n_elements), section_states
-    for round_index, n_steps in enumerate((WARMUP_STEPS, *MAX_LEAPS * (STEPS_PER_LEAP,))):
+    steps_of_rounds = (options.n_warmup_steps, *options.max_leaps * (options.steps_per_leap,))
+    for round_index, n_steps in enumerate(steps_of_rounds):
         if not len(active):
             break
         walk_end.n_steps[active] += n_steps
-        own_indices, current_states = indices[active], walk_end.section_states[active]
-        earlier_step = loose_ground.take_steps(own_indices, start, n_steps - 2)
+        active_indices, current_states = indices[active], walk_end.section_states[active]
+        earlier_step = loose_ground.take_steps(active_indices, start, n_steps - 2)
         failed = np.flatnonzero(earlier_step.outcome != Outcome.STEPPED)
-        if len(failed):  # after a leap, or at first due to the tolerance
+        if len(failed):  # A leap failed, or the tolerance of the first steps is too loose.
             retry = (loose_ground if round_index else ground).take_steps(
-                own_indices[failed], current_states[failed], n_steps - 2
+                active_indices[failed], current_states[failed], n_steps - 2
             )
-            earlier_step = StepQuantities(*map(_replace_rows, earlier_step, 3 * (failed,), retry))
-        previous_step = loose_ground.take_steps(own_indices, earlier_step.section_states)
-        current_step = loose_ground.take_steps(own_indices, previous_step.section_states)
+            retried = []
+            for part, retried_part in zip(earlier_step, retry, strict=True):
+                part = np.array(part)
+                part[failed] = retried_part
+                retried.append(part)
+            earlier_step = StepQuantities(*retried)
+        previous_step = loose_ground.take_steps(active_indices, earlier_step.section_states)
+        current_step = loose_ground.take_steps(active_indices, previous_step.section_states)
         step_outcomes = np.stack(
             [earlier_step.outcome, previous_step.outcome, current_step.outcome]
         )
@@ -82,11 +105,12 @@ def walk_until_settled(
             previous_step.section_states[is_stepping],
             current_step.section_states[is_stepping],
             n_numbers,
+            options,
         )
-        n_leaps_left = MAX_LEAPS - round_index
+        n_leaps_left = options.max_leaps - round_index
         continues = ~walk_end.is_settled[active] & (
-            (n_leaps_left > GIVE_UP_LEAPS_LEFT)
-            | (fade_distance <= GIVE_UP_FACTOR * MAX_LEAP * n_leaps_left)
+            (n_leaps_left > options.give_up_leaps_left)
+            | (fade_distance <= options.give_up_factor * options.max_leap * n_leaps_left)
         )
         active, leap_vectors = (part[continues] for part in (active, leap_vectors))
         start = walk_end.section_states[active]
@@ -96,16 +120,12 @@ def walk_until_settled(
     return walk_end
 
 
-def _replace_rows(
-    values: np.ndarray, row_indices: np.ndarray, new_values: np.ndarray
-) -> np.ndarray:
-    values = np.array(values)
-    values[row_indices] = new_values
-    return values
-
-
 def _analyze_drift(
-    earlier: np.ndarray, previous: np.ndarray, current: np.ndarray, n_numbers: int
+    earlier: np.ndarray,
+    previous: np.ndarray,
+    current: np.ndarray,
+    n_numbers: int,
+    options: LeapOptions,
 ) -> tuple[np.ndarray, ...]:
     """Analyze the drift of three successive section states.
 
@@ -117,23 +137,23 @@ def _analyze_drift(
         & (previous[:, n_numbers:] == current[:, n_numbers:]),
         axis=1,
     )
-    earlier_change, last_change = (
-        (previous - earlier)[:, :n_numbers],
-        (current - previous)[:, :n_numbers],
-    )
+    earlier_change = (previous - earlier)[:, :n_numbers]
+    last_change = (current - previous)[:, :n_numbers]
     speed = np.abs(last_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(
             np.sum(earlier_change * last_change, axis=1)
             / np.sum(earlier_change * earlier_change, axis=1)
         )
-        n_steps_to_fade = np.where(
-            decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf
-        )  # number of steps
-        fade_distance = np.where(speed < NOISE_DRIFT, 0.0, np.abs(n_steps_to_fade) * speed)
-        n_leap_steps = np.where(speed > 0.0, np.minimum(n_steps_to_fade, MAX_LEAP / speed), 0.0)
+        n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
+        fade_distance = np.where(speed < options.noise_drift, 0.0, np.abs(n_steps_to_fade) * speed)
+        n_leap_steps = np.where(
+            speed > 0.0, np.minimum(n_steps_to_fade, options.max_leap / speed), 0.0
+        )
     # A drift that changes sign at each step leads to a gait of two steps.
-    is_settled = same_codes & (fade_distance < REST_DRIFT) & (speed < REST_DRIFT)
+    is_settled = (
+        same_codes & (fade_distance < options.settled_drift) & (speed < options.settled_drift)
+    )
     has_leap = same_codes & ~is_settled & (decay_rate > 0.0)
     return (
         is_settled,

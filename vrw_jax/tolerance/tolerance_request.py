@@ -1,4 +1,4 @@
-"""Measures to within a tolerance, from the lowest model whose error can be bounded.
+"""Measures to within a tolerance, from the simplest model whose error can be bounded.
 
 The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
 by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
@@ -10,6 +10,7 @@ not contract, the gait is another one, and a walk leads to it.
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -19,12 +20,10 @@ import numpy as np
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.runtime import with_default_settings
-from vrw_jax.tolerance.contact_steps import TIGHT_TOLERANCE, VERY_TIGHT_TOLERANCE, GroundBatch
+from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, GroundBatch
 from vrw_jax.tolerance.lower_fidelity import (
-    NO_MODEL,
-    RIGID_MODEL_INDEX,
-    UNILATERAL_MODEL_INDEX,
     LowerFidelityGait,
+    ModelIndex,
     empty_gaits,
     find_paper_gaits,
     find_rigid_gaits,
@@ -33,7 +32,6 @@ from vrw_jax.tolerance.lower_fidelity import (
 )
 from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
 from vrw_jax.tolerance.refinement import (
-    MAX_GAIT_DISTANCE,
     BroydenIteration,
     RefinementResult,
     refine,
@@ -51,26 +49,39 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
-ERROR_SAFETY_FACTOR = 4.0
-"""Factor from the error estimate of one step to its bound, valid as long as corrections contract by
-3/4."""
-TIGHT_BELOW = 1e-7
-"""Tolerance of a measure below which steps use VERY_TIGHT_TOLERANCE."""
-N_EXACT_STEPS = 3
-"""Number of steps after a loose walk, before corrections, because looser steps may end in other
-modes."""
-N_STABILITY_STEPS = 60
-"""Number of steps of a walk that must stay near a gait if the gait is far from the end of the
-previous walk."""
-N_COLD_STARTS = 2
-"""Number of starts, slow ones first, for wheels without a lower gait. Of 232 wheels the first two
-starts led 100 to a gait, and the other starts led none of the rest."""
-MAX_DISTANCE_RATIO = 2.0
-"""Largest distance of the gait with unilateral contact from the lower gait that it continues, in
-first corrections. It is chosen because a contraction by a half moves at most so far."""
-N_STEPS_BEFORE_DIFFERENCES = 3
-"""Number of steps from a lower gait with its own derivatives, before finite differences replace
-them."""
+
+@dataclass(frozen=True)
+class RequestOptions:
+    """Numbers of the search for a model and a gait that give measures to a tolerance.
+
+    - `error_safety_factor`: factor from the error estimate of one step to its bound, chosen because
+      the bound holds as long as corrections contract by 3/4;
+    - `very_tight_below`: tolerance of a measure below which steps have the very tight tolerance;
+    - `n_exact_steps`: number of steps after a loose walk, before corrections, chosen because looser
+      steps may end in other contact modes;
+    - `n_stability_steps`: number of steps of a walk that must stay near a gait if the gait is far
+      from the end of the previous walk;
+    - `n_cold_starts`: number of starts, slow ones first, for wheels without a lower gait. It is
+      chosen because of 232 wheels the first two starts led 100 to a gait, and the other starts none
+      of the rest;
+    - `max_distance_ratio`: largest distance of the gait with unilateral contact from the lower gait
+      that it continues, in first corrections. It is chosen because a contraction by a half moves at
+      most so far;
+    - `n_steps_before_differences`: number of steps from a lower gait with its own derivatives,
+      before finite differences replace them.
+    """
+
+    error_safety_factor: float = 4.0
+    very_tight_below: float = 1e-7
+    n_exact_steps: int = 3
+    n_stability_steps: int = 60
+    n_cold_starts: int = 2
+    max_distance_ratio: float = 2.0
+    n_steps_before_differences: int = 3
+
+
+REQUEST_OPTIONS = RequestOptions()
+"""Options of `vrw.measure_to_tolerance`."""
 
 
 @with_default_settings
@@ -100,15 +111,15 @@ def measure_to_tolerance(
         tol: allowed error, in the measure's unit or relative to the value.
         friction: friction coefficient of the ground.
         relative: whether `tol` is relative to the value itself.
-        stoppers: of the reference wheel, "bilateral" or "one-sided".
+        stoppers: stoppers of the reference wheel, "bilateral" or "one-sided".
         which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
-            contact that walks from a stated set of starts reach; replaces the gait above.
+            contact that walks from a stated set of starts reach. It replaces the gait above.
 
     Returns:
         A `MeasureResult`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> wheel = vrw.WheelParams(damping=150.0)
@@ -129,7 +140,8 @@ def measure_to_tolerance(
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     params, mu, shape = check_batch(params, convert_friction(friction))
     rank = None if which is None else parse_gait_choice(which)
-    tolerance = TIGHT_TOLERANCE if tol >= TIGHT_BELOW else VERY_TIGHT_TOLERANCE
+    is_tight = tol >= REQUEST_OPTIONS.very_tight_below
+    tolerance = STEP_TOLERANCES.tight if is_tight else STEP_TOLERANCES.very_tight
     options = StepOptions(rtol=tolerance, atol=tolerance)
     request = _MeasureRequest(
         names, tol, relative, GroundBatch.from_params(params, mu, stoppers, options), params
@@ -153,8 +165,7 @@ def measure_to_tolerance(
 def check_batch(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
-    """Return wheels and friction broadcast to one batch axis, and the shape that they were given
-    in."""
+    """Return wheels and friction broadcast to one batch axis, and their original batch shape."""
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
     shape = max(shapes, key=len)
@@ -179,9 +190,10 @@ class _MeasureRequest:
         relative: bool,
         ground: GroundBatch,
         params: WheelParams,
+        options: RequestOptions = REQUEST_OPTIONS,
     ) -> None:
         n_elements, n_measures = len(ground.parameter_columns.T), len(names)
-        self.names, self.tol, self.relative = names, tol, relative
+        self.names, self.tol, self.relative, self.options = names, tol, relative, options
         self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
         full = lambda fill: np.full((n_elements, n_measures), fill)
         self.results = {
@@ -189,7 +201,7 @@ class _MeasureRequest:
             "errors": full(np.inf),
             "model_errors": full(np.nan),
             "numerical_errors": full(np.inf),
-            "models": np.full(n_elements, NO_MODEL),
+            "models": np.full(n_elements, ModelIndex.NONE),
             "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)),
             "n_steps": np.zeros(n_elements, int),
             "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
@@ -205,13 +217,13 @@ class _MeasureRequest:
     @property
     def unanswered_indices(self) -> np.ndarray:
         """Return the indices of the elements without a result."""
-        return np.flatnonzero(self.results["models"] == NO_MODEL)
+        return np.flatnonzero(self.results["models"] == ModelIndex.NONE)
 
     def try_rigid_model(self) -> None:
         """Try the rigid gait for wheels whose legs are stiff enough."""
         with np.errstate(all="ignore"):
             indices = np.flatnonzero(
-                ERROR_SAFETY_FACTOR * static_contraction(self.params) <= self.tol
+                self.options.error_safety_factor * static_contraction(self.params) <= self.tol
             )
         if not len(indices):
             return
@@ -220,8 +232,7 @@ class _MeasureRequest:
         self._correct_from_gaits(indices, continues=False)
 
     def try_paper_model(self) -> None:
-        """Try the paper's gaits, and the nearby gaits with unilateral contact if their values are
-        not accurate enough."""
+        """Try the paper's gaits, or else the gaits with unilateral contact near them."""
         indices = self.unanswered_indices
         if not len(indices):
             return
@@ -231,16 +242,15 @@ class _MeasureRequest:
             find_paper_gaits(self._take_wheels(indices), self.ground.options),
         )
         self._correct_from_gaits(
-            indices[self.lower_gaits.model_index[indices] != NO_MODEL], continues=True
+            indices[self.lower_gaits.model_index[indices] != ModelIndex.NONE], continues=True
         )
 
     def walk_to_gaits(self) -> None:
-        """Walk to the gaits with unilateral contact that are far from the paper's gait, or where it
-        has none."""
+        """Walk to the gaits with unilateral contact of wheels without a result."""
         indices = self.unanswered_indices
         if not len(indices):
             return
-        has_lower_gait = self.lower_gaits.model_index[indices] != NO_MODEL
+        has_lower_gait = self.lower_gaits.model_index[indices] != ModelIndex.NONE
         start_states = self.ground.embed_states(
             indices[has_lower_gait], self.lower_gaits.section_state[indices[has_lower_gait]]
         )
@@ -250,16 +260,15 @@ class _MeasureRequest:
         indices = indices[~has_lower_gait]
         if not len(indices):
             return
-        for start in compute_walk_starts(self._take_wheels(indices))[:N_COLD_STARTS]:
-            is_unanswered = self.results["models"][indices] == NO_MODEL
+        for start in compute_walk_starts(self._take_wheels(indices))[: self.options.n_cold_starts]:
+            is_unanswered = self.results["models"][indices] == ModelIndex.NONE
             start_states = self.ground.embed_states(indices[is_unanswered], start[is_unanswered])
             self._walk_and_correct(
                 indices[is_unanswered], start_states, MeasureStatus.REACHED_FROM_START
             )
 
     def select_by_rank(self, rank: int) -> None:
-        """Select the gait of this rank, slowest first, among those that walks from all starts
-        reach."""
+        """Select the gait of this rank, slowest first, among the ends of walks from all starts."""
         indices, empty_results, results_of_starts = self.unanswered_indices, self.results, []
         for start in compute_walk_starts(self.params):
             self.results = {name: x.copy() for name, x in empty_results.items()}
@@ -281,16 +290,16 @@ class _MeasureRequest:
                     empty_results[name][index] = distinct_gaits[rank][name]
 
     def _take_wheels(self, indices: np.ndarray) -> WheelParams:
+        """Return some of the wheels."""
         return jax.device_put(take_rows(self.params, indices))
 
     def _correct_from_gaits(self, indices: np.ndarray, continues: bool) -> None:
-        """Take one step with unilateral contact from the lower gaits, and more steps if one is not
-        enough."""
+        """Take one step with unilateral contact from the lower gaits, and more if `continues`."""
         if not len(indices):
             return
         lower_gaits = LowerFidelityGait(*(part[indices] for part in self.lower_gaits))
         section_states = self.ground.embed_states(
-            indices, lower_gaits.section_state, lower_gaits.model_index == RIGID_MODEL_INDEX
+            indices, lower_gaits.section_state, lower_gaits.model_index == ModelIndex.RIGID
         )
         iteration = BroydenIteration.from_states(self.ground, indices, section_states, lower_gaits)
         all_positions = np.arange(len(indices))
@@ -307,9 +316,13 @@ class _MeasureRequest:
             sensitivity = np.abs(
                 estimate.quantity_jacobian @ iteration.quantity_jacobian[:, :, plane_indices]
             )
-            own_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
-            numerical = own_defect_effect + estimate.numerical_error + estimate.dip_error
-            bound = np.abs(error) + (ERROR_SAFETY_FACTOR - 1.0) * correction_effect + numerical
+            lower_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
+            numerical = lower_defect_effect + estimate.numerical_error + estimate.dip_error
+            bound = (
+                np.abs(error)
+                + (self.options.error_safety_factor - 1.0) * correction_effect
+                + numerical
+            )
             is_accepted = estimate.same_codes & np.all(bound <= self.error_goal(values), axis=1)
         self.results["n_steps"][indices] += 1
         self._record(
@@ -327,7 +340,7 @@ class _MeasureRequest:
         rejected = np.flatnonzero(~is_accepted & estimate.same_codes)
         if not continues or not len(rejected):
             return
-        max_distance = MAX_DISTANCE_RATIO * np.linalg.norm(
+        max_distance = self.options.max_distance_ratio * np.linalg.norm(
             iteration.correction[rejected][:, plane_indices], axis=1
         )
         first_step_and_estimate = jax.tree.map(lambda part: part[rejected], (first_step, estimate))
@@ -335,7 +348,7 @@ class _MeasureRequest:
             iteration.select(rejected),
             self.names,
             self.error_goal,
-            N_STEPS_BEFORE_DIFFERENCES,
+            self.options.n_steps_before_differences,
             first_step_and_estimate,
         )
         is_near = (
@@ -361,14 +374,13 @@ class _MeasureRequest:
         self.results["outcomes"][indices] = np.where(
             is_walk_outcome, Outcome.NO_CYCLE_FOUND, walk_end.outcome
         )
-        indices, section_states = (
-            indices[walk_end.is_settled],
-            walk_end.section_states[walk_end.is_settled],
-        )
+        section_states = walk_end.section_states[walk_end.is_settled]
+        indices = indices[walk_end.is_settled]
         if not len(indices):
             return
-        step = self.ground.take_steps(indices, section_states, N_EXACT_STEPS)
-        self.results["n_steps"][indices] += N_EXACT_STEPS
+        n_exact_steps = self.options.n_exact_steps
+        step = self.ground.take_steps(indices, section_states, n_exact_steps)
+        self.results["n_steps"][indices] += n_exact_steps
         continues = step.outcome == Outcome.STEPPED
         indices, section_states = indices[continues], step.section_states[continues]
         iteration = BroydenIteration.from_states(self.ground, indices, section_states, None)
@@ -376,31 +388,31 @@ class _MeasureRequest:
         refinement.is_done[refinement.is_done] = iteration.select(
             refinement.is_done
         ).is_attracting()
+        max_distance = iteration.options.max_gait_distance
         far_positions = np.flatnonzero(
-            refinement.is_done & (iteration.distance_to(section_states) > MAX_GAIT_DISTANCE)
+            refinement.is_done & (iteration.distance_to(section_states) > max_distance)
         )
+        n_stability_steps = self.options.n_stability_steps
         refinement.is_done[far_positions] = iteration.select(far_positions).stays_near(
-            N_STABILITY_STEPS
+            n_stability_steps
         )
-        refinement.n_steps[far_positions] += N_STABILITY_STEPS
+        refinement.n_steps[far_positions] += n_stability_steps
         self._record_gaits(indices, refinement, status)
 
     def _record_gaits(
         self, indices: np.ndarray, refinement: RefinementResult, status: MeasureStatus
     ) -> None:
-        """Record gaits with unilateral contact."""
+        """Record the results of gaits with unilateral contact."""
         self.results["n_steps"][indices] += refinement.n_steps
-        indices, refinement = (
-            indices[refinement.is_done],
-            RefinementResult(*(part[refinement.is_done] for part in refinement)),
-        )
-        has_lower_gait = (self.lower_gaits.model_index[indices] != NO_MODEL)[:, None]
+        indices = indices[refinement.is_done]
+        refinement = RefinementResult(*(part[refinement.is_done] for part in refinement))
+        has_lower_gait = (self.lower_gaits.model_index[indices] != ModelIndex.NONE)[:, None]
         values = evaluate_measures(
             self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)
         )
         self._record(
             indices,
-            np.full(len(indices), UNILATERAL_MODEL_INDEX),
+            np.full(len(indices), ModelIndex.UNILATERAL),
             status,
             {
                 "values": refinement.values,
@@ -419,6 +431,7 @@ class _MeasureRequest:
         status: MeasureStatus,
         new_results: dict[str, np.ndarray],
     ) -> None:
+        """Record results of some elements, with the model and the method."""
         for name, values in new_results.items():
             self.results[name][indices] = values
         self.results["models"][indices], self.results["statuses"][indices] = model_index, status
@@ -438,6 +451,6 @@ def _find_distinct_gaits(
             )
             for other in distinct
         )
-        if candidate["models"] != NO_MODEL and all(differs):
+        if candidate["models"] != ModelIndex.NONE and all(differs):
             distinct.append(candidate)
     return sorted(distinct, key=lambda candidate: candidate["speeds"])
