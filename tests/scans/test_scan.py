@@ -29,10 +29,11 @@ from support.scanning import (
 
 import vrw_jax as vrw
 from vrw_jax.cycles import finder
+from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.scans import dask, planning
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import store as scan_store
-from vrw_jax.scans.collocation_engine import WHEELS_PER_BATCH, CollocationEngine
+from vrw_jax.scans.collocation_engine import CollocationEngine
 from vrw_jax.scans.dask import connect_workers
 from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED
@@ -513,7 +514,7 @@ def test_parallel_batches_give_the_same_results(
     for program in programs:
         engine._free_programs.put(program._replace(evaluate_cycle=met(program.evaluate_cycle)))
     columns = SMALL_GRID.sample_block((slice(None), slice(None)))
-    size = WHEELS_PER_BATCH + SMALL_GRID.size
+    size = SCAN_BATCH_SIZE + SMALL_GRID.size
     joint_result = engine({name: np.resize(column, size) for name, column in columns.items()})
     for _ in programs:
         engine._free_programs.get()
@@ -522,7 +523,7 @@ def test_parallel_batches_give_the_same_results(
     for name, value in engine_results.items():
         np.testing.assert_array_equal(joint_result[name][: SMALL_GRID.size], value, name)
         np.testing.assert_array_equal(
-            joint_result[name][WHEELS_PER_BATCH:], np.roll(value, -12, 0), name
+            joint_result[name][SCAN_BATCH_SIZE:], np.roll(value, -12, 0), name
         )
 
 
@@ -531,13 +532,14 @@ import os, sys
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
-from vrw_jax.scans.collocation_engine import WHEELS_PER_BATCH, CollocationEngine
+from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
+from vrw_jax.scans.collocation_engine import CollocationEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning
 engine = CollocationEngine(scanning.make_plan().request)
 columns = scanning.SMALL_GRID.sample_block((slice(None), slice(None)))
-size = WHEELS_PER_BATCH + scanning.SMALL_GRID.size
+size = SCAN_BATCH_SIZE + scanning.SMALL_GRID.size
 results = engine({{name: np.resize(column, size) for name, column in columns.items()}})
 devices = {{engine._free_programs.get().device.id for _ in range(engine._n_workers)}}
 assert devices == {{0, 1}}, devices
@@ -559,7 +561,7 @@ def test_two_devices_give_bitwise_the_results_of_one(
     for name, value in engine_results.items():
         np.testing.assert_array_equal(joint_result[name][: SMALL_GRID.size], value, name)
         np.testing.assert_array_equal(
-            joint_result[name][WHEELS_PER_BATCH:], np.roll(value, -12, 0), name
+            joint_result[name][SCAN_BATCH_SIZE:], np.roll(value, -12, 0), name
         )
 
 

@@ -51,7 +51,13 @@ from vrw_jax.continuation import (
     solve_many_on_planes,
     solve_on_plane,
 )
-from vrw_jax.numerics import concat_rows, map_in_batches, map_in_numpy_batches, take_rows
+from vrw_jax.numerics import (
+    batch_sizes,
+    concat_rows,
+    map_in_batches,
+    map_in_numpy_batches,
+    take_rows,
+)
 
 
 @dataclass(frozen=True)
@@ -73,12 +79,6 @@ class LocationOptions:
 LOCATION_OPTIONS = LocationOptions()
 """Options of all branches."""
 
-LOCATION_BATCH_SIZES = (1, 8)
-"""Numbers of points that one call locates, chosen because only one of them is compiled if
-compilation is expensive."""
-
-READ_BATCH_SIZE = 32
-"""Number of points that one call evaluates, chosen because fewer points take the same time."""
 
 ADMISSIBLE_COLUMN = "sequence"
 """Name of the column that is 1 if a point is admissible, else -1."""
@@ -138,14 +138,16 @@ class AbstractContinuation(abc.ABC):
         """Map a function over rows of NumPy arrays, in batches if it is compiled."""
         if self.problem.is_traceable:
             return map_in_numpy_batches(function, (batch_size,), *trees)
-        return jax.tree.map(np.asarray, map_in_batches(function, LOCATION_BATCH_SIZES, *trees))
+        return jax.tree.map(
+            np.asarray, map_in_batches(function, batch_sizes.LOCATION_BATCH_SIZES, *trees)
+        )
 
     def make_table(self, points: ContinuationPoint, wheel_indices: np.ndarray) -> QuantityTable:
         """Return every quantity at each point, with bifurcation functions and ADMISSIBLE_COLUMN."""
         wheels = take_rows(self.wheels, wheel_indices)
         table = self.evaluate_points(wheels, points)
         test_functions = map_in_numpy_batches(
-            evaluate_bifurcation_functions, (READ_BATCH_SIZE,), points.jacobian
+            evaluate_bifurcation_functions, (batch_sizes.POINT_BATCH_SIZE,), points.jacobian
         )
         table |= {name: test_functions[:, i] for i, name in enumerate(BIFURCATION_NAMES)}
         table = self.mask_undefined(table, wheel_indices)
@@ -305,7 +307,7 @@ def _locate_zeros(
     ) -> tuple[ContinuationPoint, QuantityTable]:
         bracket_rows = take_rows((wheels, left, right), bracket_indices)
         points, is_found = continuation.map_batched(
-            solve_between, LOCATION_BATCH_SIZES[-1], *bracket_rows, fractions
+            solve_between, batch_sizes.LOCATION_BATCH_SIZES[-1], *bracket_rows, fractions
         )
         parameter_at.update(
             zip(zip(bracket_indices, fractions, strict=True), points.p, strict=True)

@@ -20,7 +20,6 @@ from jaxtyping import Array
 from vrw_jax.branches.branch import Branch
 from vrw_jax.branches.branch_location import (
     ADMISSIBLE_COLUMN,
-    READ_BATCH_SIZE,
     AbstractContinuation,
     BranchData,
     QuantityTable,
@@ -54,7 +53,7 @@ from vrw_jax.measures import (
     provenance,
 )
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, take_rows
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import refuse_ladder
@@ -123,7 +122,7 @@ class GaitContinuation(AbstractContinuation):
         """Return the table of measures, with a column for each leg of a margin of several legs."""
         problem: Any = self.problem
         measure_gaits = functools.partial(problem.measure_points, self.model, self.step_options)
-        table = self.map_batched(measure_gaits, READ_BATCH_SIZE, wheels, points)
+        table = self.map_batched(measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points)
         for name, margin in MARGIN_MEASURES.items():
             if margin.dimension and name in table:
                 legs = enumerate(range(3, self.n_legs + 1))
@@ -453,7 +452,9 @@ class MapContinuation(AbstractContinuation):
 
     def evaluate_points(self, wheels: Any, points: ContinuationPoint) -> QuantityTable:
         return {
-            "x": self.map_batched(jax.vmap(self.problem.section_state), READ_BATCH_SIZE, points.z)
+            "x": self.map_batched(
+                jax.vmap(self.problem.section_state), batch_sizes.POINT_BATCH_SIZE, points.z
+            )
         }
 
     def is_admissible(self, table: QuantityTable) -> np.ndarray:

@@ -51,7 +51,7 @@ from vrw_jax.continuation import (
 from vrw_jax.cycles import CollocationSystem, transfer_to_mesh
 from vrw_jax.measures import MARGIN_MEASURES, measure_attrs, provenance
 from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
 
@@ -60,9 +60,6 @@ EDGE_COLUMN = "edge of the box"
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
 """Default options of curves, with a short first step because some curves are short."""
-
-CURVES_PER_BATCH = 8
-"""Number of curves in a batch, fixed so that one shape is compiled."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +245,7 @@ class CurveTracer(NamedTuple):
                 for seed in remaining:
                     if (
                         seed.name not in {s.name for s in batch_seeds}
-                        and len(batch_seeds) < CURVES_PER_BATCH
+                        and len(batch_seeds) < batch_sizes.CURVE_BATCH_SIZE
                     ):
                         batch_seeds.append(seed)
                 accepted: list[TracedCurve] = []
@@ -322,7 +319,7 @@ class CurveTracer(NamedTuple):
             (seed.system for seed in seeds), key=lambda system: system.options.mesh_intervals
         )
         seeds = [self._transfer_seed(seed, system) for seed in seeds]
-        padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % CURVES_PER_BATCH)]
+        padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % batch_sizes.CURVE_BATCH_SIZE)]
         test_function = GaitTestFunction(
             system, self.parameters, group, self.model, self.step_options
         )

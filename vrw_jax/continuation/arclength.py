@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.continuation.crossings import Doubt, is_accounted_for
-from vrw_jax.numerics import Scalar, StatusCode, tree_where, value_and_jacobian
+from vrw_jax.numerics import Scalar, StatusCode, batch_sizes, tree_where, value_and_jacobian
 from vrw_jax.validation import (
     check_int,
     check_positive,
@@ -499,10 +499,6 @@ def _init_branch(
     )
 
 
-MAX_CONCURRENT_BRANCHES = 8
-"""Number of branches that are continued concurrently, chosen because they fill one group of lanes
-of machine code."""
-
 BranchBatch = tuple[ContinuationState, ContinuationPoint]
 """States of concurrent branches, and the buffers of their points."""
 
@@ -641,7 +637,7 @@ def continue_from(
     is_requested = jnp.ones(p.shape, bool) if is_requested is None else is_requested
 
     def advance_group(branches: BranchBatch) -> BranchBatch:
-        rows = jnp.argsort(~is_active(branches), stable=True)[:MAX_CONCURRENT_BRANCHES]
+        rows = jnp.argsort(~is_active(branches), stable=True)[: batch_sizes.BRANCH_BATCH_SIZE]
         group_args, group_directions, state = jax.tree.map(
             lambda x: x[rows], (batch_args, directions, branches[0])
         )

@@ -19,3 +19,20 @@ GAIT_BATCH_SIZES = (8, 64, 512, 4096)
 """Limit cycles of the paper's wheel, which one Newton iteration computes for all elements."""
 CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)
 """Limit cycles with unilateral contact, which need few iterations and expensive steps."""
+
+BRANCH_BATCH_SIZE = 8
+"""Branches continued at a time, chosen because they fill one group of lanes of machine code."""
+LOCATION_BATCH_SIZES = (1, 8)
+"""Special points located by one call; only one size is compiled if compilation is expensive."""
+POINT_BATCH_SIZE = 32
+"""Points of branches measured by one call, chosen because fewer points take the same time."""
+CURVE_BATCH_SIZE = 8
+"""Curves of special points traced at a time, fixed so that one shape is compiled."""
+SCAN_BATCH_SIZE = 512
+"""Samples of a scan computed by one call, fixed so that they do not depend on other samples."""
+SCAN_TASK_SIZE = 512
+"""Samples with unilateral contact that one task of a thread computes at most."""
+GAIT_READ_BATCH_SIZE = 64
+"""Gaits with unilateral contact measured by one call, fixed as for scans."""
+SCAN_CHUNK_SIZE = 4096
+"""Samples of a scan that are written at a time by default, which a killed scan may lose."""

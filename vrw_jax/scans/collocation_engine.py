@@ -1,6 +1,6 @@
 """Steady gaits of many wheels: one compiled function over a batch of fixed size.
 
-The samples are divided into batches of `WHEELS_PER_BATCH` wheels, and the last batch is padded. The
+The samples are divided into batches of one size, and the last batch is padded. The
 same compiled code evaluates every batch, so the result of a sample depends neither on its position
 nor on the other samples.
 
@@ -21,14 +21,10 @@ from jaxtyping import Array
 from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome, make_finder
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compile_exported, with_default_settings
 from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
-
-WHEELS_PER_BATCH = 512
-"""Number of wheels in one call of the compiled functions, fixed so that results do not
-depend on the other samples."""
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
 """Outcome, section state, and measures by name."""
@@ -118,8 +114,8 @@ class CollocationEngine:
             if not self._n_workers:
                 self._compile()
         batches = (
-            rows[begin : begin + WHEELS_PER_BATCH]
-            for begin in range(0, len(rows), WHEELS_PER_BATCH)
+            rows[begin : begin + batch_sizes.SCAN_BATCH_SIZE]
+            for begin in range(0, len(rows), batch_sizes.SCAN_BATCH_SIZE)
         )
         with ThreadPoolExecutor(self._n_workers) as pool:
             parts = list(pool.map(self._evaluate_batch, batches))
@@ -128,7 +124,9 @@ class CollocationEngine:
     @with_default_settings  # in a thread of its own
     def _evaluate_batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the results of a batch, which is padded with copies of its first wheel."""
-        padded_rows = np.concatenate([rows, np.repeat(rows[:1], WHEELS_PER_BATCH - len(rows), 0)])
+        padded_rows = np.concatenate(
+            [rows, np.repeat(rows[:1], batch_sizes.SCAN_BATCH_SIZE - len(rows), 0)]
+        )
         programs = self._free_programs.get()
         try:
             values = jax.device_put(padded_rows, programs.device)
@@ -144,8 +142,10 @@ class CollocationEngine:
     def _compile(self) -> None:
         """Compile both functions in parallel for each device; all cores of a CPU share them."""
         devices = jax.local_devices()
-        values = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, len(PARAMETER_NAMES)), self._dtype)
-        state = jax.ShapeDtypeStruct((WHEELS_PER_BATCH, 3), self._dtype)
+        values = jax.ShapeDtypeStruct(
+            (batch_sizes.SCAN_BATCH_SIZE, len(PARAMETER_NAMES)), self._dtype
+        )
+        state = jax.ShapeDtypeStruct((batch_sizes.SCAN_BATCH_SIZE, 3), self._dtype)
         cache_key = self._cache_key
         compile_with_defaults = with_default_settings(compile_exported)  # in threads
         with ThreadPoolExecutor(2) as pool:

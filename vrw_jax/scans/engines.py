@@ -24,7 +24,7 @@ from vrw_jax.cycles import (
     make_finder,
 )
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
-from vrw_jax.numerics import map_in_batches
+from vrw_jax.numerics import batch_sizes, map_in_batches
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.scans.collocation_engine import (
     CollocationEngine,
@@ -37,13 +37,6 @@ from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
 from vrw_jax.selection import ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
-
-SAMPLES_PER_TASK = 512
-"""Largest number of samples per task of a thread."""
-
-GAITS_PER_READ = 64
-"""Number of gaits whose measures are computed in one call, fixed so that the result of a sample
-does not depend on the other samples."""
 
 SampleMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -62,7 +55,7 @@ class UnilateralEngine:
         measure_names = (*(n for n in measures if parse_derivative(n) is None), "spectral_radius")
 
         finder: Any = make_finder(model, base.n_legs, step_options=options)
-        self._finder = dataclasses.replace(finder, batch_sizes=(GAITS_PER_READ,))
+        self._finder = dataclasses.replace(finder, batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,))
         read = type(finder).read_measure
         self._measure_reader, self._derivatives = MeasureReader(read, measure_names), derivatives
         self._derivative_reader = MeasureReader(
@@ -72,7 +65,9 @@ class UnilateralEngine:
     def __call__(self, columns: SampleMapping) -> ResultColumns:
         """Return the results by variable; `columns` has one value per sample of each parameter."""
         values = stack_parameters(columns, self._model, self._base)
-        parts = np.array_split(values, max(self._threads, -(-len(values) // SAMPLES_PER_TASK)))
+        parts = np.array_split(
+            values, max(self._threads, -(-len(values) // batch_sizes.SCAN_TASK_SIZE))
+        )
         first_part, *other_parts = (part for part in parts if len(part))
         results = [self._evaluate_part(first_part)]  # The first call compiles for all threads.
         with ThreadPoolExecutor(self._threads) as pool:
@@ -99,7 +94,9 @@ class UnilateralEngine:
         """Return outcome, measures and derivatives of the gaits of wheels, shape (wheels,)."""
         cycle = find_slow_gaits(self._finder, values)
         results = map_in_batches(
-            lambda cycles: _read_measures(self._measure_reader, cycles), (GAITS_PER_READ,), cycle
+            lambda cycles: _read_measures(self._measure_reader, cycles),
+            (batch_sizes.GAIT_READ_BATCH_SIZE,),
+            cycle,
         )
         if self._derivatives:
             differentiable_cycles = self._finder.find_gaits(
@@ -107,7 +104,7 @@ class UnilateralEngine:
             )
             _, jacobians = map_in_batches(
                 lambda cycles: evaluate_on_gaits(self._derivative_reader, cycles),
-                (GAITS_PER_READ,),
+                (batch_sizes.GAIT_READ_BATCH_SIZE,),
                 differentiable_cycles,
             )
             names = self._model.parameter_names

@@ -15,7 +15,7 @@ from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.measures import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
 from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
 from vrw_jax.scans.design import AbstractDesign, SampleColumns
@@ -44,8 +44,6 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples, chosen because it takes over a day and some hundred GB."""
 
-DEFAULT_CHUNK_SIZE = 4096
-"""Default number of samples per chunk, which a killed scan may lose."""
 
 STORED_KINDS = {"StepOptions": "Options"}
 """Names of classes in stores, if they differ from the names in Python."""
@@ -156,7 +154,7 @@ def plan_scan(
     options.check_tolerances(np.dtype(base.damping.dtype))
     finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
     finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
-    chunk = DEFAULT_CHUNK_SIZE if chunk is None else check_int("chunk", chunk)
+    chunk = batch_sizes.SCAN_CHUNK_SIZE if chunk is None else check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
             f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
