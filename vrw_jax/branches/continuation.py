@@ -405,25 +405,20 @@ def _label_branch(
         branch_data.table["closure"],
         {"units": "1", "long_name": "miss of the section state after one event-driven period"},
     )
+    component_names = ["theta", "dtheta", "dL1"]
+    if branch_data.table["section_state"].shape[-1] != len(component_names):
+        legs = range(1, params.n_legs + 1)
+        leg_names = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in legs]
+        component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
     labels = {
         name: xr.Variable("point", branch_data.points.p, measure_attrs(name)),
-        "component": _section_component_names(
-            branch_data.table["section_state"].shape[-1], params.n_legs
-        ),
+        "component": component_names,
         "leg": locked_leg_coordinate(params.n_legs),
     }
     dataset = xr.Dataset(
         data | _stability_variables(np.asarray(branch_data.points.jacobian)), labels, attrs
     )
     return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)
-
-
-def _section_component_names(n_components: int, n_legs: int) -> list[str]:
-    """Return the names of the components of a section state, the paper's or a full one."""
-    if n_components == 3:
-        return ["theta", "dtheta", "dL1"]
-    legs = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in range(1, n_legs + 1)]
-    return ["theta", "dtheta", "vx", "vz", *legs]
 
 
 def _stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:

@@ -85,6 +85,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         Continued quantities are also defined beyond a special point.
         """
 
+    @eqx.filter_jit
     def measure_points(
         self,
         model: AbstractWheel,
@@ -93,26 +94,14 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         points: ContinuationPoint,
     ) -> dict[str, Array]:
         """Return all measures of the gaits at many points, by event-driven steps."""
-        return _measure_points(self, model, options, wheels, points)
 
+        def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
+            section_state, continued_quantities = self.read_state(wheel, z, p)
+            model_at_point, params = model.with_parameter(wheel.params, self.parameter_name, p)
+            measures = measure_gait(model_at_point, params, section_state, options, self.n_steps)
+            return measures | continued_quantities | {"section_state": section_state}
 
-@eqx.filter_jit
-def _measure_points(
-    problem: AbstractGaitProblem,
-    model: AbstractWheel,
-    options: StepOptions,
-    wheels: BranchWheel,
-    points: ContinuationPoint,
-) -> dict[str, Array]:
-    """Return all measures of the gaits at many points; compiled once per problem."""
-
-    def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
-        section_state, continued_quantities = problem.read_state(wheel, z, p)
-        model_at_point, params = model.with_parameter(wheel.params, problem.parameter_name, p)
-        measures = measure_gait(model_at_point, params, section_state, options, problem.n_steps)
-        return measures | continued_quantities | {"section_state": section_state}
-
-    return jax.vmap(measure_point)(wheels, points.z, points.p)
+        return jax.vmap(measure_point)(wheels, points.z, points.p)
 
 
 class CollocationProblem(AbstractGaitProblem):

@@ -70,6 +70,32 @@ class ScanConfig:
     chunk: int | None = None
     tol: float | None = None
 
+    @classmethod
+    def from_table(
+        cls, table: Mapping[str, object], model_class: type[AbstractWheel]
+    ) -> "ScanConfig":
+        """Return the settings of `[scan]`; raise if the model does not have a measure."""
+        _require_known_keys(table, cls.__dataclass_fields__, "[scan]", "settings")
+        measures = table.get("measures")
+        if measures is not None:
+            if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
+                requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
+                raise _make_error("measures", measures, requirement)
+            catalog = (
+                CATALOGS.get(model_class.capabilities.gait_method, CATALOGS[GaitMethod.COLLOCATION])
+                if "tol" not in table
+                else TOLERANCE_CATALOG
+            )
+            check_measures(measures, catalog)
+            measures = tuple(measures)
+        chunk = table.get("chunk")
+        tol = table.get("tol")
+        return cls(
+            measures,
+            None if chunk is None else _parse_int(chunk, "chunk", 1),
+            None if tol is None else _parse_number(tol, "tol", must_be_positive=True),
+        )
+
 
 @dataclass(frozen=True)
 class GaitConfig:
@@ -82,6 +108,22 @@ class GaitConfig:
 
     steps: int = 30
     start: tuple[float, float, float] | None = None
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, object]) -> "GaitConfig":
+        """Return the settings of `[gait]`."""
+        _require_known_keys(table, cls.__dataclass_fields__, "[gait]", "settings")
+        steps = _parse_int(table.get("steps", cls.steps), "steps", 1)
+        start = table.get("start")
+        if start is None:
+            return cls(steps)
+        if not (isinstance(start, list) and len(start) == 3):
+            requirement = (
+                "the section state before touchdown, three numbers: angle in rad, angular rate in "
+            )
+            raise _make_error("start", start, requirement + "rad/s, rate of Leg 1 in m/s")
+        theta, dtheta, dL1 = (_parse_number(value, "start") for value in start)
+        return cls(steps, (theta, dtheta, dL1))
 
 
 @dataclass(frozen=True)
@@ -100,6 +142,42 @@ class TuneConfig:
     constraints: Mapping[str, float] | None = None
     evaluations: int = 200
 
+    @classmethod
+    def from_table(cls, table: Mapping[str, object]) -> "TuneConfig":
+        """Return the settings of `[tune]` and its tables."""
+        _require_known_keys(table, cls.__dataclass_fields__, "[tune]", "settings")
+        objective = table.get("objective", cls.objective)
+        if isinstance(objective, dict):
+            objective = {name: _parse_number(value, name) for name, value in objective.items()}
+        elif not isinstance(objective, str):
+            requirement = (
+                'a measure or weights of several: write objective = "dls_fraction" or objective = '
+            )
+            raise _make_error(
+                "objective", objective, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
+            )
+        bounds = table.get("bounds")
+        if not isinstance(bounds, dict) or not bounds:
+            raise ValueError(
+                "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
+                "lines such as damping = [20.0, 215.0]."
+            )
+        _require_known_keys(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+        constraints = table.get("constraints")
+        if constraints is not None:
+            if not isinstance(constraints, dict):
+                requirement = "a table: write [tune.constraints] and below it lines such as "
+                raise _make_error(
+                    "constraints", constraints, requirement + "clearance_sls1 = 0.001"
+                )
+            constraints = {name: _parse_number(value, name) for name, value in constraints.items()}
+        return cls(
+            objective=objective,
+            bounds={name: _parse_range(name, value) for name, value in bounds.items()},
+            constraints=constraints,
+            evaluations=_parse_int(table.get("evaluations", cls.evaluations), "evaluations", 1),
+        )
+
 
 @dataclass(frozen=True)
 class BranchConfig:
@@ -115,6 +193,33 @@ class BranchConfig:
     bounds: tuple[float, float]
     period: int = 1
     max_ds: float | None = None
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, object], names: tuple[str, ...]) -> "BranchConfig":
+        """Return the settings of `[branch]` along one of the parameters `names`."""
+        _refuse_renamed_keys(table, "[branch]")
+        _require_known_keys(table, cls.__dataclass_fields__, "[branch]", "settings")
+        parameter = table.get("parameter")
+        check_parameter_name(parameter, names, "parameter that a branch of this model runs along")
+        assert isinstance(parameter, str)
+        if "bounds" not in table:
+            raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+        bounds = check_range(
+            "bounds", _parse_range("bounds of " + parameter, table["bounds"], parameter)
+        )
+        max_ds = None
+        if "max_ds" in table:
+            max_ds = _parse_number(table["max_ds"], "max_ds", must_be_positive=True)
+            if max_ds > 1.0:
+                raise ValueError(
+                    f"max_ds is {max_ds:g}, but it is a share of the range: give 0.02, say."
+                )
+        return cls(
+            parameter=parameter,
+            bounds=bounds,
+            period=_parse_int(table.get("period", cls.period), "period", 1),
+            max_ds=max_ds,
+        )
 
 
 @dataclass(frozen=True)
@@ -223,15 +328,22 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
             f"{doubly_given[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can "
             "only be one: drop one of the two."
         )
+    option_table = _get_table(tables, "options")
+    _refuse_renamed_keys(option_table, "[options]")
+    _require_known_keys(option_table, _OPTION_KEYS, "[options]", "options")
+    default_options = {key: getattr(StepOptions(), key) for key in _OPTION_KEYS}
+    option_values = _parse_like_defaults(option_table, default_options)
     config = Config(
         wheel_values=wheel,
         model_name=model_name,
         model_settings=model,
-        option_values=_parse_options(_get_table(tables, "options")),
-        scan=_parse_scan(_get_table(tables, "scan"), model_class),
-        gait=_parse_gait(_get_table(tables, "gait")),
-        tune=_parse_tune(_get_table(tables, "tune")) if "tune" in tables else None,
-        branch=_parse_branch(_get_table(tables, "branch"), names) if "branch" in tables else None,
+        option_values=option_values,
+        scan=ScanConfig.from_table(_get_table(tables, "scan"), model_class),
+        gait=GaitConfig.from_table(_get_table(tables, "gait")),
+        tune=TuneConfig.from_table(_get_table(tables, "tune")) if "tune" in tables else None,
+        branch=BranchConfig.from_table(_get_table(tables, "branch"), names)
+        if "branch" in tables
+        else None,
         design=design,
         source_text=text,
         file_name=file_name,
@@ -297,14 +409,6 @@ def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | in
     return model_name, _parse_like_defaults(model_settings, defaults)
 
 
-def _parse_options(table: Mapping[str, object]) -> dict[str, float | int | str | bool]:
-    """Return the options of `[options]`."""
-    _refuse_renamed_keys(table, "[options]")
-    _require_known_keys(table, _OPTION_KEYS, "[options]", "options")
-    defaults = StepOptions()
-    return _parse_like_defaults(table, {key: getattr(defaults, key) for key in _OPTION_KEYS})
-
-
 def _parse_like_defaults(
     table: Mapping[str, object], defaults: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
@@ -327,107 +431,6 @@ def _parse_like_defaults(
         else:
             values[key] = _parse_number(value, key, must_be_positive=True)
     return values
-
-
-def _parse_scan(table: Mapping[str, object], model_class: type[AbstractWheel]) -> ScanConfig:
-    """Return the settings of `[scan]`; raise if the model does not have a measure."""
-    _require_known_keys(table, ScanConfig.__dataclass_fields__, "[scan]", "settings")
-    measures = table.get("measures")
-    if measures is not None:
-        if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
-            requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
-            raise _make_error("measures", measures, requirement)
-        catalog = (
-            CATALOGS.get(model_class.capabilities.gait_method, CATALOGS[GaitMethod.COLLOCATION])
-            if "tol" not in table
-            else TOLERANCE_CATALOG
-        )
-        check_measures(measures, catalog)
-        measures = tuple(measures)
-    chunk = table.get("chunk")
-    tol = table.get("tol")
-    return ScanConfig(
-        measures,
-        None if chunk is None else _parse_int(chunk, "chunk", 1),
-        None if tol is None else _parse_number(tol, "tol", must_be_positive=True),
-    )
-
-
-def _parse_gait(table: Mapping[str, object]) -> GaitConfig:
-    """Return the settings of `[gait]`."""
-    _require_known_keys(table, GaitConfig.__dataclass_fields__, "[gait]", "settings")
-    steps = _parse_int(table.get("steps", GaitConfig.steps), "steps", 1)
-    start = table.get("start")
-    if start is None:
-        return GaitConfig(steps)
-    if not (isinstance(start, list) and len(start) == 3):
-        requirement = (
-            "the section state before touchdown, three numbers: angle in rad, angular rate in "
-        )
-        raise _make_error("start", start, requirement + "rad/s, rate of Leg 1 in m/s")
-    theta, dtheta, dL1 = (_parse_number(value, "start") for value in start)
-    return GaitConfig(steps, (theta, dtheta, dL1))
-
-
-def _parse_tune(table: Mapping[str, object]) -> TuneConfig:
-    """Return the settings of `[tune]` and its tables."""
-    _require_known_keys(table, TuneConfig.__dataclass_fields__, "[tune]", "settings")
-    objective = table.get("objective", TuneConfig.objective)
-    if isinstance(objective, dict):
-        objective = {name: _parse_number(value, name) for name, value in objective.items()}
-    elif not isinstance(objective, str):
-        requirement = (
-            'a measure or weights of several: write objective = "dls_fraction" or objective = '
-        )
-        raise _make_error(
-            "objective", objective, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
-        )
-    bounds = table.get("bounds")
-    if not isinstance(bounds, dict) or not bounds:
-        raise ValueError(
-            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with lines "
-            "such as damping = [20.0, 215.0]."
-        )
-    _require_known_keys(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
-    constraints = table.get("constraints")
-    if constraints is not None:
-        if not isinstance(constraints, dict):
-            requirement = "a table: write [tune.constraints] and below it lines such as "
-            raise _make_error("constraints", constraints, requirement + "clearance_sls1 = 0.001")
-        constraints = {name: _parse_number(value, name) for name, value in constraints.items()}
-    return TuneConfig(
-        objective=objective,
-        bounds={name: _parse_range(name, value) for name, value in bounds.items()},
-        constraints=constraints,
-        evaluations=_parse_int(table.get("evaluations", TuneConfig.evaluations), "evaluations", 1),
-    )
-
-
-def _parse_branch(table: Mapping[str, object], names: tuple[str, ...]) -> BranchConfig:
-    """Return the settings of `[branch]` along one of the parameters `names`."""
-    _refuse_renamed_keys(table, "[branch]")
-    _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
-    parameter = table.get("parameter")
-    check_parameter_name(parameter, names, "parameter that a branch of this model runs along")
-    assert isinstance(parameter, str)
-    if "bounds" not in table:
-        raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
-    bounds = check_range(
-        "bounds", _parse_range("bounds of " + parameter, table["bounds"], parameter)
-    )
-    max_ds = None
-    if "max_ds" in table:
-        max_ds = _parse_number(table["max_ds"], "max_ds", must_be_positive=True)
-        if max_ds > 1.0:
-            raise ValueError(
-                f"max_ds is {max_ds:g}, but it is a share of the range: give 0.02, say."
-            )
-    return BranchConfig(
-        parameter=parameter,
-        bounds=bounds,
-        period=_parse_int(table.get("period", BranchConfig.period), "period", 1),
-        max_ds=max_ds,
-    )
 
 
 def _parse_design(

@@ -100,8 +100,12 @@ def branch_figure(branch: Branch) -> Figure:
     for axes, (label, series), letter in zip(panels.ravel(), shown_panels, "abcd", strict=True):
         label_panel(axes, letter)
         for name, color in series.items():
-            scale = 1e3 if name == "clearance_sls1" else 1.0
-            columns = [_break_at_jumps(name, scale * data[name].values)]
+            columns = [data[name].values]
+            if name == "clearance_sls1":
+                # In mm, with a gap at a jump, where a dip vanishes.
+                clearance = 1e3 * data[name].values
+                clearance[1:][clearance[:-1] * clearance[1:] < 0.0] = np.nan
+                columns = [clearance]
             if name == "spectral_radius":
                 columns = list(np.abs(branch.multipliers).T)
             for column in columns:
@@ -126,14 +130,6 @@ def branch_figure(branch: Branch) -> Figure:
         axes.set_xlabel(format_axis_label(branch.parameter))
     _add_legend(figure, special_points, branch.parameter)
     return figure
-
-
-def _break_at_jumps(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values; those of a clearance have a gap where it jumps because a dip vanishes."""
-    if name.startswith("clearance"):
-        values = values.copy()
-        values[1:][values[:-1] * values[1:] < 0.0] = np.nan
-    return values
 
 
 def _select_color(special_point: SpecialPoint) -> str:

@@ -82,15 +82,6 @@ def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
     return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
 
 
-def _shade_double_support(axes: Axes, gait: xr.Dataset) -> None:
-    """Draw gray bands over double support and dotted lines at collision II."""
-    for begin, end, phase in find_phase_spans(gait):
-        if phase == 0:
-            axes.axvspan(begin, end, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
-        if phase == 2:
-            axes.axvline(begin, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
-
-
 @figure_style()
 def gait_panels(gait: xr.Dataset) -> Figure:
     """Return a figure of angle, leg lengths, load share, foot height and ground forces (Fig. 6).
@@ -118,8 +109,12 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 7.4))
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
     for axes, letter in zip(panels, "abcde", strict=True):
-        _shade_double_support(axes, gait)
         label_panel(axes, letter)
+        for begin, end, phase in find_phase_spans(gait):
+            if phase == 0:
+                axes.axvspan(begin, end, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
+            if phase == 2:
+                axes.axvline(begin, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
     panels[0].plot(time, theta, color="black")
     panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
     for begin, end, phase in find_phase_spans(gait)[:3]:

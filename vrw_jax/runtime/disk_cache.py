@@ -113,8 +113,10 @@ def load_bytes(name: str) -> bytes | None:
     path = cache_folder() and Path(cache_folder()) / f"{name}{RECORD_SUFFIX}"
     if not path or not re.fullmatch(r"\w+", name):  # Some names are read from a record.
         return None
+    # Without this flag a pipe in place of the file would block.
+    open_without_blocking = lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
     try:
-        with open(path, "rb", opener=_open_without_blocking) as file:
+        with open(path, "rb", opener=open_without_blocking) as file:
             status = os.fstat(file.fileno())
             is_file = stat.S_ISREG(status.st_mode)
             reason = _describe_distrust(status) if is_file else "is no file"
@@ -177,11 +179,6 @@ def _describe_distrust(status: os.stat_result) -> str:
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return f"can be written by other users (its mode is {stat.S_IMODE(status.st_mode):04o})"
     return ""
-
-
-def _open_without_blocking(path: str, flags: int) -> int:
-    """Open a file as `open` does, without blocking on a pipe."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _warn_once(kind: str, sentence: str) -> None:

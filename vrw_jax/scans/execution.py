@@ -150,7 +150,14 @@ def run_scan(
     executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
     """Return the dataset of a plan, computed in this process or by `executor`."""
-    storage = store if isinstance(store, AbstractStore) else _open_storage(scan_plan, store)
+    if isinstance(store, AbstractStore):
+        storage = store
+    elif store is None:
+        storage = MemoryStore(scan_plan.layout, scan_plan.store_attrs)
+    else:
+        storage = open_or_create_store(scan_plan, Path(store))
+        if storage.damage_description:
+            warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=3)
     if storage.damage_description or storage.find_missing_chunks():
         with storage.open_for_writing():
             _compute_chunks(
@@ -161,16 +168,6 @@ def run_scan(
                 executor or _compute_in_process,
             )
     return storage.load_dataset()
-
-
-def _open_storage(scan_plan: ScanPlan, store: str | Path | None) -> AbstractStore:
-    """Return the storage of a scan; warn if some of its chunks are damaged."""
-    if store is None:
-        return MemoryStore(scan_plan.layout, scan_plan.store_attrs)
-    storage = open_or_create_store(scan_plan, Path(store))
-    if storage.damage_description:
-        warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=4)
-    return storage
 
 
 def _compute_chunks(

@@ -206,23 +206,18 @@ def _check_tolerance(model: AbstractWheel, tol: float) -> float:
 def describe_environment() -> dict[str, object]:
     """Return the code digest, the versions and the device of this process."""
     environment = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
+    supported = simd.describe_processor()[2].split(",")
+    instruction_sets = [name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in supported]
+    processor = " ".join([platform.machine(), *instruction_sets])
     return {
         "code": source_digest(),
         "versions": environment["versions"],
-        "device": f"{jax.default_backend()}: {environment['device']}, {_describe_processor()}",
+        "device": f"{jax.default_backend()}: {environment['device']}, {processor}",
     }
 
 
 VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
 """Instruction sets that decide which sums the compiler fuses, and thus the last digits."""
-
-
-def _describe_processor() -> str:
-    """Return the kind of processor, as far as the last digits depend on it."""
-    supported = simd.describe_processor()[2].split(",")
-    return " ".join(
-        [platform.machine(), *(name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in supported)]
-    )
 
 
 def describe_difference(stored: object, current: object) -> str:

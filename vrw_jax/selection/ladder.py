@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from vrw_jax.contact import (
     CONTACT_OFF,
@@ -275,7 +275,11 @@ class LadderWheel(AbstractWheel):
     ) -> tuple[ModelChoice, StepResult]:
         """Return the chosen model, and the step of the viscoelastic model."""
         paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
-        is_embeddable = _is_embeddable(x, params.n_legs)
+        # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
+        is_leg_1 = jnp.arange(params.n_legs) == 0
+        locked_code = float(LOCKED_CODE_OFFSET + CONTACT_OFF)
+        paper_codes = jnp.where(is_leg_1, float(CONTACT_STICK), locked_code)
+        is_embeddable = jnp.all(jnp.round(x[4 + 2 * params.n_legs :]) == paper_codes)
         paper_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
         result = paper_model.take_step(
             params, jnp.where(is_embeddable, paper_section_state, jnp.nan), options
@@ -355,14 +359,6 @@ class LadderWheel(AbstractWheel):
         wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
         trajectory = wheel.sample_step(params, x, options, n_samples)
         return dataclasses.replace(trajectory, model_selection=choice.model_selection())
-
-
-def _is_embeddable(x: FullState, n: int) -> Bool[Array, ""]:
-    """Return whether Leg 1 alone is loaded and at rest, with all other legs on their stoppers."""
-    paper_codes = jnp.where(
-        jnp.arange(n) == 0, float(CONTACT_STICK), float(LOCKED_CODE_OFFSET + CONTACT_OFF)
-    )
-    return jnp.all(jnp.round(x[4 + 2 * n :]) == paper_codes)
 
 
 def _embed_paper_result(

@@ -28,17 +28,17 @@ def _period_of_quantities(quantities: np.ndarray) -> np.ndarray:
     return quantities[..., 0] + quantities[..., 1] + quantities[..., 2]
 
 
-def _read_quantity(name: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function that selects a quantity."""
-    index = QUANTITY_NAMES.index(name)
-    return lambda quantities: quantities[..., index]
-
-
 MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "speed": lambda t: t[..., 3] / _period_of_quantities(t),
     "period": _period_of_quantities,
     "dls_fraction": lambda t: t[..., 0] / _period_of_quantities(t),
-    **{name: _read_quantity(name) for name in ("step_length", *QUANTITY_NAMES)},
+    "step_length": lambda t: t[..., 3],
+    "duration_dls": lambda t: t[..., 0],
+    "duration_single": lambda t: t[..., 1],
+    "duration_flight": lambda t: t[..., 2],
+    "theta_touchdown": lambda t: t[..., 4],
+    "dtheta_touchdown": lambda t: t[..., 5],
+    "dL1_touchdown": lambda t: t[..., 6],
 }
 """Measures that every model has, by their names in `measures.MEASURES`."""
 

@@ -31,6 +31,7 @@ def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
     rear_share = dls.lambda_4.values / (dls.lambda_2.values + dls.lambda_4.values)
     period = float(step.time[-1] - step.time[0])
     energy = step.total_energy.values
+    count_maxima = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
     return {
         "shrink": shrink,
         "change": change[-1],
@@ -53,17 +54,12 @@ def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
         "load_grows": bool((np.diff(dls.lambda_2.values) > 0.0).all()),
         "jump": (float(dls.lambda_2[-1]), float(sls1.lambda_2[0])),
         "tangential": (float(dls.lambda_3[-1]), float(sls1.lambda_3[0])),
-        "peaks": sum(_count_maxima(phase.lambda_2.values) for phase in phases),
+        "peaks": sum(count_maxima(phase.lambda_2.values) for phase in phases),
         "peak": float(step.lambda_2.max()),
         "rise": 1e3 * float(np.diff(sls2.foot_2_z.values).min()),
         "energy_rise": np.diff(energy).max(),
         "energy_lost": energy[0] - energy[-1],
     }
-
-
-def _count_maxima(values: np.ndarray) -> int:
-    """Return the number of samples that are larger than both neighbors."""
-    return int(np.sum((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])))
 
 
 def _compute_damping_numbers(e: Evidence) -> NumbersByName:
