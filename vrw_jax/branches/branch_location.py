@@ -259,12 +259,122 @@ def _solve_between_untraced(
     return solve_many_on_planes(problem, options, wheels, z, planes, bounds)
 
 
+class _ValidRange(NamedTuple):
+    """Admissible points of one wheel, and the first point beyond each end, -1 if there is none."""
+
+    wheel_index: int
+    point_indices: np.ndarray
+    beyond_indices: tuple[int, int]
+
+
 class _PointTable(NamedTuple):
     """Points of all wheels in one array; each wheel's points are in the order of its branch."""
 
     points: ContinuationPoint
     wheel_indices: np.ndarray  # of each point
     table: QuantityTable
+
+    @classmethod
+    def from_results(
+        cls, continuation: AbstractContinuation, results: ContinuationResult
+    ) -> "_PointTable":
+        """Return all points of all results; both directions of a wheel are joined at its start."""
+        point_parts, wheel_indices = [], []
+        for wheel_index in range(results.n_points.shape[0]):
+            n_down, n_up = (int(n) for n in results.n_points[wheel_index])
+            if n_down:
+                points = take_rows(results.points, (wheel_index, 0))
+                points = take_rows(points, np.arange(n_down)[::-1])
+                point_parts.append(points._replace(fraction_rate=-points.fraction_rate))
+            if n_up:
+                points = take_rows(results.points, (wheel_index, 1))
+                point_parts.append(take_rows(points, np.arange(1 if n_down else 0, n_up)))
+            wheel_indices += [wheel_index] * (n_down + max(n_up - (1 if n_down else 0), 0))
+        if not wheel_indices:
+            return cls(take_rows(results.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
+        points = concat_rows(*point_parts)
+        return cls(
+            points,
+            np.array(wheel_indices),
+            continuation.make_table(points, np.array(wheel_indices)),
+        )
+
+    def neighbor_pairs(self, rows: np.ndarray) -> list[tuple[int, int]]:
+        """Return the pairs of points that follow each other in `rows` and belong to one branch."""
+        pairs = zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)
+        is_same_wheel = lambda i, j: self.wheel_indices[i] == self.wheel_indices[j]
+        return [(i, j) for i, j in pairs if is_same_wheel(i, j)]
+
+    def find_valid_ranges(self, starts: Mapping[int, int]) -> list[_ValidRange]:
+        """Return the points of each wheel that admissible points connect to its start."""
+        ranges = []
+        for wheel_index, start in starts.items():
+            point_indices = np.flatnonzero(self.wheel_indices == wheel_index)
+            is_valid = self.table[ADMISSIBLE_COLUMN][point_indices] > 0.0
+            # A start on a special point may be beyond it: then it is next to the branch's end.
+            candidates = [
+                i
+                for i in (start, start + 1, start - 1)
+                if 0 <= i < len(point_indices) and is_valid[i]
+            ]
+            if not candidates:
+                continue
+            start = candidates[0]
+            first_index = last_index = start
+            while first_index > 0 and is_valid[first_index - 1]:
+                first_index -= 1
+            while last_index < len(point_indices) - 1 and is_valid[last_index + 1]:
+                last_index += 1
+            below_index = int(point_indices[first_index - 1]) if first_index > 0 else -1
+            above_index = (
+                int(point_indices[last_index + 1]) if last_index < len(point_indices) - 1 else -1
+            )
+            ranges.append(
+                _ValidRange(
+                    wheel_index,
+                    point_indices[first_index : last_index + 1],
+                    (below_index, above_index),
+                )
+            )
+        return ranges
+
+    def join_ends(
+        self,
+        ranges: list[_ValidRange],
+        located_ends: Mapping[tuple[int, int], "_LocatedZero"],
+    ) -> "_PointTable":
+        """Return the admissible points, joined with the points beside the located ends."""
+        points, wheel_indices, tables = [], [], []
+
+        def append_points(
+            new_points: ContinuationPoint, wheel_index: int, table: QuantityTable
+        ) -> None:
+            points.append(new_points)
+            wheel_indices.append(np.full(len(new_points.p), wheel_index))
+            tables.append(table)
+
+        for valid_range in ranges:
+            lower_end, upper_end = (
+                located_ends.get((valid_range.wheel_index, end)) for end in (0, 1)
+            )
+            if lower_end is not None and lower_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
+                # It was located in the opposite direction, so the rates have the opposite sign.
+                point = lower_end.point_beside
+                append_points(
+                    point._replace(fraction_rate=-point.fraction_rate),
+                    valid_range.wheel_index,
+                    lower_end.table | {BRANCH_POINT_KIND: -lower_end.table[BRANCH_POINT_KIND]},
+                )
+            append_points(
+                take_rows(self.points, valid_range.point_indices),
+                valid_range.wheel_index,
+                take_rows(self.table, valid_range.point_indices),
+            )
+            if upper_end is not None and upper_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
+                append_points(upper_end.point_beside, valid_range.wheel_index, upper_end.table)
+        return _PointTable(
+            concat_rows(*points), np.concatenate(wheel_indices), concat_rows(*tables)
+        )
 
 
 class _LocatedZero(NamedTuple):
@@ -275,6 +385,17 @@ class _LocatedZero(NamedTuple):
     fraction: float  # of the chord between the points, in [0, 1]
     point_beside: ContinuationPoint  # on the side of the left point, leading axis 1
     table: QuantityTable  # at `point_beside`
+
+    @classmethod
+    def at_jump(cls, point_table: _PointTable, pair: tuple[int, int]) -> "_LocatedZero":
+        """Return the zero at a jump: the point of the pair at which the continuation stalled."""
+        i, j = pair
+        p, last = point_table.points.p, len(point_table.points.p) - 1
+        is_left = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last)] - p[j])
+        fraction = 0.0 if is_left else 1.0
+        index = i if is_left else j
+        point, table = take_rows((point_table.points, point_table.table), slice(index, index + 1))
+        return cls((i, j, CONTACT_ORDER_CHANGE), float(p[index]), fraction, point, table)
 
 
 def _locate_zeros(
@@ -358,65 +479,6 @@ def _locate_zeros(
     ]
 
 
-def _collect_points(continuation: AbstractContinuation, results: ContinuationResult) -> _PointTable:
-    """Return all points of all results; the two directions of a wheel are joined at its start."""
-    point_parts, wheel_indices = [], []
-    for wheel_index in range(results.n_points.shape[0]):
-        n_down, n_up = (int(n) for n in results.n_points[wheel_index])
-        if n_down:
-            points = take_rows(results.points, (wheel_index, 0))
-            points = take_rows(points, np.arange(n_down)[::-1])
-            point_parts.append(points._replace(fraction_rate=-points.fraction_rate))
-        if n_up:
-            points = take_rows(results.points, (wheel_index, 1))
-            point_parts.append(take_rows(points, np.arange(1 if n_down else 0, n_up)))
-        wheel_indices += [wheel_index] * (n_down + max(n_up - (1 if n_down else 0), 0))
-    if not wheel_indices:
-        return _PointTable(take_rows(results.points, (0, 0, slice(0, 0))), np.zeros(0, int), {})
-    points = concat_rows(*point_parts)
-    return _PointTable(
-        points, np.array(wheel_indices), continuation.make_table(points, np.array(wheel_indices))
-    )
-
-
-class _ValidRange(NamedTuple):
-    """Admissible points of one wheel, and the first point beyond each end, -1 if there is none."""
-
-    wheel_index: int
-    point_indices: np.ndarray
-    beyond_indices: tuple[int, int]
-
-
-def _find_valid_ranges(point_table: _PointTable, starts: Mapping[int, int]) -> list[_ValidRange]:
-    """Return the points of each wheel that are connected to its start through admissible points."""
-    ranges = []
-    for wheel_index, start in starts.items():
-        point_indices = np.flatnonzero(point_table.wheel_indices == wheel_index)
-        is_valid = point_table.table[ADMISSIBLE_COLUMN][point_indices] > 0.0
-        # A start on a special point may be beyond it: then it is next to the branch's end.
-        candidates = [
-            i for i in (start, start + 1, start - 1) if 0 <= i < len(point_indices) and is_valid[i]
-        ]
-        if not candidates:
-            continue
-        start = candidates[0]
-        first_index = last_index = start
-        while first_index > 0 and is_valid[first_index - 1]:
-            first_index -= 1
-        while last_index < len(point_indices) - 1 and is_valid[last_index + 1]:
-            last_index += 1
-        below_index = int(point_indices[first_index - 1]) if first_index > 0 else -1
-        above_index = (
-            int(point_indices[last_index + 1]) if last_index < len(point_indices) - 1 else -1
-        )
-        ranges.append(
-            _ValidRange(
-                wheel_index, point_indices[first_index : last_index + 1], (below_index, above_index)
-            )
-        )
-    return ranges
-
-
 def _is_mesh_limited(
     continuation: AbstractContinuation, point_table: _PointTable, valid_range: _ValidRange
 ) -> bool:
@@ -470,41 +532,6 @@ def _locate_ends(
     return nearest
 
 
-def _join_ends(
-    point_table: _PointTable,
-    ranges: list[_ValidRange],
-    located_ends: Mapping[tuple[int, int], _LocatedZero],
-) -> _PointTable:
-    """Return the admissible points, joined with the points beside the located ends."""
-    points, wheel_indices, tables = [], [], []
-
-    def append_points(
-        new_points: ContinuationPoint, wheel_index: int, table: QuantityTable
-    ) -> None:
-        points.append(new_points)
-        wheel_indices.append(np.full(len(new_points.p), wheel_index))
-        tables.append(table)
-
-    for valid_range in ranges:
-        lower_end, upper_end = (located_ends.get((valid_range.wheel_index, end)) for end in (0, 1))
-        if lower_end is not None and lower_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
-            # It was located in the opposite direction, so that the rates have the opposite sign.
-            point = lower_end.point_beside
-            append_points(
-                point._replace(fraction_rate=-point.fraction_rate),
-                valid_range.wheel_index,
-                lower_end.table | {BRANCH_POINT_KIND: -lower_end.table[BRANCH_POINT_KIND]},
-            )
-        append_points(
-            take_rows(point_table.points, valid_range.point_indices),
-            valid_range.wheel_index,
-            take_rows(point_table.table, valid_range.point_indices),
-        )
-        if upper_end is not None and upper_end.table[ADMISSIBLE_COLUMN][0] > 0.0:
-            append_points(upper_end.point_beside, valid_range.wheel_index, upper_end.table)
-    return _PointTable(concat_rows(*points), np.concatenate(wheel_indices), concat_rows(*tables))
-
-
 def _locate_inner_zeros(
     continuation: AbstractContinuation, point_table: _PointTable
 ) -> list[NamedZero]:
@@ -516,10 +543,10 @@ def _locate_inner_zeros(
     if continuation.problem.has_kinks:
         states = np.asarray(jax.vmap(continuation.problem.section_state)(point_table.points.z))
         fractions = point_table.points.p / (continuation.bounds[1] - continuation.bounds[0])
-        neighbors = _neighbor_pairs(point_table, all_rows)
+        neighbors = point_table.neighbor_pairs(all_rows)
         jumps = find_jumps(states, fractions, fraction_rates, neighbors)
     order = table.get(CONTACT_ORDER_COLUMN, np.zeros(len(all_rows)))
-    for left, right in _neighbor_pairs(point_table, all_rows):
+    for left, right in point_table.neighbor_pairs(all_rows):
         if order[left] != order[right]:
             # Between the end of the left order and the begin of the right one may be others.
             requests += [
@@ -539,9 +566,9 @@ def _locate_inner_zeros(
         if name != "neimark_sacker" or has_unit_circle_pair(jacobian):
             named_zeros.append((name, zero, N_CROSSING_MULTIPLIERS.get(name, 0)))
     named_zeros += [
-        (CONTACT_ORDER_CHANGE, _make_zero_at_jump(point_table, pair), 0) for pair in jumps
+        (CONTACT_ORDER_CHANGE, _LocatedZero.at_jump(point_table, pair), 0) for pair in jumps
     ]
-    pairs = _neighbor_pairs(point_table, np.flatnonzero(is_off_circle(table[MODULI_COLUMN])))
+    pairs = point_table.neighbor_pairs(np.flatnonzero(is_off_circle(table[MODULI_COLUMN])))
     pairs = [pair for pair in pairs if not contains_jump(*pair)]
     search = functools.partial(_locate_zeros, continuation, point_table)
     return add_multiple_bifurcations(
@@ -581,31 +608,13 @@ def _request_sign_changes(
                 name = BRANCH_POINT_KIND
             requests.append((left, right, columns[column_index]))
             names.append(name)
-    for left, right in _neighbor_pairs(point_table, rows):
+    for left, right in point_table.neighbor_pairs(rows):
         # On the side branch of a pitchfork the margin touches zero where the parameter turns.
         has_same_margin_sign = table["fold"][left] * table["fold"][right] > 0.0
         if has_same_margin_sign and fraction_rates[left] * fraction_rates[right] < 0.0:
             requests.append((left, right, BRANCH_POINT_KIND))
             names.append(BRANCH_POINT_KIND)
     return requests, names
-
-
-def _neighbor_pairs(point_table: _PointTable, rows: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of points that follow each other in `rows` and belong to one branch."""
-    pairs = zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)
-    wheel_indices = point_table.wheel_indices
-    return [(i, j) for i, j in pairs if wheel_indices[i] == wheel_indices[j]]
-
-
-def _make_zero_at_jump(point_table: _PointTable, pair: tuple[int, int]) -> _LocatedZero:
-    """Return the zero at a jump: the point of the pair at which the continuation stalled."""
-    i, j = pair
-    p, last = point_table.points.p, len(point_table.points.p) - 1
-    is_left = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last)] - p[j])
-    fraction = 0.0 if is_left else 1.0
-    index = i if is_left else j
-    point, table = take_rows((point_table.points, point_table.table), slice(index, index + 1))
-    return _LocatedZero((i, j, CONTACT_ORDER_CHANGE), float(p[index]), fraction, point, table)
 
 
 class BranchData(NamedTuple):
@@ -642,10 +651,10 @@ def continue_and_locate(
     ) & np.array([True, False])
     counts: Any = np.where(is_closed, 0, results.n_points)
     results = results._replace(n_points=counts)
-    point_table = _collect_points(continuation, results)
+    point_table = _PointTable.from_results(continuation, results)
     n_wheels, n_before = len(has_start), np.maximum(results.n_points[:, 0] - 1, 0)
     start_indices = {w: int(n_before[w]) for w in range(n_wheels) if w in point_table.wheel_indices}
-    ranges = _find_valid_ranges(point_table, start_indices)
+    ranges = point_table.find_valid_ranges(start_indices)
     branches: list[BranchData | None] = [None] * n_wheels
     if not is_finest:
         for valid_range in ranges:
@@ -660,7 +669,7 @@ def continue_and_locate(
     if not ranges:
         return branches
     located_ends = _locate_ends(continuation, point_table, ranges)
-    all_points = _join_ends(point_table, ranges, located_ends)
+    all_points = point_table.join_ends(ranges, located_ends)
     inner_zeros = _locate_inner_zeros(continuation, all_points)
 
     def make_special_point(
