@@ -19,11 +19,12 @@ PACKAGE_POSITIONS = [
 
 LONGEST_COMPILATIONS = (
     "test_continuation", "test_limit_cycle", "test_unilateral", "test_any_system", "test_reaching",
-    "test_web_digits", "test_answer", "test_step_accuracy", "test_bordering", "test_models_used",
+    "test_web_digits", "test_measure_to_tolerance", "test_step_accuracy",
+    "test_special_point_curves", "test_models_used",
     "test_rigid", "test_reference", "test_one_sided_stoppers", "test_scan", "test_engines",
-    "test_atlas_failures", "test_events", "test_scales", "test_ground_derivatives", "test_monitors",
+    "test_atlas_failures", "test_events", "test_scales", "test_ground_derivatives", "test_margins",
     "test_lane_engine", "test_outcomes", "test_reproduction", "test_ground_batches",
-    "test_snippets", "test_oracle", "test_simd", "test_cli", "test_stores", "test_walking",
+    "test_snippets", "test_oracle", "test_simd", "test_cli", "test_stores", "test_settling",
     "test_restitution", "test_layers", "test_phases", "test_robustness", "test_wrong_calls",
     "test_inputs", "test_checked",
 )  # fmt: skip

@@ -26,7 +26,7 @@ def gone(module):
             if isinstance(other, types.ModuleType) and not hasattr(other, node.attr):
                 yield f"{node.value.id}.{node.attr}"
 
-told = {}
+results = {}
 environment, cores = dict(os.environ), getattr(os, "sched_getaffinity", lambda _: None)(0)
 for name in sys.argv[1:]:
     out, sys.argv, absent = io.StringIO(), [name, "--help"], []
@@ -40,11 +40,11 @@ for name in sys.argv[1:]:
         "arrays": xla_bridge._backends, "environment": environment != dict(os.environ),
         "cores": cores != getattr(os, "sched_getaffinity", lambda _: None)(0),
     }.items() if yes]
-    told[name] = out.getvalue(), touched, absent
-print(json.dumps(told))
+    results[name] = out.getvalue(), touched, absent
+print(json.dumps(results))
 """
-"""Imports each module, then runs it with `--help`; what it printed, what that has touched, and what
-it asks of other modules that they do not have."""
+"""Script that imports each module and runs it with `--help`. It prints the output, the global state
+that has changed, and the missing names that the module uses of other modules."""
 
 
 @pytest.fixture(scope="module")

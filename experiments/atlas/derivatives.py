@@ -374,7 +374,7 @@ def modes() -> Rows:
 
     period = lambda row: vrw.limit_cycle(wheel(row)).period
 
-    def told(method_name: str, count: int, derive: Callable) -> dict[str, object]:
+    def measure_method(method_name: str, count: int, derive: Callable) -> dict[str, object]:
         run = lambda: np.array([derive(row, x) for row, x in zip(rows, starts, strict=True)])
         solution = run() * rows  # and compile
         error = np.linalg.norm(solution - exactly, axis=1) / size
@@ -388,9 +388,9 @@ def modes() -> Rows:
 
     for mode, derive in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
         implicit = jax.jit(derive(period))
-        yield told(f"implicit, {mode}", 0, lambda row, x, f=implicit: f(row))
+        yield measure_method(f"implicit, {mode}", 0, lambda row, x, f=implicit: f(row))
         for count in UNROLLED_STEP_COUNTS:
             unrolled = lambda row, x, d=derive, n=count: d(lambda r: through(n, x, r))(
                 jnp.asarray(row)
             )
-            yield told(f"through the walk, {mode}", count, unrolled)
+            yield measure_method(f"through the walk, {mode}", count, unrolled)

@@ -60,7 +60,7 @@ def measure_over_rates() -> Rows:
         peer = lambda steps, *more, y=y, packed=packed: (
             1,
             functools.partial(steps, y, packed, *more),
-            lambda told: (told[0, :6], told[0, 6], Outcome.STEPPED, ""),
+            lambda row: (row[0, :6], row[0, 6], Outcome.STEPPED, ""),
         )
         runs = {
             "numba Dopri5": peer(peers.numba_steps, TOLERANCE),

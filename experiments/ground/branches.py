@@ -70,12 +70,12 @@ def mapped(sides: list[Side], points: list[np.ndarray]) -> list[tuple]:
     moves = np.concatenate([np.zeros((1, NUMBERS + 1)), stencil, -stencil])
     y = np.concatenate([point + moves for point in points])
     codes = np.repeat([side.codes for side in sides], len(moves), 0)
-    told = {name: [] for name in BOUNDS}
+    columns = {name: [] for name in BOUNDS}
     for side, point in zip(sides, points, strict=True):
-        for name, column in told.items():
+        for name, column in columns.items():
             own = side.value(point[-1] + moves[:, -1]) if name == side.along else side.held[name]
             column.append(np.broadcast_to(own, len(moves)))
-    damping, friction = (np.concatenate(told[name]) for name in ("damping", "friction"))
+    damping, friction = (np.concatenate(columns[name]) for name in ("damping", "friction"))
     found = vrw.step_batch(
         vrw.WheelParams(damping=damping),
         np.concatenate([y[:, :-1], codes], 1),

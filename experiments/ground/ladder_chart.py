@@ -3,7 +3,7 @@
     python -m experiments.ground.ladder_chart [--redraw]
 
 It follows from the margins of the paper's gaits, as in a scan of the ladder; costs of a step are
-those that `rung_table` measures.
+those that `model_table` measures.
 """
 
 import matplotlib.pyplot as plt

@@ -176,10 +176,10 @@ def make_call(name: str, changes: dict[str, Any]) -> Ending:
 def classify(error: Exception, seconds: float) -> Ending:
     """Return whether an error is a sentence of this library, or somebody else's."""
     text, where = str(error), traceback.extract_tb(error.__traceback__)[-1].filename
-    told = f"{type(error).__name__}: {text[:300]} [{where.rpartition('/')[2]}]"
+    description = f"{type(error).__name__}: {text[:300]} [{where.rpartition('/')[2]}]"
     ours = "vrw_jax" in where and isinstance(error, TypeError | ValueError | OSError)
     sentence = ours and text.endswith(".") and "\n" not in text
-    return Ending("one sentence" if sentence else "foreign error", told, seconds)
+    return Ending("one sentence" if sentence else "foreign error", description, seconds)
 
 
 def find_uncoded_nan(result: Any) -> str:

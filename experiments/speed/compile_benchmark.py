@@ -41,12 +41,12 @@ def programs() -> dict[str, Program]:
         cycle = vrw.limit_cycle(params)
         return cycle.period, cycle.dls_fraction, cycle.durations
 
-    def monitors(params: vrw.WheelParams, x: jax.Array) -> vrw.Margins:
+    def compute_margins(params: vrw.WheelParams, x: jax.Array) -> vrw.Margins:
         return vrw.step(params, x, options=options).margins
 
     return {
         "a step": (lambda p, x: vrw.step(p, x, options=options), (params, x)),
-        "its monitors' derivatives": (jax.jacfwd(monitors, argnums=(0, 1)), (params, x)),
+        "its margins' derivatives": (jax.jacfwd(compute_margins, argnums=(0, 1)), (params, x)),
         f"{LANES} steps (diffrax)": (jax.vmap(vrw.return_map), (many, starts)),
         "a limit cycle's derivatives": (jax.jacfwd(measures), (params,)),
         "gradient of the spectral radius": (

@@ -141,12 +141,12 @@ def throughput() -> dict[str, float]:
         return cycle.section_state, cycle.residual, cycle.multipliers
 
     def differentiated(v: jax.Array) -> tuple:
-        def told(v: jax.Array) -> tuple:
+        def evaluate(v: jax.Array) -> tuple:
             cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
             values = jnp.concatenate([cycle.post_impact, cycle.durations, cycle.dls_fraction[None]])
             return values, cycle.residual
 
-        return jax.jacfwd(told, has_aux=True)(v)
+        return jax.jacfwd(evaluate, has_aux=True)(v)
 
     measured = lambda name: lambda v: vrw.limit_cycle(wheel_from_parameters(v, 8)).measure(name)
     derived = {
@@ -171,7 +171,7 @@ def sensitivity_ratio() -> dict[str, float]:
     params, x = vrw.WheelParams(), vrw.limit_cycle(vrw.WheelParams()).section_state
     names = [name for name in CYCLE_MEASURE_FUNCTIONS if name not in ON_STABILITY]
 
-    def told(v: jax.Array) -> jax.Array:
+    def evaluate(v: jax.Array) -> jax.Array:
         cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
         return jnp.stack([cycle.measure(name) for name in names])
 
@@ -179,9 +179,9 @@ def sensitivity_ratio() -> dict[str, float]:
     return {
         "return map at the default options": 1e3
         * measure_least_seconds(jax.jit(vrw.return_map), params, x),
-        "limit cycle from the default guess": 1e3 * measure_least_seconds(jax.jit(told), v),
+        "limit cycle from the default guess": 1e3 * measure_least_seconds(jax.jit(evaluate), v),
         f"limit cycle with {len(names)} measures x 9 derivatives": 1e3
-        * measure_least_seconds(jax.jit(jax.jacfwd(told)), v),
+        * measure_least_seconds(jax.jit(jax.jacfwd(evaluate)), v),
     }
 
 

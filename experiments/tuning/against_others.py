@@ -141,7 +141,7 @@ def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
     """The constraints as they are; both functions of one place are one gait."""
     last: dict[bytes, tuple[float, np.ndarray]] = {}
 
-    def told(u: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(u: np.ndarray) -> tuple[float, np.ndarray]:
         key = u.tobytes()
         if key not in last:
             last.clear()
@@ -149,7 +149,7 @@ def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
         return last[key]
 
     def objective(u: np.ndarray) -> float:
-        value = told(u)[0]
+        value = evaluate(u)[0]
         return MISSING_GAIT_OBJECTIVE if np.isnan(value) else -value
 
     minimize(
@@ -157,7 +157,7 @@ def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
         u,
         method="COBYLA",
         bounds=[(0.0, 1.0)] * u.size,
-        constraints={"type": "ineq", "fun": lambda u: told(u)[1]},
+        constraints={"type": "ineq", "fun": lambda u: evaluate(u)[1]},
         options={"rhobeg": 0.15, "tol": 1e-8, "maxiter": MAX_EVALUATIONS},
     )
 

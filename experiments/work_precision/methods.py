@@ -401,7 +401,7 @@ def by_step_jacobian(solver: str) -> Callable:
         model = vrw.ViscoelasticWheel()
 
         def one(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> tuple:
-            def told(x: jax.Array, row: jax.Array) -> jax.Array:
+            def evaluate_gait(x: jax.Array, row: jax.Array) -> jax.Array:
                 solution = model.advance(make_wheels(row), x, options)
                 return jnp.concatenate([solution.section_state, solution.durations])
 
@@ -412,9 +412,13 @@ def by_step_jacobian(solver: str) -> Callable:
                 tolerance=1e-11,
                 max_iterations=8,
             )
-            by_x, by_row = jax.jacfwd(told, (0, 1))(fixed_point.x, row)
+            by_x, by_row = jax.jacfwd(evaluate_gait, (0, 1))(fixed_point.x, row)
             dx = jnp.linalg.solve(jnp.eye(3) - by_x[:3], by_row[:3])
-            return by_row[3:] + by_x[3:] @ dx, told(fixed_point.x, row)[3:], fixed_point.converged
+            return (
+                by_row[3:] + by_x[3:] @ dx,
+                evaluate_gait(fixed_point.x, row)[3:],
+                fixed_point.converged,
+            )
 
         find = eqx.filter_jit(eqx.filter_vmap(one, in_axes=(0, 0, None)))
 

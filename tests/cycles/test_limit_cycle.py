@@ -328,7 +328,7 @@ def test_gait_without_double_support_is_found_though_unstable():
     assert int(cycle.outcome[0]) == Outcome.STEPPED
     assert float(cycle.durations[0, 0]) == 0.0
     assert float(cycle.indicators.lambda_4[0]) < 0.0
-    assert float(floquet.spectral_radius(cycle.monodromy_value[0])) > 1.6
+    assert float(floquet.compute_spectral_radius(cycle.monodromy_value[0])) > 1.6
     options = vrw.StepOptions.tight()
     back = vrw.return_map(truth.make_wheel(row), cycle.section_state[0], options=options)
     np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
@@ -491,19 +491,21 @@ def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, mul
 def test_section_newton_differentiates_fixed_point_and_multiplier():
     """x -> a - x^2 repeats x = (sqrt(1 + 4 a) - 1) / 2, with the multiplier -2 x."""
 
-    def told(a, start=0.5):
+    def evaluate(a, start=0.5):
         fixed_point = vrw.solve_fixed_point(lambda x: a - x**2, jnp.asarray([start]))
         return jnp.stack([fixed_point.x[0], fixed_point.jacobian[0, 0]])
 
     a = 0.7
     root = math.sqrt(1.0 + 4.0 * a)
     expected = np.array([(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5])
-    first, second = jax.jacfwd(told), jax.jacfwd(jax.jacrev(told))
-    for function, value in zip((told, first), expected, strict=False):
+    first, second = jax.jacfwd(evaluate), jax.jacfwd(jax.jacrev(evaluate))
+    for function, value in zip((evaluate, first), expected, strict=False):
         np.testing.assert_allclose(function(a), [value, -2.0 * value], rtol=1e-13)
     further = [second(a)[0], jax.jacfwd(second)(a)[0]]  # of the point alone
     np.testing.assert_allclose(further, expected[2:], rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(jax.grad(lambda a: told(a)[0]))(a), expected[1], rtol=1e-13)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(lambda a: evaluate(a)[0]))(a), expected[1], rtol=1e-13
+    )
     many = jax.vmap(first)(jnp.asarray([0.1, a, 2.0]))
     np.testing.assert_allclose(many[1], [expected[1], -2.0 * expected[1]], rtol=1e-13)
 
@@ -522,14 +524,14 @@ def test_a_fixed_point_moves_without_second_derivatives_of_its_map():
 
 
 def test_section_newton_returns_a_start_from_which_it_does_not_converge():
-    def told(a):
+    def evaluate(a):
         fixed_point = vrw.solve_fixed_point(
             lambda x: x + jnp.exp(-a * x), jnp.asarray([2.0])
         )  # repeats none
         return fixed_point.x[0], fixed_point.converged
 
-    value, slope = jax.jvp(told, (1.0,), (1.0,))
-    for x, converged in (told(1.0), value):
+    value, slope = jax.jvp(evaluate, (1.0,), (1.0,))
+    for x, converged in (evaluate(1.0), value):
         assert (float(x), bool(converged)) == (2.0, False)
     assert float(slope[0]) == 0.0
 
@@ -580,7 +582,7 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
     rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
     rows[5, column("slope")] = 0.05
 
-    def told(vectors):
+    def evaluate(vectors):
         one = lambda vector: vrw.limit_cycle(truth.make_wheel(vector))
         period = lambda vector: one(vector).period
         margin = lambda vector: one(vector).stability_margin
@@ -595,9 +597,9 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
             cycle.n_newton_iterations,
         )
 
-    *solution, outcome, passes = jax.jit(told)(rows)
+    *solution, outcome, passes = jax.jit(evaluate)(rows)
     monkeypatch.setattr(simd, "is_available", lambda: False)
-    *by_xla, code, n = jax.jit(lambda vectors: told(vectors))(rows)
+    *by_xla, code, n = jax.jit(lambda vectors: evaluate(vectors))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)
     for a, b in zip(by_xla, solution, strict=True):

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from experiments.shared.eyes import simulate_color_vision
+from experiments.shared.color_vision import simulate_color_vision
 from vrw_jax.figures import branch_figures as branch
 from vrw_jax.figures import indicators, save_animation, style
 from vrw_jax.figures.branch_figures import basin_figure

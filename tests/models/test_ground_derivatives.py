@@ -99,14 +99,14 @@ def test_batched_gradients_equal_difference_quotients():
     wheels = [STEP_SCENES[name][0] for name in ("lands sliding", "reverses", "flies")]
     value_at = [jnp.asarray(column) for column in list(zip(*wheels, strict=True))[:3]]
 
-    def told(mu, c, dtheta):
+    def evaluate(mu, c, dtheta):
         wheel, params = vrw.UnilateralWheel(friction=mu), vrw.WheelParams(damping=c)
         start = jnp.stack([jnp.asarray(0.1), dtheta, jnp.asarray(-0.1)])
         step = vrw.step(params, start, model=wheel, options=TIGHT_OPTIONS)
         return {"period": step.period, "slip": step.slip, "force": step.margins.stopper_force}
 
-    values = jax.jit(jax.vmap(told))
-    slopes = jax.jit(jax.vmap(jax.jacrev(told, argnums=(0, 1, 2))))(*value_at)
+    values = jax.jit(jax.vmap(evaluate))
+    slopes = jax.jit(jax.vmap(jax.jacrev(evaluate, argnums=(0, 1, 2))))(*value_at)
     for i in range(len(value_at)):
         size = 1e-5 * jnp.maximum(1.0, value_at[i])
         ends = [values(*value_at[:i], value_at[i] + d, *value_at[i + 1 :]) for d in (size, -size)]

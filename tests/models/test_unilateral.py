@@ -199,8 +199,8 @@ def test_the_period_of_a_gait_agrees_with_time_stepping(friction, damping):
         moreau_jean.compute_step(wheel, make_reference_start(x), h)
         for h in (16e-4, 8e-4, 4e-4, 2e-4)
     ]
-    once = lambda told: 2.0 * told[1:] - told[:-1]  # extrapolated; below once more
-    twice = lambda told: (4.0 * once(told)[1:] - once(told)[:-1]) / 3.0
+    once = lambda values: 2.0 * values[1:] - values[:-1]  # extrapolated; below once more
+    twice = lambda values: (4.0 * once(values)[1:] - once(values)[:-1]) / 3.0
     periods = twice(np.array([step.time for step in steps]))
     # Time stepping's own error: its last extrapolation moved by up to 4e-6 s.
     assert abs(periods[1] - float(jnp.sum(walk.steps.durations[-1]))) < 2e-6

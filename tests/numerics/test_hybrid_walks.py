@@ -152,15 +152,17 @@ def test_one_mode_and_one_guard_may_be_given_without_a_tuple():
     fall, floor = bouncing()
     start, options = [1.0, 0.0], vrw.StepOptions()
     listed, alone = [Mode(fall, (floor,))], Mode(fall, floor)
-    told = simulate_hybrid(listed, start, events=3)
+    solution = simulate_hybrid(listed, start, events=3)
     for modes in (alone, [alone], Mode(fall, [floor])):
-        jax.tree.map(np.testing.assert_array_equal, simulate_hybrid(modes, start, events=3), told)
+        jax.tree.map(
+            np.testing.assert_array_equal, simulate_hybrid(modes, start, events=3), solution
+        )
     np.testing.assert_array_equal(
-        time_errors(alone, start, told, options), time_errors(listed, start, told, options)
+        time_errors(alone, start, solution, options), time_errors(listed, start, solution, options)
     )
     np.testing.assert_array_equal(
-        flow_jacobian_determinant(alone, start, told, options),
-        flow_jacobian_determinant(listed, start, told, options),
+        flow_jacobian_determinant(alone, start, solution, options),
+        flow_jacobian_determinant(listed, start, solution, options),
     )
     for modes in (floor, [floor]):
         with pytest.raises(TypeError, match="Mode"):

@@ -12,7 +12,7 @@ are SI: m, s, rad, N, J.
 
     result = step(TABLE_1, x)              # one step, touchdown to touchdown
     cycle = limit_cycle(TABLE_1, x)        # period-1 gait near x
-    margins = monitors(TABLE_1, x)         # signed premises of the model over one step
+    margins = step_margins(TABLE_1, x)     # signed margins of the model over one step
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from . import five_coordinates_equations as equations
 from .constrained_wheel import NO_EVENT, Array, Guard, Params, Phase, Wheel, run_phase
-from .premises import compute_margins
+from .margins import compute_margins
 
 TABLE_1: dict[str, float] = {
     "hub_mass": 10.0,
@@ -370,8 +370,8 @@ def limit_cycle(
     return result
 
 
-def monitors(params: Params, x: Any) -> dict[str, Any]:
-    """Signed premises over one step from section state x; negative means broken.
+def step_margins(params: Params, x: Any) -> dict[str, Any]:
+    """Return the signed margins of one step from section state x; negative means violated.
 
     Forces come from the accelerations of the point masses by Newton's law, not from multipliers.
 

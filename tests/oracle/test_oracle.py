@@ -14,7 +14,7 @@ import pytest
 from . import five_coordinates as oracle
 from . import five_coordinates_equations as equations
 from .constrained_wheel import Wheel
-from .premises import mass_velocities
+from .margins import mass_velocities
 
 TRUTH = json.loads(Path(__file__).with_name("truth.json").read_text())
 CASES = {case["name"]: case for case in TRUTH["cases"]}
@@ -139,7 +139,7 @@ def test_derivatives_of_the_reference_obey_the_scaling_laws_in_22_digits(name: s
 
 
 def test_newtons_law_on_the_point_masses_gives_the_multipliers() -> None:
-    solution = oracle.monitors(oracle.TABLE_1, oracle.START)
+    solution = oracle.step_margins(oracle.TABLE_1, oracle.START)
     assert solution["newton_residual"] < 1e-9
     assert solution["lambda2"]["DLS"] == pytest.approx(103.898, abs=1e-2)
 

@@ -63,14 +63,14 @@ def test_a_measure_added_by_the_how_to_works_wherever_measures_are_named(tmp_pat
         env=os.environ | {"PYTHONPATH": str(tmp_path)}, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-2000:]
-    told, wheel = json.loads(run.stdout.splitlines()[-1]), vrw.WheelParams()
+    printed, wheel = json.loads(run.stdout.splitlines()[-1]), vrw.WheelParams()
     weight = float((wheel.hub_mass + wheel.n_legs * wheel.leg_mass) * wheel.gravity)
     at = lambda slope: weight * np.sin(slope)
-    np.testing.assert_allclose(told["value"], at(0.3), rtol=1e-7)
-    np.testing.assert_allclose(told["by_slope"], weight * np.cos(0.3), rtol=1e-5)
-    np.testing.assert_allclose(told["scan"], at(0.3), rtol=1e-7)
-    np.testing.assert_allclose(told["branch"], at(np.array(told["slopes"])), rtol=1e-7)
-    np.testing.assert_allclose(told["least"], [0.28, at(0.28)], rtol=1e-7)
-    np.testing.assert_allclose(told["kept"], np.arcsin(53.0 / weight), rtol=1e-5)
-    assert told["scan_unit"] == "N"
-    assert told["held_by"] == ["cost_of_transport"]
+    np.testing.assert_allclose(printed["value"], at(0.3), rtol=1e-7)
+    np.testing.assert_allclose(printed["by_slope"], weight * np.cos(0.3), rtol=1e-5)
+    np.testing.assert_allclose(printed["scan"], at(0.3), rtol=1e-7)
+    np.testing.assert_allclose(printed["branch"], at(np.array(printed["slopes"])), rtol=1e-7)
+    np.testing.assert_allclose(printed["least"], [0.28, at(0.28)], rtol=1e-7)
+    np.testing.assert_allclose(printed["kept"], np.arcsin(53.0 / weight), rtol=1e-5)
+    assert printed["scan_unit"] == "N"
+    assert printed["held_by"] == ["cost_of_transport"]

@@ -46,16 +46,16 @@ def process(monkeypatch):
 
 def multiples():
     """The numbers of X times each factor, by machine code and by a trace that calls some."""
-    told = []
+    results = []
     for factor in FACTORS:
         lanes = lambda _, x, factor=factor: (factor * x[0],)
-        told.append(cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0])
+        results.append(cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0])
         within = cached_lane_function(lambda x, f=factor: f * x, lambda x: x, ("within", factor))
         call = lambda x, g=within: g(x) + 0.0
-        told.append(
+        results.append(
             compile_exported(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(X)
         )
-    return told
+    return results
 
 
 def expected():
@@ -70,8 +70,8 @@ def check_recompiles(process, warns=True):
         with warnings.catch_warnings(record=True) as seen:
             warnings.simplefilter("always")
             np.testing.assert_array_equal(multiples(), expected())
-        told = [str(w.message) for w in seen if "again" in str(w.message)]
-        assert len(told) == (warns and not again), told
+        results = [str(w.message) for w in seen if "again" in str(w.message)]
+        assert len(results) == (warns and not again), results
 
 
 @pytest.mark.parametrize("kind", ["lanes_index", "lanes_code", "vrw_trace"])
@@ -217,8 +217,8 @@ def test_a_folder_that_others_can_write_is_refused_in_one_sentence(tmp_path, mod
     place = tmp_path / "cache"
     place.mkdir()
     place.chmod(mode)
-    told = started(JAX_COMPILATION_CACHE_DIR=str(place))
-    line = told.stderr.splitlines()[-1]
+    results = started(JAX_COMPILATION_CACHE_DIR=str(place))
+    line = results.stderr.splitlines()[-1]
     assert line.startswith(f"PermissionError: the cache {place} can be written by other users")
     assert line.endswith("VRW_TRUST_SHARED_CACHE=1.")
     for allowed in (
@@ -241,11 +241,11 @@ def test_a_refused_folder_is_not_jaxs_either(tmp_path):
 
 def test_the_command_line_refuses_such_a_folder_in_one_line(tmp_path):
     tmp_path.chmod(0o777)
-    told = subprocess.run(
+    results = subprocess.run(
         [sys.executable, "-m", "vrw_jax", "gait", "--steps", "1"],
         env=os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)},
         capture_output=True, text=True,
     )  # fmt: skip
-    assert told.returncode == 2
-    assert len(told.stderr.splitlines()) == 1
-    assert told.stderr.startswith("vrw: the cache")
+    assert results.returncode == 2
+    assert len(results.stderr.splitlines()) == 1
+    assert results.stderr.startswith("vrw: the cache")

@@ -77,12 +77,12 @@ def fork(parent, calls, seconds, tmp_path):
     """What came of each call in a child of its own, forked by a parent with or without arrays."""
     place = tmp_path / "parent.py"
     place.write_text(PROGRAM)
-    told = subprocess.run(
+    results = subprocess.run(
         [sys.executable, place, parent, json.dumps(calls), str(seconds)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True, text=True,
     )  # fmt: skip
-    assert told.returncode == 0, told.stderr
-    return json.loads(told.stdout)
+    assert results.returncode == 0, results.stderr
+    return json.loads(results.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_a_child_forked_before_any_array_computes(tmp_path):
 
 def test_the_how_to_runs_as_a_file_and_prints_what_it_says(tmp_path):
     """Reference: the gaits' periods, computed one by one in this process."""
-    code, told = re.search(
+    code, results = re.search(
         r"```python\n(.*?)```\n\n```text\n(.*?)```", HOWTO.read_text(), re.S
     ).groups()
     (tmp_path / "spawned.py").write_text(code)
@@ -115,6 +115,6 @@ def test_the_how_to_runs_as_a_file_and_prints_what_it_says(tmp_path):
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True, text=True,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
-    assert run.stdout == told
+    assert run.stdout == results
     periods = [float(vrw.limit_cycle(vrw.WheelParams(damping=c)).period) for c in (120.0, 150.0)]
-    assert [round(period, 3) for period in periods] == json.loads(told)
+    assert [round(period, 3) for period in periods] == json.loads(results)

@@ -327,17 +327,17 @@ def test_chunks_are_slabs() -> None:
 
 
 def test_values_match_their_coordinates() -> None:
-    told = run_plan(make_plan(), evaluate=evaluate_arithmetically)
+    scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
     for damping in SMALL_GRID.values["damping"]:
         for slope in SMALL_GRID.values["slope"]:
-            value_at = told.sel(damping=damping, slope=slope)
+            value_at = scan_result.sel(damping=damping, slope=slope)
             assert value_at.dls_fraction == pytest.approx(
                 np.sin(damping) + np.sin(slope), abs=1e-15
             )
 
 
 def test_every_variable_is_described() -> None:
-    told = run_plan(make_plan(), evaluate=evaluate_arithmetically)
+    scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
     for name in (
         *ALWAYS_INCLUDED,
         "dls_fraction",
@@ -345,24 +345,27 @@ def test_every_variable_is_described() -> None:
         "damping",
         "slope",
     ):
-        assert told[name].attrs["units"]
-        assert told[name].attrs["long_name"]
-    assert len(told.outcome.attrs["flag_values"]) == len(Outcome)
-    assert told.outcome.attrs["flag_meanings"].split()[0] == "STEPPED"
-    assert json.loads(told.attrs["scan"])["wheel"]["stiffness"] == 500.0
-    assert "jax" in json.loads(told.attrs["provenance"])["versions"]
+        assert scan_result[name].attrs["units"]
+        assert scan_result[name].attrs["long_name"]
+    assert len(scan_result.outcome.attrs["flag_values"]) == len(Outcome)
+    assert scan_result.outcome.attrs["flag_meanings"].split()[0] == "STEPPED"
+    assert json.loads(scan_result.attrs["scan"])["wheel"]["stiffness"] == 500.0
+    assert "jax" in json.loads(scan_result.attrs["provenance"])["versions"]
 
 
 def test_progress_counts_samples_failures_and_reused_samples(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_plan(make_plan(), tmp_path / "s.zarr", evaluate=CountingEngine(2))
-    told: list[ScanProgress] = []
+    reports: list[ScanProgress] = []
     result = run_plan(
-        make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically, on_progress=told.append
+        make_plan(),
+        tmp_path / "s.zarr",
+        evaluate=evaluate_arithmetically,
+        on_progress=reports.append,
     )
-    assert (told[0].n_done, told[0].n_samples, told[0].n_reused) == (0, 16, 4)
-    assert (told[-1].n_done, told[-1].n_samples) == (16, 16)
-    assert told[-1].n_failed == int(np.sum(result.outcome.values[1:] != Outcome.STEPPED))
+    assert (reports[0].n_done, reports[0].n_samples, reports[0].n_reused) == (0, 16, 4)
+    assert (reports[-1].n_done, reports[-1].n_samples) == (16, 16)
+    assert reports[-1].n_failed == int(np.sum(result.outcome.values[1:] != Outcome.STEPPED))
 
 
 def test_the_first_difference_is_named_by_its_path() -> None:
@@ -403,11 +406,11 @@ def engine_results(engine: CollocationEngine) -> Mapping[str, np.ndarray]:
 
 
 def test_table_1_gives_the_paper_s_gait(engine: CollocationEngine) -> None:
-    told = engine({"damping": np.array([200.0])})
-    assert told["outcome"] == Outcome.STEPPED
-    assert told["dls_fraction"] == pytest.approx(0.5315, abs=1e-4)
-    assert told["speed"] == pytest.approx(0.8700, abs=1e-4)
-    assert told["fore_foot_force"] == pytest.approx(103.9, abs=0.05)
+    values_by_name = engine({"damping": np.array([200.0])})
+    assert values_by_name["outcome"] == Outcome.STEPPED
+    assert values_by_name["dls_fraction"] == pytest.approx(0.5315, abs=1e-4)
+    assert values_by_name["speed"] == pytest.approx(0.8700, abs=1e-4)
+    assert values_by_name["fore_foot_force"] == pytest.approx(103.9, abs=0.05)
 
 
 def test_the_result_of_a_sample_does_not_depend_on_the_others(
@@ -465,10 +468,10 @@ def test_every_parameter_can_be_swept_at_once(engine: CollocationEngine) -> None
         name: float(getattr(base, name)) * (1.0 + 0.01 * rng.uniform(-1, 1, 8))
         for name in PARAMETER_NAMES
     }
-    told = engine(columns)
-    step_result = told["outcome"] == Outcome.STEPPED
+    values_by_name = engine(columns)
+    step_result = values_by_name["outcome"] == Outcome.STEPPED
     assert np.count_nonzero(step_result) >= 4
-    assert len(np.unique(told["speed"][step_result])) == np.count_nonzero(step_result)
+    assert len(np.unique(values_by_name["speed"][step_result])) == np.count_nonzero(step_result)
 
 
 def test_a_cycle_is_a_fixed_point_of_the_event_driven_step(
@@ -485,9 +488,9 @@ def test_a_cycle_that_the_step_does_not_confirm_has_an_outcome(
 ) -> None:
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(finder, "STATE_AGREEMENT_TOLERANCE", 0.0)
-    told = engine({"damping": np.array([200.0])})
-    assert told["outcome"] == Outcome.MESH_TOO_COARSE
-    assert np.isnan(told["speed"])
+    values_by_name = engine({"damping": np.array([200.0])})
+    assert values_by_name["outcome"] == Outcome.MESH_TOO_COARSE
+    assert np.isnan(values_by_name["speed"])
 
 
 def test_the_engine_is_traced_once(
@@ -576,7 +579,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     run_plan(make_plan(1), single_result, evaluate=engine)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)  # workers start out with the suite's
-    told: list[ScanProgress] = []
+    reports: list[ScanProgress] = []
     killed: list[int] = []
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
@@ -586,7 +589,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
         places = client.run(os.getpid)
 
         def report(progress: ScanProgress) -> None:
-            told.append(progress)
+            reports.append(progress)
             if progress.n_done and not killed:
                 busy = client.processing()
                 victim = max(places, key=lambda place: len(busy.get(place, ())))
@@ -597,7 +600,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
         result = run_plan(make_plan(1), shared, on_progress=report, executor=executor)
         assert len(killed) == 1
         assert killed[0] not in client.run(os.getpid).values()
-    assert told[-1].n_done == SMALL_GRID.size
+    assert reports[-1].n_done == SMALL_GRID.size
     assert np.all(result.outcome.values != -1)
     assert list_files(shared) == list_files(single_result)
 
@@ -634,8 +637,10 @@ def test_workers_with_another_environment_are_refused(
     from distributed import LocalCluster
 
     scan_dask = dask
-    told = iter([{"code": "ours"}])
-    monkeypatch.setattr(scan_dask, "describe_environment", lambda: next(told, {"code": "theirs"}))
+    environments = iter([{"code": "ours"}])
+    monkeypatch.setattr(
+        scan_dask, "describe_environment", lambda: next(environments, {"code": "theirs"})
+    )
     monkeypatch.setattr(scan_dask, "_make_engine_once", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,

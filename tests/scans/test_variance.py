@@ -52,19 +52,19 @@ def test_a_measure_that_varies_by_round_off_has_indices_of_zero(value: float) ->
     ulps = np.random.default_rng(0).integers(-2, 3, len(unit))
     scan["step_length"] = ("sample", value + ulps * np.spacing(value) * (value != 0.0))
     with pytest.warns(UserWarning, match=r"step_length: constant .* round-off"):
-        told = vrw.sobol_indices(scan, ["period", "step_length"])
-    assert told.is_constant.values.tolist() == [False, True]
+        indices = vrw.sobol_indices(scan, ["period", "step_length"])
+    assert indices.is_constant.values.tolist() == [False, True]
     for name in ("first_order", "total"):
         for part in ("", "_lower", "_upper"):
-            assert np.all(told[name + part].sel(measure="step_length") == 0.0)
-        np.testing.assert_allclose(told[name].sel(measure="period"), [0.8, 0.2, 0.0], atol=0.05)
+            assert np.all(indices[name + part].sel(measure="step_length") == 0.0)
+        np.testing.assert_allclose(indices[name].sel(measure="period"), [0.8, 0.2, 0.0], atol=0.05)
 
 
 def test_a_spread_of_a_ten_thousand_millionth_is_no_round_off() -> None:
     scan, unit = make_ishigami_scan()
     scan["period"] = ("sample", 0.7 * (1.0 + 1e-10 * (2.0 * unit[:, 0] + unit[:, 1])))
-    told = vrw.sobol_indices(scan, ["period"]).sel(measure="period")
-    np.testing.assert_allclose(told.total, [0.8, 0.2, 0.0], atol=0.01)
+    indices = vrw.sobol_indices(scan, ["period"]).sel(measure="period")
+    np.testing.assert_allclose(indices.total, [0.8, 0.2, 0.0], atol=0.01)
 
 
 def test_rows_without_a_gait_are_omitted_and_counted() -> None:

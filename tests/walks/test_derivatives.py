@@ -130,7 +130,7 @@ def test_second_derivatives_agree_with_differences_of_first_ones():
 
 
 def test_margins_and_indicators_are_differentiable():
-    def told(params, x):
+    def evaluate(params, x):
         result = vrw.step(params, x, options=TIGHT_OPTIONS)
         m = result.margins
         return jnp.stack(
@@ -148,13 +148,15 @@ def test_margins_and_indicators_are_differentiable():
         )
 
     h = 0.02
-    value_at = lambda damping: told(vrw.WheelParams(damping=damping), START)
+    value_at = lambda damping: evaluate(vrw.WheelParams(damping=damping), START)
     difference = (
         8 * (value_at(200 + h) - value_at(200 - h))
         - (value_at(200 + 2 * h) - value_at(200 - 2 * h))
     ) / (12 * h)
     # By all arguments, for which other tests have the machine code.
-    solution = jax.jacfwd(told, argnums=(0, 1))(vrw.WheelParams(damping=200.0), START)[0].damping
+    solution = jax.jacfwd(evaluate, argnums=(0, 1))(vrw.WheelParams(damping=200.0), START)[
+        0
+    ].damping
     # Differences of forces of 100 N good to 1e-12: 1e-12 / h.
     np.testing.assert_allclose(solution, difference, rtol=1e-7, atol=2e-10)
 

@@ -188,8 +188,8 @@ def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
     h, options = 1e-5, TIGHT
     ends = [at([0.29 + d], options=options) for d in (h, -h)]
     rows = [np.array([*end.state[:, 0], *end.rear_impulse, *end.stopper_margin]) for end in ends]
-    told = at([0.29], derivatives=("next_slope",)).jacobian[0, :, 0]
-    np.testing.assert_allclose(told, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
+    jacobian = at([0.29], derivatives=("next_slope",)).jacobian[0, :, 0]
+    np.testing.assert_allclose(jacobian, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
 
 
 @pytest.mark.parametrize("model", [None, vrw.RigidWheel(), vrw.UnilateralWheel()])

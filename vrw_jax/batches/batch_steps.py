@@ -323,7 +323,7 @@ def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
     A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There
     stability limits the solver's steps by m/c, and Leg 2 extends at the rate k (Ls - L)/c from its
     length at release. The exponents are rounded from a fit to the solver's steps of wheels near
-    their gaits and away from them (`python -m experiments.speed.lanes_that_wait`).
+    their gaits and away from them (`python -m experiments.speed.straggler_steps`).
     """
     values_by_name = dict(zip(PARAMETER_NAMES, columns, strict=True))
     single_precision = lambda name: np.asarray(values_by_name[name], np.float32)

@@ -1,10 +1,10 @@
-"""Use this rung when: the lower rungs' errors against real ground, scene by scene, and their cost.
+"""Measure the errors of the simpler models against unilateral contact, by scene, and their cost.
 
-    python -m experiments.ground.rung_table
+    python -m experiments.ground.model_table
 
-A scene is a wheel on a ground; the reference is its gait on the unilateral rung, reached by a walk
-from the gait of the paper's rung (or the paper's start, where that has none). Costs are CPU times
-of one compiled step, of one wheel by itself and of one among many (`vrw.steps`).
+A scene is a wheel on a ground. The reference is its gait with unilateral contact, reached by a walk
+from the gait of the paper's model, or from the paper's start if there is none. Costs are CPU times
+of one compiled step, of one wheel by itself and of one among many (`vrw.step_batch`).
 """
 
 import math
@@ -84,7 +84,7 @@ def errors() -> None:
     shown = "scene", "outcome", "period", "dls_fraction", "speed"
     shown += "paper_period_error", "paper_dls_fraction_error", "paper_speed_error"
     show_table(
-        "explanation/ladder.md", FIGURES / "rung_table.csv", "experiments.ground.rung_table", shown
+        "explanation/ladder.md", FIGURES / "rung_table.csv", "experiments.ground.model_table", shown
     )
 
 
@@ -122,7 +122,9 @@ def costs() -> None:
         rows.append(row)
         print(row, flush=True)
     write_table(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
-    show_table("benchmarks/contact.md", FIGURES / "rung_costs.csv", "experiments.ground.rung_table")
+    show_table(
+        "benchmarks/contact.md", FIGURES / "rung_costs.csv", "experiments.ground.model_table"
+    )
 
 
 if __name__ == "__main__":

@@ -536,10 +536,10 @@ def test_an_environment_that_can_t_be_meant_gets_one_sentence(
     (working_folder / "my.toml").write_text(GRID_TABLE)
     arguments, environment, expected = PROCESSES[name]
     before = list_files(working_folder)
-    told = process(working_folder, arguments, environment, capture_output=True)
-    assert told.returncode == 2, told.stderr
-    assert told.stderr.startswith(f"vrw: {expected}")
-    assert len(told.stderr.splitlines()) == 1
+    completed = process(working_folder, arguments, environment, capture_output=True)
+    assert completed.returncode == 2, completed.stderr
+    assert completed.stderr.startswith(f"vrw: {expected}")
+    assert len(completed.stderr.splitlines()) == 1
     assert list_files(working_folder) == before
 
 
@@ -547,7 +547,7 @@ def test_an_environment_that_can_t_be_meant_gets_one_sentence(
 @pytest.mark.parametrize("arguments", [("--version",), ("init", "new")])
 def test_a_full_device_gets_one_sentence(arguments: tuple[str, ...], working_folder: Path) -> None:
     with open("/dev/full", "w") as full:
-        told = process(working_folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)
-    assert told.returncode == 2
-    assert len(told.stderr.splitlines()) == 1
-    assert "No space left on device." in told.stderr
+        completed = process(working_folder, arguments, {}, stdout=full, stderr=subprocess.PIPE)
+    assert completed.returncode == 2
+    assert len(completed.stderr.splitlines()) == 1
+    assert "No space left on device." in completed.stderr

@@ -1,4 +1,4 @@
-"""Answers to within a tolerance: by which model, how wrong, and what is refused."""
+"""Measures to within a tolerance: the model that is used, the error, and invalid arguments."""
 
 import math
 

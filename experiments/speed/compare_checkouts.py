@@ -1,11 +1,11 @@
-"""A change of the house costs no speed: two checkouts, in turns within one run, none below 0.97.
+"""Compare the speed of two checkouts in turns within one run; none should fall below 0.97.
 
-    python -m experiments.speed.house_benchmark A B [--turns 5] [--csv FILE]
+    python -m experiments.speed.compare_checkouts A B [--turns 5] [--csv FILE]
 
-Gait steps by lanes and by collocation, limit cycles from a cold guess, samples of a scan, and the
-import (the one figure that is to be small), of the libraries in folders A (before) and B (after).
-Each turn of each is a process of its own with a cache of its own; the first, uncounted, fills it.
-CPU time of one core; told are medians over turns, of B over A too. Take it on an idle machine.
+Measures gait steps by lanes and by collocation, limit cycles from a cold guess, samples of a scan,
+and the import time, of the libraries in the folders A (before) and B (after). Each turn is a
+process with its own cache, and the first one, which fills the cache, does not count. Figures are
+medians over turns of the CPU time of one core, also as ratios B over A. Run it on an idle machine.
 """
 
 import json
@@ -20,7 +20,7 @@ from experiments.shared.command import make_parser
 from experiments.shared.tables import format_markdown, write_table
 from experiments.shared.timing import use_one_core
 
-WORKER = Path(__file__).with_name("house_worker.py")
+WORKER = Path(__file__).with_name("checkout_worker.py")
 TURN = f"import runpy; runpy.run_path({str(WORKER)!r})['turn']()"
 IMPORT = "CPU ms of import vrw_jax"
 HEADER = ("figure", "A", "B", "B / A", "lowest", "highest")
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("b", type=Path, help="folder of the checkout after")
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--csv", type=Path, help="keep the table there")
-    parser.add_argument("--caches", type=Path, default="results/house_benchmark")
+    parser.add_argument("--caches", type=Path, default="results/compare_checkouts")
     chosen = parser.parse_args()
     with use_one_core():
         both_values = chosen.a.resolve(), chosen.b.resolve()

@@ -1,4 +1,4 @@
-"""Borders in two parameters: curves through turning points, closed ones, and what they meet."""
+"""Curves of special points in two parameters: turning points, closed curves and intersections."""
 
 import functools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What a scan tells of borders: changes of sign between neighbours, and the curves beside them."""
+"""Maps of special points: sign changes between neighboring samples, and the curves near them."""
 
 import numpy as np
 import pytest

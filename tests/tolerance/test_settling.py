@@ -1,4 +1,4 @@
-"""Walks come to rest where plain ones do, in a fraction of the steps, and leaps are taken back."""
+"""Walks settle where walks without leaps do, in a fraction of the steps, and leaps are undone."""
 
 from unittest.mock import Mock
 

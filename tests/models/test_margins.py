@@ -1,4 +1,4 @@
-"""Monitors and forces against Newton's law on the point masses, from the independent oracle."""
+"""Margins and forces against Newton's law on the point masses, from the independent reference."""
 
 import functools
 
@@ -29,7 +29,7 @@ def test_every_margin_equals_the_reference(index, by_lanes):
     )
     solution = jax.tree.map(lambda leaf: np.asarray(leaf[0]), solution)
     m = solution.margins
-    oracle = five_coordinates.monitors(params, start)
+    oracle = five_coordinates.step_margins(params, start)
     least_fore = min(oracle["lambda2"].values())
     # The oracle reads minima off a dense trajectory: a few 1e-7 of the largest term near a minimum.
     near = {"rtol": 2e-6, "atol": 2e-6}

@@ -1,13 +1,13 @@
-"""Claimed against true errors of `vrw.answer`, what it costs, and which rung answers where.
+"""Compare claimed and true errors of `vrw.measure_to_tolerance`, its cost, and the models it uses.
 
-    python -m experiments.answers.claimed [--parts 25] [--folder results/answers] [--redraw]
+    python -m experiments.tolerance.claimed_errors [--parts 25] [--folder FOLDER] [--redraw]
 
-A part is 400 wheels of a wide box and 100 hostile ones: of eight times as many the paper's gaits
-that are nearest to a fold, to a border (an indicator at zero) or without double support. Friction
-is 0.5 to 100. Each wheel is asked once, to a tolerance of its own between 1e-2 and 1e-8. Its truth
-is Newton's method on steps with their own derivatives, at 1e-12, or where feet dip so often that it
-does not converge at up to 1e-9, which shares nothing but the step with the answer. Parts that lie
-in the folder are not computed again.
+A part is 400 wheels of a wide box and 100 hostile ones. The hostile ones are those of eight times
+as many whose gaits of the paper's model are nearest to a fold, nearest to the zero of an indicator,
+or without double support. Friction is 0.5 to 100. Each wheel is measured once, to its own tolerance
+between 1e-2 and 1e-8. The reference is Newton's method on steps with their own derivatives at
+1e-12, or at up to 1e-9 if feet dip so often that it does not converge. It shares only the step with
+the measured values. Parts that are in the folder are not computed again.
 """
 
 from collections import Counter
@@ -237,7 +237,7 @@ def count_results() -> None:
             )
     header = "set", "tolerance", "answers", *KINDS, "steps", "outside", "worst", "gait unconfirmed"
     write_table(COUNT, header, table)
-    show_table("verification/tolerances.md", COUNT, "experiments.answers.claimed")
+    show_table("verification/tolerances.md", COUNT, "experiments.tolerance.claimed_errors")
     print(format_markdown(header, table))
 
 

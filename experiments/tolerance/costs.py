@@ -1,12 +1,12 @@
-"""What answers cost beside the top rung alone: scans of wheels, and means over them.
+"""Compare the cost of measures to a tolerance with that of unilateral contact alone.
 
-    python -m experiments.answers.costs [--wheels 1024] [--repeats 2]
+    python -m experiments.tolerance.costs [--wheels 1024] [--repeats 2]
 
-Scans of real ground are timed against scans to a tolerance of 1e-3 of the same wheels at friction
-15 to 100, CPU time, the best of each, and once more of those wheels that begin at a gait of the
-paper's and end near it. Means are taken of wheels around a design and over a box, and
-their CPU time set beside that of a scan on real ground of as many wheels as a mean of them would
-need for the same error; what they are wrong by is told by all wheels at 1e-6.
+Scans with unilateral contact are timed against scans to a tolerance of 1e-3 of the same wheels, at
+friction 15 to 100. Figures are CPU times, the best of each. They are repeated for the wheels whose
+gait is near that of the paper's model. Means are taken over wheels around a design and over a box.
+Their CPU time is compared with that of a scan with unilateral contact of as many wheels as a mean
+of them needs for the same error. All wheels at 1e-6 are the reference of their errors.
 """
 
 import functools
@@ -102,7 +102,7 @@ def measure_means() -> None:
     )  # fmt: skip
     write_table(TABLE, header, rows)
     columns = [name for name in header if name not in ("wheels alone", "ms each")]
-    show_table("verification/tolerances.md", TABLE, "experiments.answers.costs", columns)
+    show_table("verification/tolerances.md", TABLE, "experiments.tolerance.costs", columns)
     print(format_markdown(header, rows))
 
 

@@ -1,6 +1,6 @@
-"""Pictures as eyes without green cones see them: colours that then look alike must not differ.
+"""Simulate pictures for readers without green cones, to whom different colors must not look alike.
 
-    python -m experiments.shared.eyes PICTURE.png ... [--out FOLDER]
+    python -m experiments.shared.color_vision PICTURE.png ... [--out FOLDER]
 
 Deuteranopia by Machado, Oliveira and Fernandes (2009), on linear light.
 """
@@ -33,7 +33,7 @@ def simulate_color_vision(colours: np.ndarray) -> np.ndarray:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("pictures", type=Path, nargs="+", metavar="PICTURE.png")
-    parser.add_argument("--out", type=Path, default=Path("results/eyes"))
+    parser.add_argument("--out", type=Path, default=Path("results/color_vision"))
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     for path in chosen.pictures:

@@ -1,4 +1,4 @@
-"""The premises of the paper's model, measured by Newton's law on the point masses.
+"""Margins of the paper's model, by Newton's law on the point masses.
 
 Nothing here uses a multiplier: forces and impulses are balances of hub and legs.
 """
@@ -164,7 +164,7 @@ def _lowest(
 
 
 def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Signed premises over one completed step, as ``five_coordinates.monitors`` lists them."""
+    """Return the signed margins of one completed step, as in ``five_coordinates.step_margins``."""
     phases: dict[str, Phase] = {phase.name: phase for phase in result["phases"]}
     length, legs = wheel.params["locked_length"], int(wheel.params["n_legs"])
 

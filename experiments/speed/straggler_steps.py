@@ -1,12 +1,12 @@
-"""How many steps of the solver lanes wait for the slowest of their group, by the order they are in.
+"""Measure how many solver steps lanes wait for the slowest lane of their group, by their order.
 
-    python -m experiments.speed.lanes_that_wait [--lanes 4096] [--tolerance 6e-8]
+    python -m experiments.speed.straggler_steps [--lanes 4096] [--tolerance 6e-8]
 
-A group of eight lanes goes through each phase together. Told is how many steps its slowest lane
-tries over how many its lanes do on average: 1 where none waits. Orders are as given, by c/m, that
-of `vrw.step_batch`, and by the steps of SLS-I themselves, unknown in advance. Printed are also fits
-of SLS-I's steps, of which `work_order` has the powers rounded, over that of c/m. Writes a
-table into `docs/benchmarks/steps.md`.
+A group of eight lanes goes through each phase together. The figure is the number of steps of its
+slowest lane over the mean number of its lanes, which is 1 if none waits. The orders are: as given,
+by c/m, that of `vrw.step_batch`, and by the steps of SLS-I themselves, which are not known before.
+The experiment also prints fits of the steps of SLS-I, of which `work_order` has rounded powers. It
+writes a table into `docs/benchmarks/steps.md`.
 """
 
 import functools
@@ -102,7 +102,7 @@ def main() -> None:
     table = format_markdown(
         ("wheels", "as given", "c/m", "`vrw.step_batch`", "SLS-I's steps"), result
     )
-    source = describe_run("experiments.speed.lanes_that_wait")
+    source = describe_run("experiments.speed.straggler_steps")
     replace_block(DOCS / "benchmarks" / "steps.md", "waiting", table, source)
     print(table)
     print(format_markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))

@@ -1,10 +1,10 @@
-"""Points of border curves that a core follows, reads and searches for meetings in a second.
+"""Measure how many points of curves of special points a core traces per second.
 
-    python -m experiments.speed.border_curves [--repeats 10]
+    python -m experiments.speed.curve_benchmark [--repeats 10]
 
-The curves with which the map over damping and stiffness begins (configs/map_c_k.toml), compiled
-before: CPU time of one core, the best of some repetitions, without the branches that meet them and
-with.
+The curves are the first ones of the map over damping and stiffness (configs/map_c_k.toml), compiled
+before. The figure is the CPU time of one core, the best of some repetitions, with and without the
+branches that meet the curves.
 """
 
 import numpy as np

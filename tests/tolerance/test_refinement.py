@@ -1,4 +1,4 @@
-"""Corrections end next to the point that a map repeats, where it jumps, too."""
+"""Corrections converge to the fixed point of a map, also next to a jump."""
 
 from unittest.mock import Mock
 

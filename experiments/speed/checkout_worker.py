@@ -1,6 +1,6 @@
-"""One turn of `house_benchmark`: how fast the library is that stands first on the path, old or new.
+"""Measure the speed of the library that is first on the path, for one turn of `compare_checkouts`.
 
-It knows the public face alone, and nothing of the experiments beside it.
+It uses only the public interface, and no other experiment.
 """
 
 import json
