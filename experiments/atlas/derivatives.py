@@ -323,7 +323,7 @@ def meeting() -> Rows:
     as_array = lambda matrix: jnp.asarray(np.array(matrix.tolist(), float))
     value_at = lambda s: as_array(base) + s * as_array(change)
     measures = {
-        "radius": lambda s: floquet.spectral_radius(value_at(s)),
+        "radius": lambda s: floquet.compute_spectral_radius(value_at(s)),
         "jury": lambda s: floquet.jury_margins(value_at(s)),
     }
     derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}

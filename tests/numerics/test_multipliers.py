@@ -19,7 +19,9 @@ def test_eigenvalues_agree_with_lapack(size):
         assert gap.min(0).max() < 1e-10
         assert gap.min(1).max() < 1e-10
     radius = np.abs(np.linalg.eigvals(matrices)).max(1)
-    np.testing.assert_allclose(floquet.spectral_radius(jnp.asarray(matrices)), radius, rtol=1e-11)
+    np.testing.assert_allclose(
+        floquet.compute_spectral_radius(jnp.asarray(matrices)), radius, rtol=1e-11
+    )
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -30,7 +32,7 @@ def test_radius_differentiates_like_left_and_right_eigenvectors(size):
         k = np.argmax(np.abs(values))
         derivative = np.outer(left_part[k], right[:, k])  # d value / d matrix
         expected = np.real(np.conj(values[k]) * derivative) / np.abs(values[k])
-        solution = jax.grad(floquet.spectral_radius)(jnp.asarray(matrix))
+        solution = jax.grad(floquet.compute_spectral_radius)(jnp.asarray(matrix))
         np.testing.assert_allclose(solution, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -57,7 +59,7 @@ def test_the_margin_is_differentiable_at_equal_eigenvalues():
         - floquet.stability_margin(defective - step * direction)
     ) / (2 * step)
     np.testing.assert_allclose(jnp.sum(gradient * direction), slope, rtol=1e-7)
-    assert np.all(np.isfinite(jax.grad(floquet.spectral_radius)(defective)))
+    assert np.all(np.isfinite(jax.grad(floquet.compute_spectral_radius)(defective)))
 
 
 def test_rotation_by_a_right_angle_has_multipliers_plus_and_minus_i():

@@ -99,6 +99,9 @@ class AbstractContinuation(abc.ABC):
     ending_quantities: ClassVar[tuple[str, ...]] = ()
     """Names of columns at whose zeros a branch ends because the order of events changes."""
 
+    margin_names: ClassVar[tuple[str, ...]] = ()
+    """Names of margins and indicators, whose zeros are border collisions."""
+
     linear_substitutes: ClassVar[Mapping[str, str]] = {}
     """Margins that vanish ill-conditioned, each with the column that vanishes at the same point."""
 
@@ -111,8 +114,8 @@ class AbstractContinuation(abc.ABC):
         """Return for each point of a table whether it is admissible."""
 
     def is_margin(self, name: str) -> bool:
-        """Return whether a column's zero is a border collision."""
-        return False
+        """Return whether a column's zero is a border collision; the name may end with a leg."""
+        return name.partition("[")[0] in self.margin_names
 
     def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
         """Return the table with NaN for quantities that are undefined for the wheel of a point."""

@@ -113,6 +113,7 @@ class GaitContinuation(AbstractContinuation):
         *BRANCH_ENDING_QUANTITIES,
         FRICTION_SURPLUS_COLUMN,
     )
+    margin_names: ClassVar[tuple[str, ...]] = (*INDICATOR_NAMES, *MARGIN_MEASURES)
     linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
     """Margins that vanish as a cube, with the quantity that vanishes linearly at the same point. A
     foot that takes off less steeply dips less deeply, until it rises at once. A solver cannot
@@ -149,9 +150,6 @@ class GaitContinuation(AbstractContinuation):
             f"At {value:.9g} the friction coefficient is the tangent of the slope: with less no "
             "contact carries the weight along the slope, and no gait repeats."
         )
-
-    def is_margin(self, name: str) -> bool:
-        return name in INDICATOR_NAMES or name.partition("[")[0] in MARGIN_MEASURES
 
     def name_end(self, table: QuantityTable, row_index: int) -> str:
         outcome = Outcome(int(table["outcome"][row_index]))

@@ -101,6 +101,7 @@ class CurveContinuation(AbstractContinuation):
         EDGE_COLUMN,
         FORCE_FALL_NAME,
     )
+    margin_names: ClassVar[tuple[str, ...]] = GaitContinuation.margin_names
     linear_substitutes: ClassVar[Mapping[str, str]] = LINEAR_SUBSTITUTES
 
     def evaluate_points(self, wheels: TestFunctionArgs, points: ContinuationPoint) -> QuantityTable:
@@ -148,9 +149,6 @@ class CurveContinuation(AbstractContinuation):
     def is_admissible(self, table: QuantityTable) -> np.ndarray:
         is_positive = np.all([~(table[name] <= 0.0) for name in self.ending_quantities], axis=0)
         return is_positive & self.gait_continuation.is_admissible(table)
-
-    def is_margin(self, name: str) -> bool:
-        return self.gait_continuation.is_margin(name)
 
     def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
         return self.gait_continuation.is_mesh_limited(table, ends)

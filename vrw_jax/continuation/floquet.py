@@ -168,7 +168,7 @@ def _sort_by_modulus(values: Array) -> Array:
 
 
 @jax.jit
-def spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
+def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of an eigenvalue.
 
     If two eigenvalues meet, its derivative is one-sided or zero.

@@ -145,7 +145,7 @@ class AbstractCycle(AbstractPrintable):
     @property
     def spectral_radius(self) -> Array:
         """Return the largest modulus of a multiplier. The gait is stable below 1."""
-        return floquet.spectral_radius(self.monodromy)
+        return floquet.compute_spectral_radius(self.monodromy)
 
     @property
     def spectral_margin(self) -> Array:

@@ -182,13 +182,13 @@ def _rolling_gaits(params: WheelParams) -> tuple:
     model, options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
     def rolling_gait(params: WheelParams) -> tuple:
-        def step_outputs(x: jax.Array) -> tuple:
+        def evaluate_step(x: jax.Array) -> tuple:
             step = model.take_step(params, x, options)
             return step.section_state, step.step_length, jnp.sum(step.durations)
 
         x = model.default_start(params)
         (y, length, duration), (jacobian, _, duration_jacobian) = value_and_jacobian(
-            step_outputs, x
+            evaluate_step, x
         )
         return x, y, length, duration, jacobian, duration_jacobian
 
