@@ -24,13 +24,14 @@ from vrw_jax.validation import (
 
 
 class FixedPointResult(NamedTuple):
-    """A fixed point of a map, and the map's Jacobian there.
+    """A fixed point of a map, and the map's Jacobian at it.
 
     - `x`: the point, shape (n,);
-    - `jacobian`: of the map, or of its period_n-th iterate;
+    - `jacobian`: Jacobian of the map, or of its period_n-th iterate;
     - `residual`: largest entry of map(x) - x;
-    - `converged`, `n_iterations`: of Newton's method;
-    - `termination`: of the simulation of a `ReturnMap` from `x`; None for any other map.
+    - `converged`: whether Newton's method converged;
+    - `n_iterations`: number of Newton's iterations;
+    - `termination`: how the simulation of a `ReturnMap` from `x` ended; None for any other map.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -53,8 +54,9 @@ class FixedPointResult(NamedTuple):
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
             return f"FixedPointResult{tuple(self)}"
-        known = bool(np.all(np.isfinite(self.jacobian)))
-        multipliers = np.linalg.eigvals(self.jacobian) if known else np.full(len(self.x), np.nan)
+        multipliers = np.full(len(self.x), np.nan)
+        if np.all(np.isfinite(self.jacobian)):
+            multipliers = np.linalg.eigvals(self.jacobian)
         rows = [
             ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
             ("x", format_numbers(self.x)),
@@ -67,6 +69,7 @@ class FixedPointResult(NamedTuple):
 
 
 def _describe_convergence(converged: bool, n_iterations: int) -> str:
+    """Return the sentence about one fixed point."""
     if converged:
         return f"Newton's method converged after {n_iterations} iterations."
     return (
@@ -76,7 +79,7 @@ def _describe_convergence(converged: bool, n_iterations: int) -> str:
 
 
 MAX_NEWTON_ITERATIONS = 30
-"""Default limit of Newton's iterations."""
+"""Default limit of Newton's iterations, chosen far above the number that a near start needs."""
 
 
 @refuse_renamed_arguments(iterations="max_iterations")
@@ -88,26 +91,26 @@ def solve_fixed_point(
     tolerance: float | Scalar = 1e-12,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
 ) -> FixedPointResult:
-    """Solve for a fixed point of `function` applied `period_n` times, by Newton's method from
-    `start`.
+    """Return a fixed point of `function` applied `period_n` times, by Newton's method.
 
-    The result is differentiable in whatever `function` closes over, by two further iterations that
-    carry derivatives: the point to third order, the Jacobian to first. A start that does not
-    converge is returned unchanged, without derivative.
+    The result is differentiable with respect to everything that `function` closes over, by two
+    further iterations with derivatives: the point to third order, the Jacobian to first order. If a
+    start does not converge, it is returned unchanged, without derivative.
 
     Args:
-        function: a map of a vector onto its like, differentiable forwards; of a walk through
-            modes a `ReturnMap`, which has no point where the walk ends early.
-        start: shape (n,), near the point that is looked for.
-        period_n: how often the map is applied.
-        tolerance: of Newton's last correction, in units of `start`.
+        function: map of a vector to a vector of its shape, differentiable in forward mode. For a
+            hybrid system it is a `ReturnMap`, which has no fixed point if its simulation ends
+            early.
+        start: start of Newton's method, shape (n,).
+        period_n: number of times that the map is applied.
+        tolerance: tolerance of Newton's last correction, in units of `start`.
         max_iterations: limit of Newton's iterations.
 
     Returns:
         A `FixedPointResult`.
 
     Raises:
-        TypeError, ValueError: an invalid argument, in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: jnp.cos(x), jnp.array([0.7]))
@@ -128,10 +131,10 @@ def solve_fixed_point_implicit(
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
 ) -> FixedPointResult:
-    """Solve for a fixed point of a map whose second derivatives are expensive.
+    """Return a fixed point of a map whose second derivatives are expensive.
 
-    The point's first derivatives require only first derivatives of `function`, and its second
-    derivatives second ones. Derivatives of the Jacobian are NaN.
+    First derivatives of the point need only first derivatives of `function`, and second derivatives
+    need second ones. Derivatives of the Jacobian are NaN.
     """
     return _solve_checked(
         _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
@@ -146,7 +149,7 @@ def _solve_checked(
     tolerance: float | Scalar,
     iterations: int,
 ) -> FixedPointResult:
-    """Validate the arguments, and solve with one of the two methods below."""
+    """Validate the arguments, and return the fixed point by one of the two methods below."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     iterations = check_int("iterations", iterations)
@@ -163,8 +166,7 @@ def _solve_checked(
         description = getattr(output, "shape", type(output).__name__)
         raise ValueError(
             f"the map gives {description} for a start of shape {start.shape}, but it must give "
-            f"its like: "
-            "take a map of a state to the next."
+            "its like: take a map of a state to the next."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     static = (run_newton, function, period_n, iterations)
@@ -199,8 +201,8 @@ def _newton_correction(
 
 
 N_DERIVATIVE_ITERATIONS = 2
-"""Number of iterations with derivatives, chosen because one from a point without derivatives yields
-only its first."""
+"""Number of iterations with derivatives, chosen because a single one gives only first derivatives
+of the point."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -226,17 +228,16 @@ def _run_newton(
         x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
         n_searching = is_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
         correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
-        correction_norm = jnp.max(
-            jnp.abs(correction)
-        )  # checked in the last iterations too: the map may jump next to the point
+        # It is checked in the last iterations too, because the map may jump next to the point.
+        correction_norm = jnp.max(jnp.abs(correction))
         next_x = jnp.where(jnp.all(jnp.isfinite(correction)), x + correction, x)
-        jacobian_and_residual = jacobian, jnp.max(jnp.abs(defect))
         return (
             next_x,
             correction_norm,
             n_iterations + n_searching,
             n_derivative_iterations + 1 - n_searching,
-            *jacobian_and_residual,
+            jacobian,
+            jnp.max(jnp.abs(defect)),
         )
 
     zero, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
@@ -262,7 +263,7 @@ def _run_newton(
 def _run_newton_jvp(
     converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the tangent, by iterations from the fixed point that carry derivatives."""
+    """Return the fixed point and its tangent, by iterations with derivatives from it."""
     start, _, *closed_over = primals
     result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
 
@@ -287,6 +288,7 @@ def _run_newton_jvp(
 def _run_newton_implicit(
     converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
 ) -> FixedPointResult:
+    """Run Newton's method; its derivative rule is that of the implicit function theorem."""
     return _run_newton(converted_map, iterations, start, tolerance, *closed_over)
 
 
@@ -295,8 +297,9 @@ def _run_newton_implicit(
 def _run_newton_implicit_jvp(
     converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the tangent by the implicit function theorem, at a point that is differentiated by
-    this rule.
+    """Return the fixed point and its tangent by the implicit function theorem.
+
+    The point in this rule is differentiated by the same rule.
     """
     result = _run_newton_implicit(converted_map, iterations, *primals)
     closed_over, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
