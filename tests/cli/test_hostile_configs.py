@@ -7,13 +7,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from vrw_jax.cli import config
+from vrw_jax.selection import list_config_names
 
 SWEPT = (*config.PARAMETER_NAMES, config.FRICTION_NAME)
 RANGES = dict.fromkeys(config.RANDOM_DESIGNS, ("n", "seed", *SWEPT))
 KEYS = {
     "wheel": (*config.PARAMETER_NAMES, "n_legs"),
-    "model": ("rung", "friction", "max_events", "stoppers", "restitution", "infinite", "uneven",
-              "stop_at_lift_off"),
+    "model": ("name", "friction", "max_events", "stoppers", "restitution",
+              "infinite_friction_rule", "uneven", "stop_at_lift_off"),
     "options": tuple(config.StepOptions.__dataclass_fields__),
     "gait": tuple(config.GaitConfig.__dataclass_fields__),
     "scan": tuple(config.ScanConfig.__dataclass_fields__),
@@ -47,15 +48,15 @@ LITERALS = (
 PLACES = [(table, key) for table, keys in KEYS.items() for key in keys]
 
 
-@pytest.mark.parametrize("rung", [*config.MODEL_CLASSES])
+@pytest.mark.parametrize("model_name", list_config_names())
 @settings(
     max_examples=150, derandomize=True, database=None, deadline=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 @given(place=st.sampled_from(PLACES), literal=LITERALS)
-def test_a_key_takes_or_refuses_a_hostile_value(rung, place, literal):
+def test_a_key_takes_or_refuses_a_hostile_value(model_name, place, literal):
     table, key = place
-    named = "" if key == "rung" else f'rung = "{rung}"\n'
+    named = "" if place == ("model", "name") else f'name = "{model_name}"\n'
     lines = [line for line in SOUND.get(table, "").splitlines() if not line.startswith(f"{key} =")]
     before = "".join(f"{line}\n" for line in lines if table.startswith("tune"))
     inside = "".join(f"{line}\n" for line in lines if not table.startswith("tune"))
