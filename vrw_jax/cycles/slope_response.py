@@ -83,7 +83,7 @@ def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
     """
     A, B1, B0, C, D1, D0 = response
     n = len(A)
-    is_stable = floquet.spectral_radius(lax.stop_gradient(A)) < 1.0
+    is_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
     A = jnp.where(is_stable, A, 0.0)
     b = A @ B0 + B1
     equation = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)

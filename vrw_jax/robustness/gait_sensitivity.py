@@ -138,7 +138,7 @@ def gait_sensitivity(
         )
     norms = compute_gait_sensitivity(finder.slope_response(params, cycle, names))
     mask = lambda value: jnp.where(cycle.outcome == Outcome.STEPPED, value, 0.0)
-    radius = floquet.spectral_radius(lax.stop_gradient(cycle.monodromy_value))
+    radius = floquet.compute_spectral_radius(lax.stop_gradient(cycle.monodromy_value))
     return GaitSensitivity(
         norm=mask(norms.norm),
         ending_step=mask(norms.ending_step),
