@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from experiments.shared.tables import FIGURES, format_markdown, read_table, shorten_number
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MAX_PAGE_WORDS = 1500
@@ -83,6 +85,20 @@ def find_blocks_without_source(page_text):
     ]
 
 
+def find_blocks_unlike_their_table(page_text):
+    """Return names of blocks that show other numbers than the stored table of their name."""
+    different_names = []
+    for name, content in BLOCK.findall(page_text):
+        rows = read_table(FIGURES / f"{name}.csv") if (FIGURES / f"{name}.csv").exists() else []
+        lines = [line for line in content.splitlines() if line.startswith("|")]
+        header = [cell.strip() for cell in lines[0].strip("|").split(" | ")] if lines else []
+        if rows and set(header) <= set(rows[0]):
+            cells = [[shorten_number(row[column]) for column in header] for row in rows]
+            if format_markdown(header, cells) != "\n".join(lines):
+                different_names.append(name)
+    return different_names
+
+
 def name_of(page):
     return str(page.relative_to(ROOT))
 
@@ -95,8 +111,9 @@ def test_a_page_is_short_and_uses_plain_verbs(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_a_measured_block_names_command_commit_machine_and_date(page):
+def test_a_measured_block_shows_stored_numbers_and_names_its_run(page):
     assert not find_blocks_without_source(page.read_text())
+    assert not find_blocks_unlike_their_table(page.read_text())
 
 
 def test_few_sentences_are_long_or_hold_many_numbers():
@@ -117,6 +134,10 @@ def test_prose_against_the_rules_is_found():
     source = "Command: `x`; commit: `y`; machine: z; date: `2026-01-01`."
     assert find_blocks_without_source(block.format("")) == ["speeds"]
     assert not find_blocks_without_source(block.format(source))
+    header = ["damping", "friction", "starts", "left"]
+    table = "| " + " | ".join(header) + " |\n|---|---|---|---|\n| 1 | 2 | 3 | 4 |"
+    changed_block = f"<!-- bouncing -->\n\n{table}\n\n<!-- end of bouncing -->"
+    assert find_blocks_unlike_their_table(changed_block) == ["bouncing"]
     assert split_sentences("One is here now. Two are\nthere now.\n\n- Three are in a list.") == [
         "One is here now.",
         "Two are there now.",
