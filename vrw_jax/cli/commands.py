@@ -93,15 +93,15 @@ def root(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
-    """The passive viscoelastic-legged rimless wheel: walk it, reproduce the paper, scan it.
+    """Simulate the passive viscoelastic-legged rimless wheel: walk, scan, tune, follow branches.
 
     [bold]Examples[/bold]
 
-      [cyan]vrw init[/cyan]                              the example configs named here
+      [cyan]vrw init[/cyan]                              write the example configs named here
 
       [cyan]vrw gait[/cyan]                              the wheel of Table 1 on the paper's slope
 
-      [cyan]vrw gait --set damping=150[/cyan]            the same with softer dampers
+      [cyan]vrw gait --set damping=150[/cyan]            the same with weaker dampers
 
       [cyan]vrw reproduce --out paper[/cyan]             all figures and the table of facts
 
@@ -111,14 +111,13 @@ def root(
 
       [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits, special points
 
-    [bold]What is written[/bold]   init: configs. gait: nothing. reproduce: figures and tables into
-    its folder. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures,
+    [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures,
     PNG and SVG. tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks.
     continue: branch.zarr, borders.csv, a picture and summary.md.
 
-    The first run of a command compiles for a while; the code is kept in a cache folder of yours
-    (JAX_COMPILATION_CACHE_DIR names another), and later runs start quickly. Angles are in rad, all
-    else in SI units.
+    The first run of a command compiles for some seconds. The code is kept in a cache folder
+    (JAX_COMPILATION_CACHE_DIR names another), so later runs start quickly. Angles are in rad, all
+    other quantities in SI units.
     """
 
 
@@ -184,7 +183,7 @@ def gait(
 def explore(
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Begin there; may be repeated."),
+        typer.Option("--set", metavar="NAME=VALUE", help="Start with this parameter; may be repeated."),
     ] = None,
     model_name: Annotated[
         str, typer.Option("--model", help="viscoelastic, rigid or unilateral.")
