@@ -111,8 +111,9 @@ def root(
 
       [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits, special points
 
-    [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures,
-    PNG and SVG. tune: path.zarr, a picture, summary.md, and wheel.toml, which vrw gait walks.
+    [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr
+    (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
+    tune: path.zarr, a picture, summary.md, and wheel.toml, a config of vrw gait.
     continue: branch.zarr, borders.csv, a picture and summary.md.
 
     The first run of a command compiles for some seconds. The code is kept in a cache folder
@@ -183,7 +184,7 @@ def gait(
 def explore(
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Start with this parameter; may be repeated."),
+        typer.Option("--set", metavar="NAME=VALUE", help="Initial parameter; may be repeated."),
     ] = None,
     model_name: Annotated[
         str, typer.Option("--model", help="viscoelastic, rigid or unilateral.")
