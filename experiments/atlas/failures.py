@@ -120,7 +120,7 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
 
     Blocks of the cases that were measured now get a new line of command, commit, machine and date.
     """
-    lines = []
+    results, origins = [], []
     for name, selection in group_rows(rows, "case").items():
         case, methods = import_case(name), summarize_by_method(selection)
         errors = [
@@ -130,22 +130,20 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
             "; ".join(m for m, verdict, *_ in methods if verdict == label)
             for label in VERDICT_LABELS.values()
         ]
-        lines.append(
-            [
-                f"[{case.title}](#{anchor(case.title)})", case.breaks, case.source, case.truth,
-                f"{max(errors):.0e}" if errors else "-", *result_list,
-            ]
-        )  # fmt: skip
+        link = f"[{case.title}](#{anchor(case.title)})"
+        results.append([link, *result_list, f"{max(errors):.0e}" if errors else "-"])
+        origins.append([link, case.breaks, case.truth, case.source])
         header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
                   "ms", "options; version"]  # fmt: skip
         table = format_markdown(header, methods)
         measured = name in measured_names
         source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None
         replace_block(TEXT, f"failure {name}", table, source)
-    header = ["case", "difficulty", "origin", "reference",
-              "largest error of vrw_jax over the condition", *VERDICT_LABELS.values()]  # fmt: skip
+    header = ["problem", *VERDICT_LABELS.values(), "error of vrw_jax over condition"]
     source = describe_run("experiments.atlas.failures") if len(measured_names) > 1 else None
-    replace_block(TEXT, "failures", format_markdown(header, lines), source)
+    replace_block(TEXT, "failures", format_markdown(header, results), source)
+    header = ["problem", "difficulty", "reference", "origin"]
+    replace_block(TEXT, "origins of failures", format_markdown(header, origins), source)
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:
