@@ -11,11 +11,8 @@ from oracle import moreau_jean
 import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
-    CONTACT_OFF,
-    CONTACT_SLIP_DOWN,
-    CONTACT_SLIP_UP,
-    CONTACT_STICK,
     AllowedModes,
+    ContactMode,
     SignTolerances,
     choose_combination,
     solve_combination,
@@ -30,7 +27,12 @@ from vrw_jax.contact.mechanics import (
 
 N_CASES = 200
 RNG_SEED = 6
-MODE_RANKS = {CONTACT_STICK: 0, CONTACT_SLIP_DOWN: 1, CONTACT_SLIP_UP: 1, CONTACT_OFF: 2}
+MODE_RANKS = {
+    ContactMode.STICK: 0,
+    ContactMode.SLIP_DOWN: 1,
+    ContactMode.SLIP_UP: 1,
+    ContactMode.OFF: 2,
+}
 """Preferred are combinations with most feet at rest."""
 SOLUTION_COUNTS = {(0.7, False): {1}, (0.7, True): {1}, (3.0, False): {1, 3}, (3.0, True): {1, 3}}
 """How many are admissible, by friction and level: one where the law is well posed."""
@@ -68,19 +70,22 @@ def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
         *((False, True) if value_at else (False,) for value_at in at_stopper)
     )
     for modes, held_values in itertools.product(itertools.product(MODE_RANKS, repeat=2), stoppers):
-        if modes == (CONTACT_STICK, CONTACT_STICK) and all(held_values):
+        if modes == (ContactMode.STICK, ContactMode.STICK) and all(held_values):
             continue  # fixes the hub twice over
         closed = []  # row kept at rest, direction of its force, bias
         for i, mode in enumerate(modes):
             tangential_part, off = feet[i]
-            drag = {CONTACT_SLIP_DOWN: -wheel.friction, CONTACT_SLIP_UP: wheel.friction}.get(
-                mode, 0.0
+            drag = {
+                ContactMode.SLIP_DOWN: -wheel.friction,
+                ContactMode.SLIP_UP: wheel.friction,
+            }.get(mode, 0.0)
+            closed += (
+                [(off, off + drag * tangential_part, bias[i, 1])] if mode != ContactMode.OFF else []
             )
             closed += (
-                [(off, off + drag * tangential_part, bias[i, 1])] if mode != CONTACT_OFF else []
-            )
-            closed += (
-                [(tangential_part, tangential_part, bias[i, 0])] if mode == CONTACT_STICK else []
+                [(tangential_part, tangential_part, bias[i, 0])]
+                if mode == ContactMode.STICK
+                else []
             )
             closed += [(room[i], room[i], 0.0)] if held_values[i] else []
         R, C = (np.reshape([c[k] for c in closed], (-1, len(axes))) for k in range(2))
@@ -88,12 +93,12 @@ def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
         after, forces, good = free + inverse @ C.T @ p, iter(p), True
         for i, mode in enumerate(modes):
             x, z = feet[i] @ after + bias[i]
-            normal = next(forces) if mode != CONTACT_OFF else 0.0
+            normal = next(forces) if mode != ContactMode.OFF else 0.0
             good &= normal >= 0.0
-            good &= mode != CONTACT_OFF or z >= 0.0
-            good &= mode != CONTACT_STICK or abs(next(forces)) <= wheel.friction * normal
-            good &= mode != CONTACT_SLIP_DOWN or x >= 0.0
-            good &= mode != CONTACT_SLIP_UP or x <= 0.0
+            good &= mode != ContactMode.OFF or z >= 0.0
+            good &= mode != ContactMode.STICK or abs(next(forces)) <= wheel.friction * normal
+            good &= mode != ContactMode.SLIP_DOWN or x >= 0.0
+            good &= mode != ContactMode.SLIP_UP or x <= 0.0
             good &= (
                 next(forces) >= 0.0
                 if held_values[i]
@@ -164,5 +169,5 @@ def test_infinite_friction_is_the_limit_of_large_friction(moving):
         np.testing.assert_array_equal(contact, large[0])
         np.testing.assert_array_equal(held_values, large[1])
         np.testing.assert_allclose(rates, large[2], rtol=1e-4, atol=1e-4)
-        slid += bool(np.isin(contact, (CONTACT_SLIP_DOWN, CONTACT_SLIP_UP)).any())
+        slid += bool(np.isin(contact, (ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)).any())
     assert slid > 5

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import (
-    CONTACT_OFF,
-    CONTACT_SLIP_DOWN,
-    CONTACT_SLIP_UP,
-    CONTACT_STICK,
-)
+from vrw_jax.contact.contact_modes import ContactMode
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
-SLIP_MODES = (CONTACT_SLIP_DOWN, CONTACT_SLIP_UP)
+SLIP_MODES = (ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
 STEP_SCENES = {  # friction, damping, dtheta at the start, stoppers; events that happen among others
     "lands sliding": (
         (0.7, 200.0, 1.6, "bilateral"),
@@ -39,25 +34,25 @@ def classify_events(trace, first_locked):
     result = {"lands"}  # the opening landing
     if first_locked and not locked[0, 0]:
         result.add("the fore leg leaves its stopper")
-    if np.any(np.all(contact == CONTACT_OFF, axis=1)):
+    if np.any(np.all(contact == ContactMode.OFF, axis=1)):
         result.add("flies")
     for i in range(len(rows) - 1):
         for before, after, was, is_active in zip(
             *contact[i : i + 2], *locked[i : i + 2], strict=True
         ):
-            if before == CONTACT_STICK and after in SLIP_MODES:
+            if before == ContactMode.STICK and after in SLIP_MODES:
                 result.add("slips")
-            if before in SLIP_MODES and after == CONTACT_STICK:
+            if before in SLIP_MODES and after == ContactMode.STICK:
                 result.add("sticks")
             if before in SLIP_MODES and after in SLIP_MODES and before != after:
                 result.add("reverses")
-            if before != CONTACT_OFF and after == CONTACT_OFF:
+            if before != ContactMode.OFF and after == ContactMode.OFF:
                 result.add("lifts off")
-            if before == CONTACT_OFF and after != CONTACT_OFF:
+            if before == ContactMode.OFF and after != ContactMode.OFF:
                 result.add("lands again")
             if is_active and not was:
                 result.add("meets its stopper")
-            if was and not is_active and after == CONTACT_OFF:
+            if was and not is_active and after == ContactMode.OFF:
                 result.add("leaves its stopper in the air")
     return result
 

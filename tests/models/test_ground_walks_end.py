@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
 from vrw_jax.contact.batch_integrator import (
-    PAINLEVE_TOLERANCES,
+    INTERVAL_OPTIONS,
     EventBracket,
     _earliest_root,
     _earliest_secant,
@@ -86,7 +86,9 @@ def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
         step = vrw.step(params, starts[place], model=model, options=options)
         assert int(step.outcome) == vrw.Outcome.PAINLEVE_PARADOX
         # It ends where no more is left than `march.SINGULAR` says, of what falls by 0.8 a second.
-        left_over = (PAINLEVE_TOLERANCES[0] + PAINLEVE_TOLERANCES[1] * tolerance) / 0.8
+        left_over = (
+            INTERVAL_OPTIONS.painleve_atol + INTERVAL_OPTIONS.painleve_rtol_factor * tolerance
+        ) / 0.8
         assert abs(step.durations.sum() - (time - 1e-6 / slope)) < 1.1 * left_over
 
 

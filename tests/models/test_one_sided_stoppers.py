@@ -9,7 +9,7 @@ import pytest
 from oracle import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import CONTACT_OFF
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.contact.mechanics import WheelMotion, kinetic_energy, potential_energy
@@ -46,7 +46,7 @@ def stopper_impact():
     )
     motion = motion._replace(dL=motion.dL.at[STRUCK_LEG].set(0.5))
     stance = ContactState(
-        jnp.full(8, CONTACT_OFF, jnp.int32), jnp.arange(8) != STRUCK_LEG, none, none, none
+        jnp.full(8, ContactMode.OFF, jnp.int32), jnp.arange(8) != STRUCK_LEG, none, none, none
     )
     law = lambda one_sided, rest: ContactLaw(s, jnp.asarray(0.7), one_sided, True, rest)
     event = classify_event(make_guard_layout(8, True), jnp.int32(8 + STRUCK_LEG))

@@ -7,7 +7,7 @@ import pytest
 from oracle import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
 from vrw_jax.contact.impacts import ContactLaw, classify_event, project_motion, resolve_event
 from vrw_jax.contact.mechanics import WheelMotion, kinetic_energy, leg_directions
@@ -23,7 +23,7 @@ def random_impacts():
     s, none = vrw.WheelParams().symbols(), jnp.zeros(8, bool)
     locked = jnp.arange(8) > 1
     stance = ContactState(
-        jnp.where(jnp.arange(8) == 1, CONTACT_STICK, CONTACT_OFF), locked, none, none, none
+        jnp.where(jnp.arange(8) == 1, ContactMode.STICK, ContactMode.OFF), locked, none, none, none
     )
     event = classify_event(make_guard_layout(8, False), jnp.int32(0))
 

@@ -12,12 +12,7 @@ from oracle import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import (
-    CONTACT_OFF,
-    CONTACT_SLIP_DOWN,
-    CONTACT_SLIP_UP,
-    CONTACT_STICK,
-)
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
@@ -125,11 +120,11 @@ def test_friction_lies_in_coulombs_cone_and_opposes_slip(scene_traces):
             tangential, normal = trace.tangential[k], trace.normal[k]
             if math.isfinite(friction):
                 assert float(jnp.max(jnp.abs(tangential) - friction * normal)) <= 1e-9
-            for mode, sign in ((CONTACT_SLIP_DOWN, 1.0), (CONTACT_SLIP_UP, -1.0)):
+            for mode, sign in ((ContactMode.SLIP_DOWN, 1.0), (ContactMode.SLIP_UP, -1.0)):
                 sliding = np.asarray(trace.contact[k] == mode)
                 assert np.all(np.asarray(sign * speed)[:, sliding] >= -1e-9)
                 assert np.all(np.asarray(sign * tangential)[:, sliding] <= 1e-9)
-            resting = np.asarray(trace.contact[k] == CONTACT_STICK)
+            resting = np.asarray(trace.contact[k] == ContactMode.STICK)
             assert np.all(np.abs(np.asarray(speed)[:, resting]) <= 1e-9)
 
 
@@ -183,7 +178,7 @@ def make_reference_start(x):
     rates = [x[2], x[3], x[1]]
     code = np.round(code).astype(int)
     return moreau_jean.StepStart(
-        np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != CONTACT_OFF
+        np.r_[hub, L], np.r_[rates, dL], code >= 4, code % 4 != ContactMode.OFF
     )
 
 
@@ -257,7 +252,7 @@ def make_resting_motion(theta, **changes):
 
 def make_contact_state(contact, locked):
     none = jnp.zeros(8, bool)
-    codes = jnp.asarray(list(contact) + [CONTACT_OFF] * 6, jnp.int32)
+    codes = jnp.asarray(list(contact) + [ContactMode.OFF] * 6, jnp.int32)
     return ContactState(codes, jnp.asarray(locked), none, none, none)
 
 
@@ -267,7 +262,7 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
         s,
         jnp.asarray(friction),
         False,
-        make_contact_state((CONTACT_SLIP_DOWN, CONTACT_SLIP_DOWN), [True] * 8),
+        make_contact_state((ContactMode.SLIP_DOWN, ContactMode.SLIP_DOWN), [True] * 8),
     )
     solution = compute_forces(flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))).solution
     g, slope = 9.81, 0.30
@@ -279,7 +274,10 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
 def test_a_wheel_in_the_air_falls_freely():
     s = TABLE_1.symbols()
     flow = make_mode_dynamics(
-        s, jnp.asarray(0.7), False, make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+        s,
+        jnp.asarray(0.7),
+        False,
+        make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8),
     )
     motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
     current_value = compute_forces(flow, motion)
@@ -292,7 +290,7 @@ def test_a_wheel_in_the_air_falls_freely():
 def test_a_vertical_leg_lands_with_its_own_mass_alone():
     s, speed = TABLE_1.symbols(), 2.0
     motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))
-    in_the_air = make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+    in_the_air = make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8)
     event = classify_event(make_guard_layout(8, False), jnp.int32(0))
     change = resolve_event(make_contact_law(s, 0.7), motion, in_the_air, event)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
@@ -328,7 +326,7 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
         s,
         jnp.asarray(0.7),
         False,
-        make_contact_state((CONTACT_STICK, CONTACT_OFF), [False] + [True] * 7),
+        make_contact_state((ContactMode.STICK, ContactMode.OFF), [False] + [True] * 7),
     )
     lift = make_guard_layout(8, False).liftoff
     watched = MonitoredFunctions(lambda y: guard_values(flow, y)[lift : lift + 1], 1)
@@ -350,11 +348,11 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
 def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     s = TABLE_1.symbols()
     motion = make_resting_motion(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
-    in_the_air = make_contact_state((CONTACT_OFF, CONTACT_OFF), [True] * 8)
+    in_the_air = make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8)
     event = classify_event(make_guard_layout(8, False), jnp.int32(0))
     change = resolve_event(make_contact_law(s, friction), motion, in_the_air, event)
     normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
-    assert int(change.contact_state.contact[0]) == CONTACT_SLIP_DOWN
+    assert int(change.contact_state.contact[0]) == ContactMode.SLIP_DOWN
     assert abs(tangential + friction * normal) < 1e-12
 
 
@@ -408,4 +406,6 @@ def test_too_flat_a_slope_ends_the_walk_with_an_outcome():
 
 def test_sliding_uphill_is_a_separate_contact_mode(scene_traces):
     modes = np.concatenate([np.unique(trace.contact) for _, _, trace in scene_traces.values()])
-    assert {CONTACT_OFF, CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP} <= set(modes.tolist())
+    assert {ContactMode.OFF, ContactMode.STICK, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP} <= set(
+        modes.tolist()
+    )

@@ -6,6 +6,8 @@ No computation in this module combines values of different lanes.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -36,27 +38,48 @@ followed by those of legs in the air, if stoppers are one-sided, and by `N_ACCUM
 if these are requested."""
 N_ACCUMULATOR_ROWS = 3
 """Number of accumulated rows: energy lost in dampers and by sliding, slip."""
-STATUS_RUNNING, STATUS_EVENT = -1, -2
-"""Status codes of a lane that is integrating or at an event; every other status is its
-`Outcome`."""
-MAX_WAIT_TRIES = 8
-"""Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
-PAINLEVE_TOLERANCES = 1e-8, 1e2
-"""Absolute tolerance, and factor of the relative tolerance, below which the determinant counts as
-zero at Painlevé's singularity. Forces there are a ratio of two vanishing numbers, resolved
-neither by rounding nor by integration. Chosen because with 18 tolerances one singularity was
-missed."""
-MAX_PARABOLA_ITERATIONS = 3
-"""Number of event iterations by parabolas; the later ones use secants, which converge better in
-stiff dips."""
-OWN_GUARD_AFTER_ITERATIONS = 15
-"""Number of event iterations after which a guard that starts at its own event may be the event
-found."""
-MAX_ROUNDOFF_FALL_SECONDS = 1e-3
-"""Time (s) within which a guard must fall by its own rounding to count as falling."""
-EVENT_TIME_TOLERANCE_FACTOR = 30.0
-"""Largest last correction to the time of an event, in tolerances of the step. Chosen because the
-proposal is a parabola's, whose own error is about a hundredth of the correction."""
+
+
+class LaneStatus(IntEnum):
+    """Status of a lane between two events; a non-negative status is its `Outcome`."""
+
+    RUNNING = -1
+    EVENT = -2
+
+
+@dataclass(frozen=True)
+class IntervalOptions:
+    """Search for events with unilateral contact, and the loop over lanes."""
+
+    max_wait_tries: int = 8
+    """Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
+    painleve_atol: float = 1e-8
+    """Determinant below which it counts as zero at Painlevé's singularity.
+
+    Forces there are a ratio of two vanishing numbers, resolved neither by round-off nor by
+    integration.
+    """
+    painleve_rtol_factor: float = 1e2
+    """Factor of the relative tolerance that is added to `painleve_atol`.
+
+    It is chosen because with a factor of 18 one singularity was missed.
+    """
+    n_parabola_iterations: int = 3
+    """Number of event iterations by parabolas; the later ones use secants, which converge better in
+    stiff dips."""
+    n_before_own_guard: int = 15
+    """Number of event iterations after which a guard that starts at its own event may be the
+    event."""
+    max_roundoff_fall: float = 1e-3
+    """Time within which a guard must fall by its own round-off to count as falling, s."""
+    event_time_factor: float = 30.0
+    """Largest last correction to the time of an event, in tolerances of the step.
+
+    It is chosen because the error of a parabola's proposal is about a hundredth of the correction.
+    """
+
+
+INTERVAL_OPTIONS = IntervalOptions()
 
 
 class IntervalPoint(NamedTuple):
@@ -93,8 +116,8 @@ class IntervalState(NamedTuple):
     h: Array  # of the next attempt, s
     time: Array  # since the last event, s
     search: EventBracket
-    status: Array  # MARCHING, EVENT or an Outcome
-    guard: Array  # that has triggered
+    status: Array  # a LaneStatus or an Outcome
+    guard: Array  # index of the guard that has triggered
     n_solver_steps: Array  # attempted since the last event
 
 
@@ -196,18 +219,27 @@ def find_own_guards(dynamics: ModeDynamics) -> Array:
 
 
 @eqx.filter_jit  # traced once for all call sites
-def init_interval(dynamics: ModeDynamics, motion: WheelMotion, h: Array) -> IntervalState:
+def init_interval(
+    dynamics: ModeDynamics,
+    motion: WheelMotion,
+    h: Array,
+    interval_options: IntervalOptions = INTERVAL_OPTIONS,
+) -> IntervalState:
     """Return the lanes at the start of a contact state.
 
-    A lane is at an event again if one of its guards falls at once.
+    A lane is at an event again if one of its guards falls immediately.
     """
     point, is_own = make_point(dynamics, motion), find_own_guards(dynamics)
     values, rates = guards_at_point(dynamics, point), guard_rates(dynamics, point)
     # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
     # rises from below has no event before it falls; events without duration leave several such.
     roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_EPS * jnp.finfo(values.dtype).eps)
-    is_own = is_own | ((values <= roundoff) & (rates > -roundoff / MAX_ROUNDOFF_FALL_SECONDS))
+    min_rate = -roundoff / interval_options.max_roundoff_fall
+    is_own = is_own | ((values <= roundoff) & (rates > min_rate))
     has_passed = ~is_own & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
+    first_passed = jnp.zeros(has_passed.shape[1:], jnp.int32)
+    for row in reversed(range(len(has_passed))):
+        first_passed = jnp.where(has_passed[row], row, first_passed)
     offset = jnp.where(is_own, values - 2.0 * roundoff, 0.0)
     zero, zero_count = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
     return IntervalState(
@@ -223,20 +255,12 @@ def init_interval(dynamics: ModeDynamics, motion: WheelMotion, h: Array) -> Inte
         search=EventBracket(
             zero_count > 0, jnp.zeros_like(is_own), zero, zero, zero, zero_count, zero, values
         ),
-        status=jnp.where(jnp.any(has_passed, axis=0), STATUS_EVENT, STATUS_RUNNING).astype(
+        status=jnp.where(jnp.any(has_passed, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING).astype(
             jnp.int32
         ),
-        guard=_first_set(has_passed),
+        guard=first_passed,
         n_solver_steps=zero_count,
     )
-
-
-def _first_set(flags: Array) -> Array:
-    """Return the index of the first row whose flag is set; 0 if none is."""
-    index = jnp.zeros(flags.shape[1:], jnp.int32)
-    for row in reversed(range(len(flags))):
-        index = jnp.where(flags[row], row, index)
-    return index
 
 
 DynamicsFn = Callable[[Array], ModeDynamics]
@@ -253,7 +277,7 @@ def integrate_interval(
 ) -> IntervalState:
     """Return the lanes integrated until none is running.
 
-    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` is at an
+    After `max_wait_tries` attempts, the loop ends as soon as a lane with `is_walking` is at an
     event.
     """
     dynamics = dynamics_at(columns)
@@ -265,22 +289,27 @@ def integrate_interval(
         )
 
     return run_until_done(
-        lambda state: state.status == STATUS_RUNNING, is_walking, try_step, initial
+        lambda state: state.status == LaneStatus.RUNNING, is_walking, try_step, initial
     )
 
 
 def run_until_done(
-    is_running: Callable[[Any], Array], is_walking: Array, iterate: Callable, initial: Any
+    is_running: Callable[[Any], Array],
+    is_walking: Array,
+    iterate: Callable,
+    initial: Any,
+    max_wait_tries: int = INTERVAL_OPTIONS.max_wait_tries,
 ) -> Any:
     """Return the state after repeated `iterate`, until no lane is running.
 
-    After `MAX_WAIT_TRIES` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
+    After `max_wait_tries` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
     """
 
     def should_continue(loop_state: tuple) -> Array:
         state, n_tries = loop_state
         is_active = is_running(state)
-        return jnp.any(is_active) & ((n_tries < MAX_WAIT_TRIES) | ~jnp.any(is_walking & ~is_active))
+        has_stopped = jnp.any(is_walking & ~is_active)
+        return jnp.any(is_active) & ((n_tries < max_wait_tries) | ~has_stopped)
 
     zero = jnp.zeros((), jnp.int32)
     iterate_once = lambda loop_state: (iterate(loop_state[0]), loop_state[1] + 1)
@@ -372,13 +401,18 @@ def finish_attempt(
     return AttemptedStep(end, squared_error, values, *parabola_terms, dip_fraction, accumulated)
 
 
-def is_at_singularity(value_before: Array, value_after: Array, options: StepOptions) -> Array:
+def is_at_singularity(
+    value_before: Array,
+    value_after: Array,
+    options: StepOptions,
+    interval_options: IntervalOptions = INTERVAL_OPTIONS,
+) -> Array:
     """Return whether the determinant has vanished at Painlevé's singularity, from its values at
     both ends.
     """
-    return (value_before * value_after <= 0.0) | (
-        jnp.abs(value_after) <= PAINLEVE_TOLERANCES[0] + PAINLEVE_TOLERANCES[1] * options.rtol
-    )
+    atol, rtol_factor = interval_options.painleve_atol, interval_options.painleve_rtol_factor
+    is_zero = jnp.abs(value_after) <= atol + rtol_factor * options.rtol
+    return (value_before * value_after <= 0.0) | is_zero
 
 
 def integrator_step(
@@ -387,12 +421,13 @@ def integrator_step(
     scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
+    interval_options: IntervalOptions = INTERVAL_OPTIONS,
 ) -> IntervalState:
     """Return the lanes after one attempt: accepted, repeated with another step size, or at an
     event.
     """
     point, h, search, end = state.point, state.h, state.search, attempt.end
-    is_running = state.status == STATUS_RUNNING
+    is_running = state.status == LaneStatus.RUNNING
     is_accurate = is_running & ~search.is_active & (attempt.squared_error <= 1.0)
     needs_retry = (
         is_accurate
@@ -401,7 +436,9 @@ def integrator_step(
     )
     has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
     is_accepted = is_accurate & ~needs_retry & ~has_crossed
-    next_search, event = _search_event(state, attempt, has_crossed, scales, options)
+    next_search, event = _search_event(
+        state, attempt, has_crossed, scales, options, interval_options
+    )
     has_arrived = event.has_arrived
     length_factor = jnp.where(
         needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
@@ -426,14 +463,14 @@ def integrator_step(
     )
     is_stuck = is_stuck | (~search.is_active & (state.time + next_h == state.time))
     determinant_row = len(point.q) + N_CONTACT_ROWS - 1
-    determinant_before, determinant_after = (
-        point.dynamics_rows[determinant_row],
-        end.dynamics_rows[determinant_row],
-    )
-    status = jnp.where(is_stuck, Outcome.SOLVER_FAILED, STATUS_RUNNING)
-    status = jnp.where(has_arrived, STATUS_EVENT, status)
+    determinant_before = point.dynamics_rows[determinant_row]
+    determinant_after = end.dynamics_rows[determinant_row]
+    status = jnp.where(is_stuck, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
+    status = jnp.where(has_arrived, LaneStatus.EVENT, status)
     status = jnp.where(is_late, Outcome.NO_TOUCHDOWN_IN_TIME, status)
-    is_singular = is_taken & is_at_singularity(determinant_before, determinant_after, options)
+    is_singular = is_taken & is_at_singularity(
+        determinant_before, determinant_after, options, interval_options
+    )
     status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
     return state._replace(
         point=tree_where(is_taken, end, point),
@@ -463,6 +500,7 @@ def _search_event(
     has_crossed: Array,
     scales: Array,
     options: StepOptions,
+    interval_options: IntervalOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
     """Return one more iteration of the search, from the zeros of the guards' parabolas or
     secants.
@@ -473,20 +511,18 @@ def _search_event(
     parabolas = state.guard_values, attempt.linear_term, attempt.curvature
     root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_at_own_event(state))
     secant_h, secant_guard = _earliest_secant(search, attempt.guard_values, h, is_crossing)
-    uses_secant = search.is_active & (search.n_iterations >= MAX_PARABOLA_ITERATIONS)
-    proposal, guard = (
-        jnp.where(uses_secant, secant_h, h * root_fraction),
-        jnp.where(uses_secant, secant_guard, guard),
-    )
+    uses_secant = search.is_active & (search.n_iterations >= interval_options.n_parabola_iterations)
+    proposal = jnp.where(uses_secant, secant_h, h * root_fraction)
+    guard = jnp.where(uses_secant, secant_guard, guard)
     has_passed = jnp.any(is_crossing & is_below_zero, axis=0)
     low = jnp.where(search.is_active & ~has_passed, h, search.low)
     high = jnp.where(search.is_active & has_passed, h, search.high)
     low, high = jnp.where(has_crossed, 0.0, low), jnp.where(has_crossed, h, high)
     resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
-    time_tolerance = jnp.maximum(EVENT_TIME_TOLERANCE_FACTOR * options.rtol * h, resolution)
+    time_tolerance = jnp.maximum(interval_options.event_time_factor * options.rtol * h, resolution)
     time_tolerance = jnp.where(search.is_active, search.time_tolerance, time_tolerance)
     is_in_bracket = (proposal >= low - time_tolerance) & (proposal <= high + time_tolerance)
-    # In a dip of microseconds, rounding moves proposals out of the bracket: bisect it instead.
+    # In a dip of microseconds, round-off moves proposals out of the bracket: it is bisected.
     bisects = ~is_in_bracket | (uses_secant & ((search.n_iterations & 3) == 3))
     # A guard that starts at its own event falls again soon, or not at all.
     middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
@@ -497,14 +533,12 @@ def _search_event(
     # A guard at its own event is within twice its rounding; without another event, it is the event.
     roundoff = (
         GUARD_ROUNDOFF_EPS
-        * jnp.where(search.n_iterations < OWN_GUARD_AFTER_ITERATIONS, 1.0, 3.0)
+        * jnp.where(search.n_iterations < interval_options.n_before_own_guard, 1.0, 3.0)
         * jnp.finfo(h.dtype).eps
     )
     is_roundoff = search.is_active & (jnp.abs(lowest) <= roundoff)
-    time_shift, guard = (
-        jnp.where(is_roundoff, 0.0, time_shift),
-        jnp.where(is_roundoff, lowest_guard, guard),
-    )
+    time_shift = jnp.where(is_roundoff, 0.0, time_shift)
+    guard = jnp.where(is_roundoff, lowest_guard, guard)
     is_close = search.is_active & (jnp.abs(time_shift) <= time_tolerance)
     n_iterations = jnp.where(search.is_active, search.n_iterations + 1, 0)
     is_active = (search.is_active | has_crossed) & ~is_close
@@ -512,7 +546,7 @@ def _search_event(
         is_active, is_crossing, low, high, time_tolerance, n_iterations, h, attempt.guard_values
     )
     return next_search, _LocatedEvent(
-        next_h, time_shift, is_close & (state.status == STATUS_RUNNING), guard
+        next_h, time_shift, is_close & (state.status == LaneStatus.RUNNING), guard
     )
 
 
@@ -553,10 +587,8 @@ def _lowest_guard(values: Array, is_crossing: Array) -> tuple[Array, Array]:
     lowest, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
     for index in range(len(values)):
         is_lower = is_crossing[index] & (values[index] < lowest)
-        lowest, guard = (
-            jnp.where(is_lower, values[index], lowest),
-            jnp.where(is_lower, index, guard),
-        )
+        lowest = jnp.where(is_lower, values[index], lowest)
+        guard = jnp.where(is_lower, index, guard)
     return guard, lowest
 
 
@@ -579,10 +611,8 @@ def _earliest_secant(
         has_fallen = is_crossing[index] & ~is_falling & (values[index] < 0.0)
         root_h = jnp.where(has_fallen, -jnp.inf, root_h)
         is_earlier = (is_falling | has_fallen) & (root_h < earliest)
-        earliest, guard = (
-            jnp.where(is_earlier, root_h, earliest),
-            jnp.where(is_earlier, index, guard),
-        )
+        earliest = jnp.where(is_earlier, root_h, earliest)
+        guard = jnp.where(is_earlier, index, guard)
     return earliest, guard
 
 
@@ -605,10 +635,8 @@ def _earliest_root(
     has_root = has_root & ~(is_own & is_falling)
     has_fallen = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
     root_fraction, has_root = jnp.where(has_fallen, -jnp.inf, root_fraction), has_root | has_fallen
-    earliest, guard = (
-        jnp.full_like(root_fraction[0], jnp.inf),
-        jnp.zeros(root_fraction.shape[-1:], jnp.int32),
-    )
+    earliest = jnp.full_like(root_fraction[0], jnp.inf)
+    guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
     for index in reversed(range(len(root_fraction))):
         guard = jnp.where(is_crossing[index], index, guard)
     for index in range(len(root_fraction)):

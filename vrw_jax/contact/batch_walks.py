@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from vrw_jax import simd
 from vrw_jax.contact.batch_integrator import pack_coordinates
-from vrw_jax.contact.contact_modes import CONTACT_OFF
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.impacts import project_motion
 from vrw_jax.contact.mechanics import WheelMotion
 from vrw_jax.contact.section import (
@@ -35,12 +35,9 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.numerics import StepOptions, map_in_batches
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.runtime import cached_lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols
-
-XLA_BLOCK_SIZE = 2048
-"""Number of lanes in one block if XLA compiles the walk."""
 
 
 def walk_batch(
@@ -88,7 +85,7 @@ def step_batch_with_jacobian(
     has_tangent = np.ones(numbers.shape, bool)
     is_free_leg = code < LOCKED_CODE_OFFSET
     is_free_entry = [
-        is_free_leg & ((code & (LOCKED_CODE_OFFSET - 1)) == CONTACT_OFF),
+        is_free_leg & ((code & (LOCKED_CODE_OFFSET - 1)) == ContactMode.OFF),
         is_free_leg,
         np.zeros(code.shape, bool),
     ]
@@ -271,7 +268,7 @@ def _compile_for_rows(n: int, function_name: str, size: int, dtype: np.dtype) ->
 
 
 def _compile_with_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
-    """Return the function of numbers and rows, compiled by XLA in blocks of `XLA_BLOCK_SIZE` lanes.
+    """Return the function of numbers and rows, compiled by XLA in blocks of lanes.
 
     It is used without machine code.
     """
@@ -282,7 +279,9 @@ def _compile_with_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[...
 
     def in_blocks(uniform: list, lane_rows: list) -> tuple:
         run_block = lambda *rows: compiled(tuple(uniform), rows)
-        return move_axis(map_in_batches(run_block, (XLA_BLOCK_SIZE,), *lane_rows), 0, -1)
+        return move_axis(
+            map_in_batches(run_block, (batch_sizes.CONTACT_XLA_BATCH_SIZE,), *lane_rows), 0, -1
+        )
 
     return in_blocks
 

@@ -15,6 +15,7 @@ lifts otherwise. Only if neither is possible, it slides without friction.
 import functools
 import itertools
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,8 +38,15 @@ from vrw_jax.wheel import Symbols
 
 Friction = Elementwise | SlotPair
 """Friction of all feet, or of each slot's foot."""
-CONTACT_OFF, CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP = 0, 1, 2, 3
-"""Contact modes of a foot: in the air, at rest, sliding downhill, sliding uphill."""
+
+
+class ContactMode(IntEnum):
+    """Contact mode of a foot, as it is stored in section states and trajectories."""
+
+    OFF = 0  # in the air
+    STICK = 1  # at rest on the ground
+    SLIP_DOWN = 2  # sliding downhill
+    SLIP_UP = 3  # sliding uphill
 
 
 PAPER_RULE_SENTINEL = -np.inf
@@ -126,13 +134,13 @@ def _make_foot_equations(
         friction,
     )
     normal_share = map_friction(lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction)
-    is_sticking = _make_pair(lambda i: contact[i] == CONTACT_STICK)
+    is_sticking = _make_pair(lambda i: contact[i] == ContactMode.STICK)
     is_sliding = _make_pair(
-        lambda i: (contact[i] == CONTACT_SLIP_DOWN) | (contact[i] == CONTACT_SLIP_UP)
+        lambda i: (contact[i] == ContactMode.SLIP_DOWN) | (contact[i] == ContactMode.SLIP_UP)
     )
     drag = _make_pair(
         lambda i: jnp.where(
-            contact[i] == CONTACT_SLIP_DOWN,
+            contact[i] == ContactMode.SLIP_DOWN,
             -_friction_of_slot(i, coefficient),
             _friction_of_slot(i, coefficient),
         )
@@ -313,14 +321,20 @@ def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
     Two sticking feet on two held legs are excluded: they constrain the hub twice, so that their
     forces are not determined.
     """
-    rank = {CONTACT_STICK: 0, CONTACT_SLIP_DOWN: 1, CONTACT_SLIP_UP: 1, CONTACT_OFF: 2}
+    rank = {
+        ContactMode.STICK: 0,
+        ContactMode.SLIP_DOWN: 1,
+        ContactMode.SLIP_UP: 1,
+        ContactMode.OFF: 2,
+    }
     rows = [
         (modes, held)
         for modes in itertools.product(
-            (CONTACT_STICK, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP, CONTACT_OFF), repeat=2
+            (ContactMode.STICK, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP, ContactMode.OFF),
+            repeat=2,
         )
         for held in itertools.product((False, True), repeat=2)
-        if not (modes == (CONTACT_STICK, CONTACT_STICK) and all(held))
+        if not (modes == (ContactMode.STICK, ContactMode.STICK) and all(held))
     ]
     rows.sort(key=lambda row: (sum(rank[mode] for mode in row[0]), sum(row[1])))
     return np.array([r[0] for r in rows], np.int32), np.array([r[1] for r in rows])
@@ -329,14 +343,17 @@ def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
 MODE_TABLE, HELD_TABLE = _enumerate_combinations()
 """Combinations in order of preference: contact modes and held stoppers, shape (63, 2) each."""
 PAPER_RULE_ORDER = np.argsort(
-    [sum({CONTACT_STICK: 0, CONTACT_OFF: 2}.get(int(m), 5) for m in row) for row in MODE_TABLE],
+    [
+        sum({ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(m), 5) for m in row)
+        for row in MODE_TABLE
+    ],
     kind="stable",
 )
 """Order of the combinations by the paper's rule: sliding comes last."""
 N_CONCURRENT_COMBINATIONS = 8
 """Number of combinations that XLA solves together, chosen because most events allow no more.
 Machine code solves them one after the other."""
-ALL_MODES_MASK = (1 << 4) - 1
+ALL_MODES_MASK = sum(1 << mode for mode in ContactMode)
 """Set of all modes, one bit per mode."""
 
 RowSet = tuple[Any, Any]
@@ -358,7 +375,9 @@ class _TableOrder(NamedTuple):
             return words[0], words[1]
 
         modes, held = MODE_TABLE[rows].T, HELD_TABLE[rows].T
-        contact = [[pack_bits(slot_column == mode) for mode in range(4)] for slot_column in modes]
+        contact = [
+            [pack_bits(slot_column == mode) for mode in ContactMode] for slot_column in modes
+        ]
         return cls(contact, [pack_bits(slot_column) for slot_column in held])
 
 
@@ -462,8 +481,8 @@ def _violation(
         mode = contact[i]
         holds_along_slope.append(
             held[i]
-            & (mode != CONTACT_OFF)
-            & ((mode == CONTACT_STICK) | _friction_of_slot(i, is_limit))
+            & (mode != ContactMode.OFF)
+            & ((mode == ContactMode.STICK) | _friction_of_slot(i, is_limit))
         )
         zero_if = lambda is_untested, value: jnp.where(is_untested, 0.0, value)
         is_untested = contains_mode(allowed.untested_modes[i], mode)
@@ -481,15 +500,15 @@ def _violation(
         stick_violation = zero_if(
             is_untested, jnp.maximum(pull_violation, cone_violation / tolerances.force)
         )
-        slip_violation = jnp.where(mode == CONTACT_SLIP_DOWN, -x, x) / tolerances.motion
-        friction_violation = jnp.where(mode == CONTACT_SLIP_DOWN, t, -t) / tolerances.force
+        slip_violation = jnp.where(mode == ContactMode.SLIP_DOWN, -x, x) / tolerances.motion
+        friction_violation = jnp.where(mode == ContactMode.SLIP_DOWN, t, -t) / tolerances.force
         slide_violation = jnp.maximum(
             jnp.where(_friction_of_slot(i, is_limit), friction_violation, pull_violation),
             zero_if(is_untested, slip_violation),
         )
-        loaded_violation = jnp.where(mode == CONTACT_STICK, stick_violation, slide_violation)
+        loaded_violation = jnp.where(mode == ContactMode.STICK, stick_violation, slide_violation)
         foot_violation = jnp.where(
-            mode == CONTACT_OFF, zero_if(is_untested, -z / tolerances.motion), loaded_violation
+            mode == ContactMode.OFF, zero_if(is_untested, -z / tolerances.motion), loaded_violation
         )
         open_violation = zero_if(allowed.untested_open[i], solution.length[i] / tolerances.motion)
         stopper_violation = jnp.where(
@@ -640,8 +659,8 @@ def is_release_consistent(
     )
     coefficient = finite_friction(slot_friction)
     is_limit, mode = slot_friction == jnp.inf, jnp.where(is_second, contact[1], contact[0])
-    slides_down = mode == CONTACT_SLIP_DOWN
-    is_sliding = slides_down | (mode == CONTACT_SLIP_UP)
+    slides_down = mode == ContactMode.SLIP_DOWN
+    is_sliding = slides_down | (mode == ContactMode.SLIP_UP)
 
     def mode_margin(free_motion: FreeMotion) -> Array:
         solution = solve_combination(s, inertia, free_motion, contact, held, friction)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK, Friction, finite_friction
+from vrw_jax.contact.contact_modes import ContactMode, Friction, finite_friction
 from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     ForceSolution,
@@ -82,7 +82,7 @@ class ModeDynamics(NamedTuple):
     held: Bool[Array, "2"]  # the slots' legs on their stoppers
     airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
     accumulates: bool  # in batches: the accumulators are integrated as well
-    tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
+    tilt: Elementwise | None = None  # by which the next line is steeper, rad
 
     def configure(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration at this motion."""
@@ -99,7 +99,7 @@ def make_mode_dynamics(
     tilt: Elementwise | None = None,
 ) -> ModeDynamics:
     """Return the dynamics of the wheel in this contact state."""
-    slots = find_slots(contact_state.contact != CONTACT_OFF)
+    slots = find_slots(contact_state.contact != ContactMode.OFF)
     contact, held = (
         slots.gather_codes(contact_state.contact),
         slots.gather_flags(contact_state.locked),
@@ -257,7 +257,7 @@ def evaluate_guards(
     """
     s, contact_state = dynamics.s, dynamics.contact_state
     ones = jnp.ones_like(motion.L)
-    is_airborne = (contact_state.contact == CONTACT_OFF) & (
+    is_airborne = (contact_state.contact == ContactMode.OFF) & (
         has_begun | ~contact_state.has_just_lifted
     )
     is_free_leg = ~contact_state.locked & (has_begun | ~contact_state.has_just_unlocked)
@@ -269,7 +269,9 @@ def evaluate_guards(
     is_limit = stack_friction(dynamics.friction) == jnp.inf
     direction = jnp.stack(slip_sign(dynamics.contact))
     pressure = jnp.where(is_limit & (direction != 0.0), -direction * tangential, normal)
-    has_cone = (dynamics.contact == CONTACT_STICK) & jnp.isfinite(stack_friction(dynamics.friction))
+    has_cone = (dynamics.contact == ContactMode.STICK) & jnp.isfinite(
+        stack_friction(dynamics.friction)
+    )
     is_sliding = (direction != 0.0) & (has_begun | ~has_just_slid)
     if_watched = lambda condition, value: jnp.where(condition, value, 1.0)
     airborne_guards = (
@@ -280,7 +282,7 @@ def evaluate_guards(
     return [
         jnp.where(is_airborne, foot_heights(motion, quantities.legs, dynamics.tilt), ones),
         jnp.where(is_free_leg, s.L0 - motion.L, ones),
-        if_watched(dynamics.contact != CONTACT_OFF, pressure),
+        if_watched(dynamics.contact != ContactMode.OFF, pressure),
         if_watched(has_cone, coefficient * normal - tangential),
         if_watched(has_cone, coefficient * normal + tangential),
         if_watched(is_sliding, direction * jnp.stack(quantities.slip_speed)),

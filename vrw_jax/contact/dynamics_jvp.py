@@ -13,13 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.contact.contact_modes import (
-    CONTACT_SLIP_DOWN,
-    CONTACT_SLIP_UP,
-    Friction,
-    finite_friction,
-    solve_combination,
-)
+from vrw_jax.contact.contact_modes import ContactMode, Friction, finite_friction, solve_combination
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
     FreeMotion,
@@ -73,7 +67,7 @@ class ForceSolution(NamedTuple):
 def slip_sign(contact: Array) -> SlotPair:
     """Return 1 for a slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
     sign = lambda mode: jnp.where(
-        mode == CONTACT_SLIP_DOWN, 1.0, jnp.where(mode == CONTACT_SLIP_UP, -1.0, 0.0)
+        mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
     )
     return sign(contact[0]), sign(contact[1])
 

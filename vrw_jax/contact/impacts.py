@@ -4,6 +4,7 @@ Everything is elementwise: for one wheel or a batch.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -14,14 +15,11 @@ from jaxtyping import Array, Bool, Int
 
 from vrw_jax.contact.contact_modes import (
     ALL_MODES_MASK,
-    CONTACT_OFF,
-    CONTACT_SLIP_DOWN,
-    CONTACT_SLIP_UP,
-    CONTACT_STICK,
     MAX_VIOLATION,
     PAPER_RULE_SENTINEL,
     AllowedModes,
     ChosenCombination,
+    ContactMode,
     Friction,
     SignTolerances,
     choose_combination,
@@ -111,14 +109,24 @@ class ContactLaw(NamedTuple):
     counts_solutions: bool  # whether all admissible solutions are counted
     rest_speed: Elementwise  # contacts slower than this after an impact are at rest, m/s
     restitution: Elementwise | None = None  # of the feet: speed ratio
-    tilt: Elementwise | None = None  # by which the ground ahead is steeper, rad
+    tilt: Elementwise | None = None  # by which the next line is steeper, rad
 
 
-MAX_BLOCK_PIVOTS, MAX_SINGLE_PIVOTS = 8, 16
-"""Numbers of block pivots and single pivots in the search for the holding stoppers; a few suffice
-unless friction couples the legs."""
-MAX_ENUMERATED_LEGS = 8
-"""Largest number of legs on stoppers whose combinations are enumerated if pivoting fails."""
+@dataclass(frozen=True)
+class PivotOptions:
+    """Search for the stoppers that hold their legs; few pivots suffice unless friction couples
+    legs.
+    """
+
+    max_block_pivots: int = 8
+    """Number of pivots that switch all legs of the wrong sign."""
+    max_single_pivots: int = 16
+    """Number of pivots after them that switch one leg."""
+    max_enumerated_legs: int = 8
+    """Largest number of legs whose combinations are enumerated if pivoting fails."""
+
+
+PIVOT_OPTIONS = PivotOptions()
 
 
 class _LevelSolution(NamedTuple):
@@ -142,6 +150,7 @@ def _solve_stopper_lcp(
     at_stopper: Array,
     is_tested: Array,
     tolerances: SignTolerances,
+    options: PivotOptions = PIVOT_OPTIONS,
 ) -> tuple[_LevelSolution, Array]:
     """Return the solution for the legs in the air that are held, and which legs are held.
 
@@ -154,7 +163,7 @@ def _solve_stopper_lcp(
     frozen = stop_gradients((law, motion))
     rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
-        jnp.sum(is_tested, axis=0, dtype=jnp.int32), MAX_ENUMERATED_LEGS
+        jnp.sum(is_tested, axis=0, dtype=jnp.int32), options.max_enumerated_legs
     )
     leg_index = _index_column(len(at_stopper), n_combinations)
 
@@ -173,11 +182,11 @@ def _solve_stopper_lcp(
         max_violation = jnp.maximum(jnp.max(violation, axis=0), level.chosen.violation)
         best = tree_where(max_violation < best[0], (max_violation, held, level.chosen), best)
         is_last = leg_index == jnp.max(jnp.where(is_violated, leg_index, -1), axis=0)
-        switched = held ^ jnp.where(n_tries < MAX_BLOCK_PIVOTS, is_violated, is_last)
+        switched = held ^ jnp.where(n_tries < options.max_block_pivots, is_violated, is_last)
         is_pivoting = (
             (code < 0)
             & jnp.any(is_violated, axis=0)
-            & (n_tries < MAX_BLOCK_PIVOTS + MAX_SINGLE_PIVOTS)
+            & (n_tries < options.max_block_pivots + options.max_single_pivots)
         )
         code = jnp.where(is_pivoting, code, code + 1)
         enumerated = jnp.where(is_tested, ((code >> rank) & 1) == 1, at_stopper)
@@ -187,10 +196,8 @@ def _solve_stopper_lcp(
             state,
         )
 
-    zeros, slot_zeros = (
-        jnp.zeros_like(n_combinations),
-        jnp.stack([n_combinations, n_combinations]) * 0,
-    )
+    zeros = jnp.zeros_like(n_combinations)
+    slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
     infinite = jnp.full_like(frozen[1].theta, jnp.inf)
     initial = (
         at_stopper,
@@ -293,7 +300,7 @@ def _solve_velocity_level(
     It also returns the held legs in the air: with one-sided stoppers, those that need not pull. The
     paper's rule keeps resting feet planted when a leg meets its stopper.
     """
-    s, slots = law.s, find_slots((contact_state.contact != CONTACT_OFF) | event.lands)
+    s, slots = law.s, find_slots((contact_state.contact != ContactMode.OFF) | event.lands)
     friction = slot_friction(law.friction, slots)
     at_stopper = contact_state.locked | event.meets_stopper
     is_loaded = jnp.stack([jnp.any(slots.first, axis=0), jnp.any(slots.second, axis=0)])
@@ -303,17 +310,17 @@ def _solve_velocity_level(
     )
     is_landing = jnp.any(event.lands, axis=0)
     is_planted = (
-        (slot_modes == CONTACT_STICK)
+        (slot_modes == ContactMode.STICK)
         & ~is_landing
         & (stack_friction(friction) == PAPER_RULE_SENTINEL)
     )
-    modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << CONTACT_OFF).astype(jnp.int32)
+    modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(jnp.int32)
     modes = jnp.where(is_planted, 1 << slot_modes, modes)
     allowed = AllowedModes(
         contact=jnp.where(event.is_impact, modes, 0),  # without an impact, no mode is examined
         may_hold=slot_locked,
         keeps_mode=is_planted,
-        untested_modes=jnp.where(is_loaded, 0, 1 << CONTACT_OFF).astype(jnp.int32),
+        untested_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
         untested_open=~slot_locked,
     )
     tolerances = SignTolerances(
@@ -363,17 +370,17 @@ def _following_modes(
     - `is_consistent`: the next mode of a slot's foot has the direction of release (see
       `is_release_consistent`).
     """
-    own_bit, off_bit = 1 << mode, 1 << CONTACT_OFF
-    modes = jnp.where(mode == CONTACT_STICK, ALL_MODES_MASK, own_bit | off_bit)
+    own_bit, off_bit = 1 << mode, 1 << ContactMode.OFF
+    modes = jnp.where(mode == ContactMode.STICK, ALL_MODES_MASK, own_bit | off_bit)
     reversed_bit = jnp.where(
-        mode == CONTACT_SLIP_DOWN, 1 << CONTACT_SLIP_UP, 1 << CONTACT_SLIP_DOWN
+        mode == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
     )
-    modes = jnp.where(event.stops_sliding, 1 << CONTACT_STICK | off_bit | reversed_bit, modes)
-    untested = jnp.where((mode == CONTACT_STICK) | event.stops_sliding, 0, own_bit)
+    modes = jnp.where(event.stops_sliding, 1 << ContactMode.STICK | off_bit | reversed_bit, modes)
+    untested = jnp.where((mode == ContactMode.STICK) | event.stops_sliding, 0, own_bit)
     for flags, following, ended_bit in (
         (event.lifts_off, off_bit, own_bit),
-        (event.slides_up, 1 << CONTACT_SLIP_UP, 1 << CONTACT_STICK),
-        (event.slides_down, 1 << CONTACT_SLIP_DOWN, 1 << CONTACT_STICK),
+        (event.slides_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
+        (event.slides_down, 1 << ContactMode.SLIP_DOWN, 1 << ContactMode.STICK),
     ):
         tested_bits = (
             ALL_MODES_MASK
@@ -405,12 +412,14 @@ def _solve_acceleration_level(
     derivatives.
     """
     law, motion = stop_gradients((law, motion))
-    s, slots = law.s, find_slots(contact != CONTACT_OFF)
+    s, slots = law.s, find_slots(contact != ContactMode.OFF)
     friction = slot_friction(law.friction, slots)
     mode, slot_locked = slots.gather_codes(contact), slots.gather_flags(at_stopper)
-    was_resting = (mode == CONTACT_STICK) | event.stops_sliding
+    was_resting = (mode == ContactMode.STICK) | event.stops_sliding
     # At the release of such a foot, its tangential force jumps to zero.
-    follows_paper_rule = (mode == CONTACT_STICK) & (stack_friction(friction) == PAPER_RULE_SENTINEL)
+    follows_paper_rule = (mode == ContactMode.STICK) & (
+        stack_friction(friction) == PAPER_RULE_SENTINEL
+    )
     slides_up, slides_down = event.slides_up, event.slides_down
     is_second = (event.lifts_off | slides_up | slides_down)[1]
     any_slot = lambda flags: jnp.any(flags, axis=0).astype(jnp.int32)
@@ -469,10 +478,12 @@ def _bring_to_rest(
     legs = leg_directions(law.s, motion.theta)
     tangential_speed, normal_speed = foot_speeds(motion, legs)
     stays_loaded = slots.is_filled & (normal_speed < law.rest_speed)
-    slip_mode = jnp.where(tangential_speed > 0.0, CONTACT_SLIP_DOWN, CONTACT_SLIP_UP)
-    mode = jnp.where(jnp.abs(tangential_speed) < law.rest_speed, CONTACT_STICK, slip_mode)
+    slip_mode = jnp.where(tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
+    mode = jnp.where(jnp.abs(tangential_speed) < law.rest_speed, ContactMode.STICK, slip_mode)
     mode = jnp.where(
-        stays_loaded, jnp.where(contact == CONTACT_STICK, CONTACT_STICK, mode), CONTACT_OFF
+        stays_loaded,
+        jnp.where(contact == ContactMode.STICK, ContactMode.STICK, mode),
+        ContactMode.OFF,
     )
     is_locked = at_stopper | (was_locked & (jnp.abs(motion.dL) < law.rest_speed))
     has_changed = jnp.any((mode != contact) | (is_locked != at_stopper), axis=0)
@@ -483,14 +494,14 @@ def _bring_to_rest(
         speed_after, _ = foot_speeds(
             project_motion(s, frozen_motion, mode, is_locked, friction), legs
         )
-        return ((mode == CONTACT_SLIP_DOWN) & (speed_after < 0.0)) | (
-            (mode == CONTACT_SLIP_UP) & (speed_after > 0.0)
+        return ((mode == ContactMode.SLIP_DOWN) & (speed_after < 0.0)) | (
+            (mode == ContactMode.SLIP_UP) & (speed_after > 0.0)
         )
 
     is_reversed = has_changed & run_if_any(
         jnp.any(has_changed), find_reversed_slip, is_locked & False
     )
-    mode = jnp.where(is_reversed, CONTACT_STICK, mode)
+    mode = jnp.where(is_reversed, ContactMode.STICK, mode)
     return (
         tree_where(
             has_changed, project_motion(law.s, motion, mode, is_locked, law.friction), motion
@@ -512,9 +523,11 @@ def _merge_touching(
     dip_depth = law.rest_speed**2 / (2.0 * s.g)
     heights = foot_heights(motion, legs, law.tilt)
     is_touching = (heights <= dip_depth) & (foot_speeds(motion, legs)[1] <= law.rest_speed)
-    lands = event.lands | (is_touching & (contact_state.contact == CONTACT_OFF) & event.is_impact)
+    lands = event.lands | (
+        is_touching & (contact_state.contact == ContactMode.OFF) & event.is_impact
+    )
     fits_slots = (
-        jnp.sum(lands | (contact_state.contact != CONTACT_OFF), axis=0, dtype=jnp.int32) <= 2
+        jnp.sum(lands | (contact_state.contact != ContactMode.OFF), axis=0, dtype=jnp.int32) <= 2
     )
     is_extended = (dip_depth >= s.L0 - motion.L) & (motion.dL >= -law.rest_speed)
     meets_stopper = event.meets_stopper | (is_extended & ~contact_state.locked & event.is_impact)
@@ -532,9 +545,11 @@ def _liftoff_to_slip(
     force no longer resists.
     """
     law, motion = stop_gradients((law, motion))
-    slots = find_slots(contact_state.contact != CONTACT_OFF)
+    slots = find_slots(contact_state.contact != ContactMode.OFF)
     friction, mode = slot_friction(law.friction, slots), slots.gather_codes(contact_state.contact)
-    begins_slip = event.lifts_off & (mode == CONTACT_STICK) & (stack_friction(friction) == jnp.inf)
+    begins_slip = (
+        event.lifts_off & (mode == ContactMode.STICK) & (stack_friction(friction) == jnp.inf)
+    )
     slot_state = (
         slots,
         mode,
@@ -561,7 +576,7 @@ def resolve_event(
         law, motion, contact_state, _liftoff_to_slip(law, motion, contact_state, event)
     )
     s, is_impact = law.s, event.is_impact
-    was_touching = (contact_state.contact != CONTACT_OFF) | event.lands
+    was_touching = (contact_state.contact != ContactMode.OFF) | event.lands
     was_locked = (contact_state.locked | event.meets_stopper) & ~event.leaves_stopper
     velocity_level, slots, held = _solve_velocity_level(law, motion, contact_state, event)
     if law.restitution is not None:
@@ -593,13 +608,13 @@ def resolve_event(
     is_locked = jnp.where(
         slots.is_filled, slots.scatter(acceleration_level.held) > 0, at_stopper & held
     )
-    is_sliding = (acceleration_level.contact == CONTACT_SLIP_DOWN) | (
-        acceleration_level.contact == CONTACT_SLIP_UP
+    is_sliding = (acceleration_level.contact == ContactMode.SLIP_DOWN) | (
+        acceleration_level.contact == ContactMode.SLIP_UP
     )
     contact_state = ContactState(
         contact=contact,
         locked=is_locked,
-        has_just_lifted=was_touching & (contact == CONTACT_OFF),
+        has_just_lifted=was_touching & (contact == ContactMode.OFF),
         has_just_unlocked=(contact_state.locked | event.meets_stopper) & ~is_locked,
         has_just_slid=slots.scatter(is_sliding & was_resting) > 0,
     )
@@ -647,13 +662,13 @@ def project_motion(
     its contacts is unchanged up to round-off.
     """
     legs = leg_directions(s, motion.theta)
-    L = jnp.where((contact != CONTACT_OFF) & ~locked, motion.z / legs.cos, motion.L)
+    L = jnp.where((contact != ContactMode.OFF) & ~locked, motion.z / legs.cos, motion.L)
     motion = motion._replace(L=jnp.where(locked, s.L0, L))
-    slots = find_slots(contact != CONTACT_OFF)
+    slots = find_slots(contact != ContactMode.OFF)
     airborne = locked & ~slots.is_filled
     modes, held = slots.gather_codes(contact), slots.gather_flags(locked)
     # Two resting feet on two held legs would constrain the hub twice.
-    is_overdetermined = jnp.all((modes == CONTACT_STICK) & held, axis=0)
+    is_overdetermined = jnp.all((modes == ContactMode.STICK) & held, axis=0)
     held = jnp.stack([held[0], held[1] & ~is_overdetermined])
     slot_coefficients = (
         jnp.zeros_like(motion.theta) if friction is None else slot_friction(friction, slots)

@@ -5,7 +5,7 @@ state.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions
 from vrw_jax.models import PAPER_START, is_valid_slope, is_valid_start, replace_invalid
@@ -43,7 +43,9 @@ def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
             jnp.where(is_leg_1, L1, s.L0),
             jnp.where(is_leg_1, dL1, 0.0),
             jnp.where(
-                is_leg_1, float(CONTACT_STICK), LOCKED_CODE_OFFSET + CONTACT_OFF + 0.0 * theta
+                is_leg_1,
+                float(ContactMode.STICK),
+                LOCKED_CODE_OFFSET + ContactMode.OFF + 0.0 * theta,
             ),
         ]
     )
@@ -94,7 +96,7 @@ def _unpack_posture(
     L = jnp.where(locked, s.L0, L)
     legs = leg_directions(s, theta)
     hub = L[0] * legs.sin[0], L[0] * legs.cos[0]
-    L = jnp.where((contact != CONTACT_OFF) & ~locked, hub[1] / legs.cos, L)
+    L = jnp.where((contact != ContactMode.OFF) & ~locked, hub[1] / legs.cos, L)
     return theta, hub, L, dL, contact, locked
 
 
@@ -102,7 +104,7 @@ def _is_possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
     """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long."""
     theta, (_, z), L, _, contact, _ = _unpack_posture(s, x)
     height, tolerance = z - L * leg_directions(s, theta).cos, PENETRATION_TOLERANCE * s.L0
-    is_contact_consistent = (contact == CONTACT_OFF) | (height <= tolerance)
+    is_contact_consistent = (contact == ContactMode.OFF) | (height <= tolerance)
     return jnp.all((height >= -tolerance) & is_contact_consistent & (tolerance >= L - s.L0), axis=0)
 
 

@@ -23,7 +23,7 @@ from vrw_jax.contact.batch_integrator import (
     init_interval,
     motion_from_point,
 )
-from vrw_jax.contact.contact_modes import CONTACT_OFF
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
@@ -298,7 +298,7 @@ def _unpack_samples(n: int, log: IntervalLog, rows: Array) -> tuple[Array, Array
     clock = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
     q, v, accumulators, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)
     state = [q[..., :3], v[..., :3], q[..., 3:], v[..., 3:], clock[..., None], accumulators]
-    slots = jax.vmap(lambda contact: find_slots(contact != CONTACT_OFF))(log.contact)
+    slots = jax.vmap(lambda contact: find_slots(contact != ContactMode.OFF))(log.contact)
     scatter_to_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.scatter(pair), (None, 0)))
     normal, tangential = (scatter_to_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
     return jnp.concatenate(state, -1), tangential, normal

@@ -4,6 +4,7 @@ A step is a sequence of events, each followed by an interval in which no contact
 event is the opening landing; the step is complete when the foremost foot lands.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.contact.contact_modes import CONTACT_OFF, PAPER_RULE_SENTINEL, Friction
+from vrw_jax.contact.contact_modes import PAPER_RULE_SENTINEL, ContactMode, Friction
 from vrw_jax.contact.contact_state import Accumulators, ContactState, GuardLayout
 from vrw_jax.contact.impacts import (
     ContactLaw,
@@ -29,21 +30,33 @@ from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.wheel import Outcome, Symbols
 
-DIP_DEPTH_PER_ATOL, MIN_DIP_EPS = 1e-2, 4e2
-"""Smallest depth of a followed dip: the first as a fraction of the tolerance, the second in
-rounding units of a leg's length, 1e-13 m in float64."""
-REST_SPEED_RAMP_START = 100
-"""Number of events of a step after which each further event raises the rest speed by its initial
-value; a quarter of the allowed events if that is more. Walks make 4 to 60 events, and chains of
-ever smaller dips make hundreds, which this ends where a tolerance would continue them. Of 400
-events, the last dip is as large as a tolerance of 1e-6 leaves from the first."""
+
+@dataclass(frozen=True)
+class RestOptions:
+    """Rules by which a foot that dips ever less comes to rest."""
+
+    dip_depth_per_atol: float = 1e-2
+    """Smallest depth of a dip that a step follows, as a fraction of the absolute tolerance."""
+    dip_depth_eps: float = 4e2
+    """The same in units of round-off of a leg's length: 1e-13 m in float64."""
+    n_events_before_ramp: int = 100
+    """Number of events of a step after which each event raises the rest speed by its initial value.
+
+    A quarter of the allowed events replaces it if that is more. It is chosen because walks have 4
+    to 60 events, and chains of ever smaller dips have hundreds. Of 400 events, the last dip is as
+    large as a tolerance of 1e-6 leaves from the first.
+    """
 
 
-def min_dip_depth(L0: Elementwise, options: StepOptions) -> Array:
+REST_OPTIONS = RestOptions()
+
+
+def min_dip_depth(
+    L0: Elementwise, options: StepOptions, rest_options: RestOptions = REST_OPTIONS
+) -> Array:
     """Return the smallest depth of a dip that a step follows, m."""
-    return jnp.maximum(
-        DIP_DEPTH_PER_ATOL * options.atol, MIN_DIP_EPS * jnp.finfo(L0.dtype).eps * L0
-    )
+    roundoff_depth = rest_options.dip_depth_eps * jnp.finfo(L0.dtype).eps * L0
+    return jnp.maximum(rest_options.dip_depth_per_atol * options.atol, roundoff_depth)
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
@@ -79,21 +92,20 @@ def process_event(
     guard: Int[Array, "..."],
     n_events: Int[Array, "..."],
     max_events: int,
+    rest_options: RestOptions = REST_OPTIONS,
 ) -> tuple[EventResult, Event, Int[Array, "..."]]:
     """Return the result of a guard's event, the event, and STEPPED if it was resolved.
 
     - `n_events`: number of earlier events in this step, of at most `max_events`.
 
-    The integrator lets feet drift by its error, so the motion is projected onto its contacts first.
-    A foot that lifts off rises like the third power of time, from the slope and from rest; without
-    the projection it would land again at once.
+    The motion is projected onto its contacts first, because feet drift by the integrator's error. A
+    foot that lifts off rises from the slope like the third power of time; without the projection it
+    would land again immediately.
     """
-    ramp_start = max(REST_SPEED_RAMP_START, max_events // 4)
+    ramp_start = max(rest_options.n_events_before_ramp, max_events // 4)
     law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
-    motion, event = (
-        project_motion(law.s, motion, contact_state.contact, contact_state.locked),
-        classify_event(layout, guard),
-    )
+    motion = project_motion(law.s, motion, contact_state.contact, contact_state.locked)
+    event = classify_event(layout, guard)
     result = resolve_event(law, motion, contact_state, event)
     outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
     outcome = jnp.where(result.is_paradox, Outcome.PAINLEVE_PARADOX, outcome)
@@ -134,7 +146,7 @@ def add_interval(
     n_solver_steps: Array,
 ) -> StepCounters:
     """Return the counters after one more interval in this contact state."""
-    n_loaded = jnp.sum(contact_state.contact != CONTACT_OFF, axis=0)
+    n_loaded = jnp.sum(contact_state.contact != ContactMode.OFF, axis=0)
     has_n_feet = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
     durations = counters.durations + jnp.where(has_n_feet, duration, 0.0)
     return counters._replace(

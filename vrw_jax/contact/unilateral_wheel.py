@@ -132,8 +132,8 @@ class _EventLoopState(NamedTuple):
 class UnevenGround(NamedTuple):
     """Uneven ground: quantities of a step besides the ground of its own landing."""
 
-    friction: Scalar  # of the feet that landed before
-    tilt: Scalar  # by which the ground ahead is steeper, rad
+    friction: Scalar  # of the feet that landed earlier
+    tilt: Scalar  # by which the next line is steeper, rad
 
 
 def _convert_restitution(value: Any) -> Array | None:

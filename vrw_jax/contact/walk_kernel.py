@@ -16,10 +16,9 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    STATUS_EVENT,
-    STATUS_RUNNING,
     IntervalPoint,
     IntervalState,
+    LaneStatus,
     init_interval,
     integrate_interval,
     motion_from_point,
@@ -63,9 +62,11 @@ from vrw_jax.wheel import (
     wheel_from_parameters,
 )
 
-N_PARAMETERS, N_UNEVEN_COLUMNS = len(PARAMETER_NAMES), 2
-"""Columns: so many parameters and friction; on uneven ground friction of the feet that landed
-before, and by how much the line ahead is steeper, rad."""
+N_PARAMETERS = len(PARAMETER_NAMES)
+"""Number of columns of parameters, which friction follows."""
+N_UNEVEN_COLUMNS = 2
+"""Number of further columns on uneven ground: friction of the feet that landed earlier, and the
+angle by which the next line is steeper, rad."""
 STATUS_UNFINISHED = -1
 """Code of an unfinished lane in place of its outcome."""
 
@@ -194,7 +195,7 @@ class BatchWalk(NamedTuple):
         q, v = pack_coordinates(motion)
         point = IntervalPoint(q, v, jnp.full_like(interval.point.dynamics_rows, jnp.inf))
         interval = interval._replace(
-            point=point, contact_state=contact_state, status=interval.status + STATUS_EVENT
+            point=point, contact_state=contact_state, status=interval.status + LaneStatus.EVENT
         )
         return LaneState(
             interval,
@@ -231,7 +232,7 @@ class BatchWalk(NamedTuple):
                 details, dynamics_before, motion_from_point(interval.point), interval.time
             )
             accumulators = accumulators + interval.accumulated
-        at_event = interval.status == STATUS_EVENT
+        at_event = interval.status == LaneStatus.EVENT
         has_landed = at_event & (interval.guard == layout.foremost_landing)
         arguments = counters, layout, at_event, interval.guard, has_landed, interval.status
         outcome = interval_outcome(*arguments, self.max_events).astype(jnp.int32)
@@ -272,7 +273,7 @@ class BatchWalk(NamedTuple):
         continued_lane = LaneState(
             next_interval, counters, details, accumulators, n_stepped, lane.outcome
         )
-        is_at_end = (interval.status != STATUS_RUNNING) & (lane.outcome == STATUS_UNFINISHED)
+        is_at_end = (interval.status != LaneStatus.RUNNING) & (lane.outcome == STATUS_UNFINISHED)
         return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane)
 
     def compute_result(self, lane: LaneState, tilt: Array | None) -> Any:

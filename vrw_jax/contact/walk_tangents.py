@@ -19,11 +19,10 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     N_ACCUMULATOR_ROWS,
-    STATUS_EVENT,
-    STATUS_RUNNING,
     DynamicsFn,
     IntervalPoint,
     IntervalState,
+    LaneStatus,
     evaluate_dynamics,
     finish_attempt,
     guards_at_point,
@@ -32,7 +31,7 @@ from vrw_jax.contact.batch_integrator import (
     run_until_done,
     stage_state,
 )
-from vrw_jax.contact.contact_modes import CONTACT_OFF
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState, ModeDynamics, guard_scales
 from vrw_jax.contact.tangent_basis import N_MOVING_LEGS, TangentBasis
 from vrw_jax.contact.walk_kernel import (
@@ -302,7 +301,7 @@ def _integrate_with_tangents(
 
         return next_interval, tangents.map_tangents(end_tangent, rows)
 
-    is_running = lambda state: state[0].status == STATUS_RUNNING
+    is_running = lambda state: state[0].status == LaneStatus.RUNNING
     interval, rows = run_until_done(is_running, is_walking, try_step, (initial, tangents.rows))
     return interval, tangents.map_tangents(
         _shift_to_event(dynamics_at, columns, initial, interval, tangents, template), rows
@@ -324,7 +323,7 @@ def _evaluate_stages(
     """
     point, h = interval.point, interval.h
     size, last_stage = len(template.dynamics_rows), len(tableau.nodes) - 1
-    is_fresh = (interval.status == STATUS_RUNNING) & (interval.time == 0.0)
+    is_fresh = (interval.status == LaneStatus.RUNNING) & (interval.time == 0.0)
 
     def evaluate_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, stage_rows, row_tangents = state
@@ -400,20 +399,18 @@ def _stage_tangent(
     return q + h * (node * v + h * second_sum), v + h * first_sum
 
 
-TANGENT_STABILITY_SHARE = 0.85
-"""Fraction of the longest stable step size that is used for tangents of a swinging leg."""
-
-
-def _max_stable_step(dynamics: ModeDynamics, tableau: ButcherTableau) -> Array:
-    """Return the step size above which tangents of a swinging leg grow.
+def _max_stable_step(
+    dynamics: ModeDynamics, tableau: ButcherTableau, safety_factor: float = 0.85
+) -> Array:
+    """Return the step size above which tangents of a swinging leg grow, times a safety factor.
 
     The damper of such a leg stops it within m / c. Step-size control is based on the motion alone,
     in which such a leg may be almost at rest.
     """
     has_swing_leg = jnp.any(
-        ~dynamics.contact_state.locked & (dynamics.contact_state.contact == CONTACT_OFF), axis=0
+        ~dynamics.contact_state.locked & (dynamics.contact_state.contact == ContactMode.OFF), axis=0
     )
-    step_factor = TANGENT_STABILITY_SHARE * real_stability_limit(tableau)
+    step_factor = safety_factor * real_stability_limit(tableau)
     return jnp.where(has_swing_leg, step_factor * dynamics.s.m / dynamics.s.c, jnp.inf)
 
 
@@ -450,7 +447,7 @@ def _shift_to_event(
 
     _, push_guards = jax.linearize(compute_guards, columns, point.q, point.v)
     rates = push_guards(jnp.zeros_like(columns), point.v, point.dynamics_rows[:n])
-    has_arrived = (initial.status == STATUS_RUNNING) & (interval.status == STATUS_EVENT)
+    has_arrived = (initial.status == LaneStatus.RUNNING) & (interval.status == LaneStatus.EVENT)
 
     def shift_tangent(k: Array, row: Array) -> _IntervalTangent:
         tangent, time_tangent = _unpack_rows(row, template), jnp.zeros_like(interval.time)

@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.contact import (
-    CONTACT_OFF,
-    CONTACT_STICK,
     LOCKED_CODE_OFFSET,
+    ContactMode,
     FullState,
     UnilateralStep,
     UnilateralTrajectory,
@@ -277,8 +276,8 @@ class LadderWheel(AbstractWheel):
         paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
-        locked_code = float(LOCKED_CODE_OFFSET + CONTACT_OFF)
-        paper_codes = jnp.where(is_leg_1, float(CONTACT_STICK), locked_code)
+        locked_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
+        paper_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_code)
         is_embeddable = jnp.all(jnp.round(x[4 + 2 * params.n_legs :]) == paper_codes)
         paper_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
         result = paper_model.take_step(

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.contact import (
-    CONTACT_STICK,
     LOCKED_CODE_OFFSET,
+    ContactMode,
     UnilateralWheel,
     embed_section_states,
     min_dip_depth,
@@ -129,7 +129,7 @@ class GroundBatch:
         contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
         is_free = np.zeros((len(section_states), 4 + 2 * n_legs), bool)
         is_free[:, :2] = is_free[:, 4 + n_legs] = True
-        is_free[:, 2] = contact_codes[:, 0] != CONTACT_STICK
+        is_free[:, 2] = contact_codes[:, 0] != ContactMode.STICK
         is_free[:, 3] = is_free[:, 4] = contact_codes[:, 0] % LOCKED_CODE_OFFSET == 0
         is_off_stopper = contact_codes[:, 1:] < LOCKED_CODE_OFFSET
         is_free[:, 5 : 4 + n_legs], is_free[:, 5 + n_legs :] = is_off_stopper, is_off_stopper
@@ -152,7 +152,7 @@ class GroundBatch:
         )
         length = section_states[:, 4]
         section_states[:, 2] = np.where(
-            foot_code == CONTACT_STICK,
+            foot_code == ContactMode.STICK,
             leg_1_rate * sin + length * hub_rate * cos,
             section_states[:, 2],
         )
