@@ -87,7 +87,7 @@ START_NAME = "section_state"
 
 
 class StepwiseParameter(NamedTuple):
-    """How a parameter enters the steps of a walk, for the chain rule.
+    """Role of a parameter in the steps of a walk, for the chain rule.
 
     It may be several inputs of one step, and its values may differ from step to step.
     """

@@ -294,7 +294,7 @@ class _WalkConfig(NamedTuple):
     max_events: int
     is_one_sided: bool
     uses_paper_rule: bool
-    has_tangents: bool  # all that a step tells, and along directions of each lane
+    has_tangents: bool  # whether the detailed step and its tangents are computed
     uneven: bool
 
     @classmethod

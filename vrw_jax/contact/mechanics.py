@@ -346,17 +346,18 @@ def foot_velocity(
 def foot_heights(
     motion: WheelMotion, legs: LegDirections, tilt: Elementwise | None = None
 ) -> LegArray:
-    """Height of every foot above the slope, m.
+    """Return the height of every foot above the slope, m.
 
-    The foremost foot's is above the line ahead, where that is steeper by `tilt`, rad; it begins
-    under Leg 1's foot.
+    - `tilt`: angle by which the next line is steeper, rad. The height of the foremost foot is then
+      that above the next line, which begins under the foot of Leg 1.
     """
     heights = motion.z - motion.L * legs.cos
     if tilt is None:
         return heights
-    places = foot_positions(motion, legs)
-    ahead = heights[-1] * jnp.cos(tilt) + (places[-1] - places[0]) * jnp.sin(tilt)
-    return jnp.concatenate([heights[:-1], ahead[None]])
+    positions = foot_positions(motion, legs)
+    distance = positions[-1] - positions[0]
+    foremost_height = heights[-1] * jnp.cos(tilt) + distance * jnp.sin(tilt)
+    return jnp.concatenate([heights[:-1], foremost_height[None]])
 
 
 def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:

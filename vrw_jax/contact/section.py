@@ -56,8 +56,8 @@ def replace_invalid_start(
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Return whether a step may begin at this input, and the input or, if not, a valid substitute.
 
-    On uneven ground, where the line ahead is steeper by `tilt`, rad, feet may be below the line
-    that the next foothold continues.
+    - `tilt`: angle by which the next line is steeper, rad. On such uneven ground feet may be below
+      the line that continues the one of the last foothold.
     """
     safe_state = embed_section_state(
         WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
@@ -125,10 +125,9 @@ def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, Contact
 def pack_section_state(
     motion: WheelMotion, contact_state: ContactState, tilt: Elementwise | None = None
 ) -> FullState:
-    """Return the section state of a motion just before the next landing, in the slope's frame
-    there.
+    """Return the section state of a motion just before the next landing, in the frame of its line.
 
-    - `tilt`: by which the ground ahead is steeper, if it is.
+    - `tilt`: angle by which that line is steeper, rad; None on flat ground.
     """
     code = contact_state.contact + LOCKED_CODE_OFFSET * contact_state.locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz

@@ -65,8 +65,8 @@ PARAMETER_GROUPS = [
         ("friction", "friction_before"),
     )
 ]
-"""Columns that act in one way; the place of stoppers acts by lengths alone, the line ahead only in
-guards."""
+"""Groups of columns with one common effect. Lengths act through the position of stoppers alone, the
+tilt of the next line through guards alone."""
 
 CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
 """Function that returns some coordinates and rates of a tangent at a point."""

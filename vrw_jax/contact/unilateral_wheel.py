@@ -147,7 +147,9 @@ def _convert_restitution(value: Any) -> Array | None:
     if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
         (restitution >= 0.0) & (restitution <= 1.0)
     ):
-        raise ValueError(f"restitution is {value}, but feet come back at 0 to 1 of their speed.")
+        raise ValueError(
+            f"restitution is {value}, but it is a ratio of speeds: give a number from 0 to 1."
+        )
     return restitution
 
 
@@ -237,17 +239,18 @@ class UnilateralWheel(AbstractWheel):
         return full_section_size(params.n_legs) - params.n_legs
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
-        """Return the full section state of the paper's (theta-, dtheta-, dL1-): Leg 1 planted."""
+        """Return the full section state for (theta-, dtheta-, dL1-), with Leg 1 on the ground."""
         return _embedded(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        """Slope and friction of a landing, friction of the feet before, and by how much the line
-        ahead is steeper."""
+        """Return slope, friction, friction of the earlier feet, and tilt of the next line of each
+        step; None on flat ground of one friction.
+        """
         slope, friction = params.slope, self.friction
         if slope.ndim == friction.ndim == 0:
             return None
-        flat = slope.ndim == 0
-        slopes = jnp.full(n_steps + 1, slope) if flat else complete_slopes(slope, n_steps)
+        is_flat = slope.ndim == 0
+        slopes = jnp.full(n_steps + 1, slope) if is_flat else complete_slopes(slope, n_steps)
         if friction.ndim:
             check_step_values(FRICTION_NAME, friction, n_steps)
         friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
@@ -293,12 +296,12 @@ class UnilateralWheel(AbstractWheel):
         )
 
     def _is_supported_by_lanes(self, options: StepOptions) -> bool:
-        """Whether the ground is such as lanes know."""
+        """Return whether machine code supports the ground: it has no restitution."""
         is_supported = self.restitution is None
         if options.engine == "lanes" and not is_supported:
             raise ValueError(
-                "engine is 'lanes', but lanes do not know feet that come back: take engine='auto' "
-                "or 'diffrax'."
+                "engine is 'lanes', which does not support restitution: take engine='auto' or "
+                "'diffrax'."
             )
         return is_supported
 

@@ -184,7 +184,7 @@ class BatchWalk(NamedTuple):
         ) if self.uneven else friction
 
     def tilt(self, columns: Array) -> Array | None:
-        """By which the line ahead is steeper, rad; None on flat ground."""
+        """Return the angle by which the next line is steeper, rad; None on flat ground."""
         return columns[N_PARAMETERS + 2] if self.uneven else None
 
     def begin_walk(self, columns: Array, x: Array) -> LaneState:

@@ -16,8 +16,8 @@ from vrw_jax.numerics import StepOptions
 class ReturnMap:
     """Map of section coordinates to those after `events` events of a hybrid simulation.
 
-    It is not a number if the simulation ends early, so that no method takes the state at which it
-    stopped for a return. `solve_fixed_point` reports the termination with the point.
+    It is NaN if the simulation ends early, so that no method mistakes its last state for a return.
+    `solve_fixed_point` reports the termination with the point.
 
     - `modes`: as in `simulate_hybrid`;
     - `embed`: the state of given section coordinates, where the simulation begins;
@@ -42,7 +42,7 @@ class ReturnMap:
         )
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the next section coordinates; not a number if the simulation ended early."""
+        """Return the next section coordinates; NaN if the simulation ended early."""
         solution = self.simulate(x)
         section = self.project(solution.state)
         return section * jnp.where(

@@ -33,7 +33,7 @@ def flow_jacobian_determinant(
     return map's Jacobian loses that product's digits where a guard is grazed, because its entries
     grow as one over the guard's rate.
 
-    Not a number where steps are spent. Transforms apply, reverse mode does not.
+    The result is NaN if the solver steps are exhausted. Transforms apply, reverse mode does not.
     """
     options = StepOptions() if options is None else options
     modes, start = collect_modes(modes), check_reals("start", start)

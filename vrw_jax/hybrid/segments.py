@@ -43,7 +43,7 @@ def segment_maps(
 
     Derivatives take part in the step-size control. Each tangent is a direction of about constant
     length and the logarithm of its growth, so that decaying directions keep their digits. A segment
-    whose solver steps are spent is NaN. A clock among the coordinates is no direction and must
+    whose solver steps are exhausted is NaN. A clock among the coordinates is no direction and must
     follow those that are.
     """
     start = jnp.asarray(start, float)
@@ -135,8 +135,8 @@ def product_multipliers(
         raise ValueError(f"maps has shape {jacobians.shape}, but it must be (n_segments, n, n).")
     if not np.all(np.isfinite(jacobians)):
         raise ValueError(
-            "maps holds a number that is not finite: the flow left its domain, or its steps were "
-            "spent; take more segments, or raise StepOptions.max_solver_steps."
+            "maps contains a number that is not finite: the flow left its domain, or its steps "
+            "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
         )
     n, basis, closing_matrix = (
         jacobians.shape[1],

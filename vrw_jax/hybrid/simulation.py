@@ -31,9 +31,9 @@ after then take 2.4 GB."""
 
 
 class Guard(NamedTuple):
-    """A function that ends its mode where `value`, positive inside, falls to zero.
+    """A function `value`, positive inside its mode, that ends the mode when it falls to zero.
 
-    Then `reset` is applied, and `target_mode` follows.
+    Then `reset` is applied to the state, and `target_mode` begins.
     """
 
     value: Callable[[StateVector], Scalar]
@@ -72,14 +72,18 @@ class Termination(StatusCode):
     )
 
 
+RUNNING_CODE = -1
+"""Code of a simulation that has not ended, in place of its `Termination`."""
+
+
 class HybridSolution(NamedTuple):
     """Events of a simulation in order of time; rows past `n_events` are zero."""
 
     times: Float[Array, " events"]
-    time_tolerance: Float[
-        Array, " events"
-    ]  # the state's tolerances as an error of each time, no bound
-    time_roundoff: Float[Array, " events"]  # the state's round-off as an error of each time
+    time_tolerance: Float[Array, " events"]
+    """Tolerances of the state as an error of each time, which is no bound."""
+    time_roundoff: Float[Array, " events"]
+    """Round-off of the state as an error of each time."""
     states_before: Float[Array, "events dim"]  # states on the guard
     states_after: Float[Array, "events dim"]  # states after the reset
     modes: Int[Array, " events"]  # modes that ended
@@ -106,15 +110,14 @@ def simulate_hybrid(
     mode: int = 0,
     options: StepOptions | None = None,
 ) -> HybridSolution:
-    """Simulate `modes` from `start` through at most `events` events.
+    """Return the simulation of `modes` from `start` through at most `events` events.
 
-    Guards are met as `integrate_phase` meets them: the earliest first, at the integrator's
-    accuracy, with derivatives of event times and states. A guard within the clock's rounding of
-    zero where its mode begins counts as zero; one that is zero at rest there fires only if it
-    will not rise. Transforms (`jax.jit`, `jax.jacfwd`, `jax.vmap`)
-    apply, reverse mode does not. One mode, or a mode's one guard, may be given without a tuple.
-    Outside of `jax.jit` equal modes are compiled once: functions with equal code that refer to
-    equal constants share a program.
+    Events are located by `integrate_phase`: the earliest first, at the integrator's accuracy, with
+    derivatives of event times and states. At the start of a mode, a guard within round-off of the
+    time of zero counts as zero. A guard that is zero with a zero rate there ends the mode only if
+    it will not rise. The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` apply, reverse mode does
+    not. One mode, or the only guard of a mode, may be given without a tuple. Outside of `jax.jit`
+    equal modes are compiled once: functions with equal code and equal constants share a program.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
@@ -127,11 +130,6 @@ def simulate_hybrid(
     return refuse_reverse_mode("simulate_hybrid", solution)
 
 
-ERROR_CHECK_TIGHTENINGS = (0.1, 0.01)
-"""Factors by which the tolerances are divided in the simulations that `time_errors`
-compares with."""
-
-
 def time_errors(
     modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,
@@ -140,13 +138,15 @@ def time_errors(
 ) -> Float[Array, " events"]:
     """Return estimated errors of the event times, s, from simulations at two looser tolerances.
 
-    The same events are walked to again with tolerances ten and a hundred times as large. Each time
-    is stated to twice the most that any event so far moved by, in units of its `resolution`, and to
-    twice its `resolution` at least; not below the roundings of all states so far, and of the clock.
-    That holds what `resolution` alone does not know: errors of
-    steps that add up, what earlier events hand on to later ones, and what an implicit solver's own
-    estimate leaves out where the field is stiff. Infinite from the first event that the walk at ten
-    times the tolerance does not meet. Measured, not proved; `options` are those of the walk.
+    The simulation is repeated with tolerances that are ten and a hundred times as large. The change
+    of each event's time is divided by its `time_tolerance`. The estimate of an event is twice the
+    largest of these ratios so far, at least 1, times its `time_tolerance`. It is not below the sum
+    of the round-off of all states and of the time.
+
+    Unlike `time_tolerance`, the estimate contains errors of steps that add up, errors of earlier
+    events, and errors that an implicit solver's own estimate omits in a stiff field. It is infinite
+    from the first event that the simulation at ten times the tolerance does not reach. The estimate
+    is measured, not proved. `options` are those of the simulation.
     """
     options = StepOptions() if options is None else options
     modes = collect_modes(modes)
@@ -157,6 +157,7 @@ def time_errors(
 def _estimate_time_errors(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Float[Array, " events"]:
+    """Return `time_errors` of modes that are tuples."""
     count = jnp.arange(len(solution.times))
 
     def time_change(factor: Array) -> Array:
@@ -169,13 +170,13 @@ def _estimate_time_errors(
         is_same_event = jnp.cumprod(is_same_event & (count < looser_solution.n_events)) > 0
         return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
 
-    # Each event adds a rounding of its state, and the clock its own.
+    # Each event adds the round-off of its state, and the time has its own.
     rounding = jnp.cumsum(
         jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
     )
     rounding = rounding + jnp.finfo(start.dtype).eps * jnp.abs(solution.times)
     changes_at_ten, changes_at_hundred = lax.stop_gradient(
-        lax.map(time_change, jnp.asarray(ERROR_CHECK_TIGHTENINGS, start.dtype))
+        lax.map(time_change, jnp.asarray([0.1, 0.01], start.dtype))
     )
     max_change = (
         jnp.maximum(
@@ -184,12 +185,12 @@ def _estimate_time_errors(
         / solution.time_tolerance
     )
     max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
-    stated = jnp.maximum(2.0 * max_change * solution.time_tolerance, rounding)
-    return jnp.where(count < solution.n_events, stated, 0.0)
+    errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, rounding)
+    return jnp.where(count < solution.n_events, errors, 0.0)
 
 
 def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
-    """Return modes, and the guards of each, as tuples; one alone may be given as it is."""
+    """Return modes, and the guards of each, as tuples; a single one may be given without."""
     if isinstance(modes, Mode | Guard):  # tuples themselves
         modes = (modes,)  # type: ignore[assignment]
     check_type("modes", modes, (list, tuple), "give Modes in a list")
@@ -205,12 +206,13 @@ def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
 
 
 def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: int) -> None:
+    """Raise a ValueError unless start, events, mode and all functions of the modes fit together."""
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
     if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
-        raise ValueError("start holds a number that is not finite.")
+        raise ValueError("start contains a number that is not finite: give finite numbers.")
     if events * start.size > MAX_STORED_NUMBERS:
-        raise ValueError(f"events is {events}, but so many states don't fit: ask for fewer.")
+        raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
     if not 0 <= mode < len(modes):
         raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
     for i, (field, guards) in enumerate(modes):
@@ -224,11 +226,12 @@ def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: i
             if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
                 raise ValueError(
                     f"{name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
-                    f"count from 0."
+                    "count from 0."
                 )
 
 
 def _check_output_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
+    """Raise an error unless `function(start)` returns floats of this shape."""
     check_callable(name, function, "of the state")
     output: Any = jax.eval_shape(function, start)
     output_shape = getattr(output, "shape", None)
@@ -248,12 +251,10 @@ def _check_output_shape(name: str, function: Callable, start: Array, shape: tupl
 def _integrate_mode(
     mode: Mode, state: Array, time: Array, options: StepOptions
 ) -> tuple[PhaseEnd, Array]:
-    """Integrate a mode, and return its end and whether a guard is violated at its start."""
+    """Return the end of a mode, and whether a guard is violated at its start."""
     guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
-    values, (rates, curvatures) = (
-        mode.guard_values(state),
-        jax.jvp(guard_rates, (state,), (mode.field(state),)),
-    )
+    values = mode.guard_values(state)
+    rates, curvatures = jax.jvp(guard_rates, (state,), (mode.field(state),))
     values, rates, curvatures = lax.stop_gradient((values, rates, curvatures))
     clock = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
@@ -263,9 +264,9 @@ def _integrate_mode(
     # For a guard at rest the second derivative decides: it does not fire if it will rise.
     is_rising = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
     guard_offset = jnp.where(is_rising, jnp.finfo(state.dtype).tiny, guard_offset)
-    on = (values <= 0.0) & is_near_zero & ~is_rising
+    is_zero = (values <= 0.0) & is_near_zero & ~is_rising
     monitored_functions = MonitoredFunctions(
-        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), is_zero_at_start=on
+        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), is_zero_at_start=is_zero
     )
     return integrate_phase(
         mode.field, monitored_functions, state, ~is_violated, options
@@ -273,8 +274,9 @@ def _integrate_mode(
 
 
 def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple[Array, Array]:
-    """Return tolerance and round-off of the state as times of the event, large where a guard is
-    grazed.
+    """Return tolerance and round-off of the state as errors of the event time.
+
+    They are large if the guard is grazed.
     """
     state = lax.stop_gradient(end.state)
     guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(end.guard, 0)]
@@ -287,43 +289,34 @@ def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple
     return lax.stop_gradient((time_scales[0], time_scales[1]))
 
 
-def _apply_reset(mode: Mode, guard: Array, state: Array, mode_index: int) -> tuple[Array, Array]:
-    """Return the state after the reset of the guard that ended the mode, and the next mode."""
-    index = jnp.maximum(guard, 0)
-    next_state = lax.switch(index, [g.reset for g in mode.guards], state)
-    return next_state, jnp.asarray(
-        [mode_index if g.target_mode is None else g.target_mode for g in mode.guards], jnp.int32
-    )[index]
-
-
-def _added(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the rounded sum and what rounding took from it (D. E. Knuth's two-sum)."""
-    later = time + duration
-    taken = later - time
-    return later, (time - (later - taken)) + (duration - taken)
+def _add_exactly(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
+    """Return the rounded sum and its rounding error (D. E. Knuth's two-sum)."""
+    total = time + duration
+    added = total - time
+    return total, (time - (total - added)) + (duration - added)
 
 
 def _simulate(
     static: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
+    """Return the simulation; `static` holds the modes and the number of events."""
     modes, events = static
 
     def make_mode_branch(mode_index: int) -> Callable:
         def run_mode(state: Array, time: Array) -> tuple:
             end, is_violated = _integrate_mode(modes[mode_index], state, time, options)
             time_scales = _event_time_scales(modes[mode_index], end, options)
-            return (
-                end,
-                is_violated,
-                time_scales,
-                *_apply_reset(modes[mode_index], end.guard, end.state, mode_index),
-            )
+            guards, guard = modes[mode_index].guards, jnp.maximum(end.guard, 0)
+            next_state = lax.switch(guard, [g.reset for g in guards], end.state)
+            next_modes = [mode_index if g.target_mode is None else g.target_mode for g in guards]
+            next_mode = jnp.asarray(next_modes, jnp.int32)[guard]
+            return end, is_violated, time_scales, next_state, next_mode
 
         return run_mode
 
     mode_branches = [make_mode_branch(mode_index) for mode_index in range(len(modes))]
-    # The n - 1 guards between n bodies that meet in one point fire up to n (n - 1) / 2 times there.
-    most_at_once = sum(len(mode.guards) ** 2 for mode in modes)
+    # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
+    max_simultaneous = sum(len(mode.guards) ** 2 for mode in modes)
 
     def advance_event(carry: tuple) -> tuple:
         solution, n_stationary, remainder = carry
@@ -331,13 +324,13 @@ def _simulate(
             solution.mode, mode_branches, solution.state, solution.time
         )
         has_event = ~is_violated & (end.guard >= 0)
-        time, remainder = _added(solution.time, end.duration + remainder)
+        time, remainder = _add_exactly(solution.time, end.duration + remainder)
         n_stationary = jnp.where(time > solution.time, 0, n_stationary + 1)
         has_spent_steps = end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
-            solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), _STILL_RUNNING
+            solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), RUNNING_CODE
         )
-        termination = jnp.where(n_stationary > most_at_once, int(Termination.ZENO), termination)
+        termination = jnp.where(n_stationary > max_simultaneous, int(Termination.ZENO), termination)
         failure = jnp.where(
             end.timed_out, int(Termination.MAX_TIME_REACHED), int(Termination.STEP_SIZE_UNDERFLOW)
         )
@@ -380,12 +373,9 @@ def _simulate(
         states_before=rows, states_after=rows,
         modes=zero_indices, guards=zero_indices, n_events=zero_count, time=zero, state=start,
         mode=zero_count + mode,
-        solver_steps=zero_count, termination=zero_count + _STILL_RUNNING,
+        solver_steps=zero_count, termination=zero_count + RUNNING_CODE,
     )  # fmt: skip
     is_running = lambda carry: opaque_condition(
-        carry[0].termination == _STILL_RUNNING, carry[0].n_events
+        carry[0].termination == RUNNING_CODE, carry[0].n_events
     )
     return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, zero))[0]
-
-
-_STILL_RUNNING = -1

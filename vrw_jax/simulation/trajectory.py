@@ -391,8 +391,8 @@ def make_contact_spec(wheels: StepWheels, options: StepOptions, n_samples: int) 
     """Return the specification of a model with unilateral contact, over time and leg.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
-    including both ends. For a `LadderWheel`, `rung` and `reason` give the model used at each time
-    and the cause (see `ModelChoice`).
+    including both ends. For a `LadderWheel`, the variables `rung` and `reason` give the model used
+    at each time and the cause (see `ModelChoice`).
     """
 
     frictions = [float(model.friction) for model, _ in wheels]
