@@ -1,0 +1,79 @@
+"""Number of files of the library of which functions run in four calls, for the architecture page.
+
+    python -m experiments.shared.count_files [CALL]
+
+Counts the files of which at least one function runs, without the packages that check, print, cache
+and compile. Without CALL, each call runs in a process of its own without caches, because a trace
+from a cache runs no functions.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import jax
+import numpy as np
+
+import vrw_jax as vrw
+
+LIBRARY = Path(vrw.__file__).parent
+UNCOUNTED_PACKAGES = ("validation", "printing", "runtime", "simd")
+
+
+def step() -> object:
+    return vrw.step(vrw.WheelParams(), vrw.paper_start())
+
+
+def limit_cycle() -> object:
+    return vrw.limit_cycle(vrw.WheelParams())
+
+
+def gradient() -> object:
+    return jax.grad(lambda params: vrw.limit_cycle(params).dls_fraction)(vrw.WheelParams())
+
+
+def contact_batch() -> object:
+    params = vrw.WheelParams(damping=np.full(4, 150.0))
+    starts = np.tile(vrw.paper_start(), (4, 1))
+    return vrw.step_batch(params, starts, model=vrw.UnilateralWheel())
+
+
+CALLS: dict[str, Callable[[], object]] = {
+    "step": step,
+    "limit_cycle": limit_cycle,
+    "gradient": gradient,
+    "contact_batch": contact_batch,
+}
+
+
+def list_files(call: Callable[[], object]) -> list[str]:
+    """Return the files of which a function runs in a call, in the order of their first calls."""
+    files: dict[str, None] = {}
+
+    def record(frame: FrameType, event: str, _: object) -> None:
+        path = Path(frame.f_code.co_filename)
+        is_function = event == "call" and frame.f_code.co_name != "<module>"
+        if is_function and path.is_relative_to(LIBRARY) and path.name != "__init__.py":
+            relative_path = path.relative_to(LIBRARY)
+            if relative_path.parts[0] not in UNCOUNTED_PACKAGES:
+                files[str(relative_path)] = None
+
+    sys.setprofile(record)
+    call()
+    sys.setprofile(None)
+    return list(files)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        vrw.start_jax()
+        files = list_files(CALLS[sys.argv[1]])
+        print(f"{sys.argv[1]}: {len(files)} files\n  " + "\n  ".join(files))
+    else:
+        for name in CALLS:
+            environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+            command = [sys.executable, "-m", "experiments.shared.count_files", name]
+            subprocess.run(command, check=True, env=environment)
