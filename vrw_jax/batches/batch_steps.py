@@ -385,7 +385,7 @@ def _step_by_lanes(
     tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert tableau is not None  # checked by `_select_engine`
 
-    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+    def lane_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
         current_options = jax.tree.unflatten(structure, uniform)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
@@ -419,7 +419,7 @@ def _step_by_lanes(
     n_inputs = N_STEP_INPUTS + len(next_slopes)
     limits = simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_LIMITS
     lane_arrays = [*wheels, *states, *next_slopes]
-    results = run_compiled(step, uniform, lane_arrays, settings, limits)
+    results = run_compiled(lane_step, uniform, lane_arrays, settings, limits)
     _, outcome, n_solver_steps, values, *jacobian = results
     return values[:3], values[3:], outcome, n_solver_steps, *jacobian
 
@@ -438,7 +438,7 @@ def _step_by_collocation(
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+    def lane_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
         params = wheel_from_parameters(lanes[:n_parameters], n_legs)
         x, expected_durations = tuple(lanes[n_parameters:-3]), tuple(lanes[-3:])
         result = collocation_gait_step(params, x, expected_durations, stop_at_lift_off)
@@ -447,7 +447,7 @@ def _step_by_collocation(
         return is_unfinished, result.is_trusted, values
 
     settings = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, is_trusted, values = run_compiled(step, [], [*wheels, *states, *durations], settings)
+    _, is_trusted, values = run_compiled(lane_step, [], [*wheels, *states, *durations], settings)
     outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
     result = values[:3], values[3:], outcome, n_solver_steps
     untrusted = np.flatnonzero(~is_trusted)

@@ -196,6 +196,7 @@ def _weighted_sum(weights: np.ndarray, nodes: NodeAccelerations, coordinate: int
 
 
 def _end_state(q: Vector, v: Vector, h: Array, nodes: NodeAccelerations) -> tuple[Vector, Vector]:
+    """Return coordinates and rates at the end of a step."""
     n = range(len(q))
     return (
         tuple(q[d] + h * (v[d] + h * _weighted_sum(DOUBLE_END_WEIGHTS, nodes, d)) for d in n),
@@ -204,6 +205,7 @@ def _end_state(q: Vector, v: Vector, h: Array, nodes: NodeAccelerations) -> tupl
 
 
 def _node_state(node_index: int, q: Vector, v: Vector, h: Array, nodes: NodeAccelerations) -> tuple:
+    """Return coordinates and rates at a node of a step."""
     n, node = range(len(q)), float(GAUSS_NODES[node_index])
     return (
         tuple(
@@ -267,8 +269,16 @@ def _solve_step(
         nodes, largest_correction = correct(step.nodes, step.h, projections)
         return _SweepState(step.h, nodes, largest_correction, step.correction), None
 
+    def evaluate_event(q: Vector, v: Vector) -> tuple[Array, Vector]:
+        instant = PhaseInstant(phase, phase.motion_at(q, v), None)
+        return phase.end_guard(instant), instant.acceleration[: phase.n_dof]
+
     def shift_to_event(step: _SweepState) -> Array:
-        event_shift = _time_to_event(phase, *_end_state(q, v, step.h, step.nodes))
+        """Return the time from the step's end to the event, by Newton's method."""
+        end_q, end_v = _end_state(q, v, step.h, step.nodes)
+        _, acceleration = evaluate_event(end_q, end_v)
+        (value, _), (rate, _) = jax.jvp(evaluate_event, (end_q, end_v), (end_v, acceleration))
+        event_shift = -value / jnp.where(rate < 0.0, rate, -jnp.inf)
         return jnp.clip(event_shift, -0.5 * step.h, 0.5 * step.h)
 
     def run_round(
@@ -487,18 +497,6 @@ def _correct_nodes(
             largest_change = jnp.maximum(largest_change, jnp.abs(change))
         corrected_nodes.append(tuple(row))
     return tuple(corrected_nodes), h * largest_change
-
-
-def _time_to_event(phase: AbstractPhase, q: Vector, v: Vector) -> Array:
-    """Return the time from (q, v) to the phase's own end, by Newton's method."""
-
-    def evaluate_event(q: Vector, v: Vector) -> tuple[Array, Vector]:
-        instant = PhaseInstant(phase, phase.motion_at(q, v), None)
-        return phase.end_guard(instant), instant.acceleration[: phase.n_dof]
-
-    _, acceleration = evaluate_event(q, v)
-    (value, _), (rate, _) = jax.jvp(evaluate_event, (q, v), (v, acceleration))
-    return -value / jnp.where(rate < 0.0, rate, -jnp.inf)
 
 
 def _min_guard(

@@ -85,12 +85,12 @@ def step_batch_after_landing(
     n_parameters, stop_at_lift_off = len(PARAMETER_NAMES), model.stop_at_lift_off
     input_indices = tuple(LANDING_STEP_INPUTS.index(name) for name in derivatives)
 
-    def step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+    def take_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
         current_options = jax.tree.unflatten(structure, uniform)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
 
-        def step_outputs(*lanes: Array) -> tuple:
+        def landing_outputs(*lanes: Array) -> tuple:
             params = wheel_from_parameters(lanes[:n_parameters], n_legs, lanes[-1])
             state = lanes[n_parameters:-1]
             result = step_after_landing(
@@ -100,15 +100,15 @@ def step_batch_after_landing(
             return result.values, diagnostics
 
         if not input_indices:
-            values, diagnostics = step_outputs(*lanes)
+            values, diagnostics = landing_outputs(*lanes)
             return (*diagnostics, values)
-        columns, values, diagnostics = jacobian_columns(step_outputs, lanes, input_indices)
+        columns, values, diagnostics = jacobian_columns(landing_outputs, lanes, input_indices)
         return (*diagnostics, values, columns)
 
     settings = ("step after landing", n_legs, stop_at_lift_off, structure, input_indices)
     limits = simd.RegisterLimits(N_STEP_INPUTS) if input_indices else simd.DEFAULT_LIMITS
     lane_arrays = [*wheels, *states, next_slopes]
-    results = run_compiled(step, uniform, lane_arrays, settings, limits)
+    results = run_compiled(take_step, uniform, lane_arrays, settings, limits)
     _, outcome, durations, values, *columns = results
     return LandingSteps(
         state=values[:2],

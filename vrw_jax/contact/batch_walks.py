@@ -105,14 +105,14 @@ def step_batch_with_jacobian(
     walk_result, tangents = _run_walk(config, arguments, 1, options.with_derivative_tolerances())
     first_lane = np.searchsorted(owner, np.arange(len(states)))
 
-    def jacobian(leaf: np.ndarray) -> np.ndarray:
+    def gather_tangents(leaf: np.ndarray) -> np.ndarray:
         jacobian_rows = np.zeros((*numbers.shape, *leaf.shape[2:]), leaf.dtype)
         jacobian_rows[wheel, input_index] = leaf[lane, slot]
         jacobian_rows[:, rate_indices] = independent_rates.expand(jacobian_rows[:, rate_indices])
         return np.moveaxis(jacobian_rows, 1, -1)
 
     return jax.tree.map(lambda x: x[first_lane], walk_result.step_result), jax.tree.map(
-        jacobian, tangents
+        gather_tangents, tangents
     )
 
 

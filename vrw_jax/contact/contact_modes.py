@@ -387,14 +387,6 @@ _TABLE_ORDERS = (
 )
 
 
-def _select_order(uses_paper_rule: Array) -> _TableOrder:
-    """Return the paper's order or the usual one, per batch element."""
-    return jax.tree.map(
-        lambda paper_words, limit_words: jnp.where(uses_paper_rule, paper_words, limit_words),
-        *_TABLE_ORDERS,
-    )
-
-
 class AllowedModes(NamedTuple):
     """Allowed combinations, and conditions that need no test. Sets of modes are bits."""
 
@@ -571,10 +563,11 @@ def choose_combination(
         _violation, *lax.stop_gradient((s, inertia, free, friction)), allowed, tolerances
     )
     uses_paper_rule = map_friction(lambda value: value == PAPER_RULE_SENTINEL, friction)
-    order = _select_order(
-        uses_paper_rule[0] & uses_paper_rule[1]
-        if isinstance(uses_paper_rule, tuple)
-        else uses_paper_rule
+    if isinstance(uses_paper_rule, tuple):
+        uses_paper_rule = uses_paper_rule[0] & uses_paper_rule[1]
+    order = jax.tree.map(
+        lambda paper_words, limit_words: jnp.where(uses_paper_rule, paper_words, limit_words),
+        *_TABLE_ORDERS,
     )
 
     def decode_row(row: RowSet) -> tuple[Array, Array]:

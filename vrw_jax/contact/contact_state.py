@@ -130,16 +130,13 @@ def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces
     )
 
 
-def _free_outward_acceleration(forces: ContactForces) -> LegArray:
-    """Return the acceleration of each leg's length without forces of slots and stoppers, m/s^2."""
-    sin, cos = forces.legs
-    ax, az, _ = forces.solution.hub
-    return forces.free_legs + sin * ax + cos * az
-
-
 def airborne_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> LegArray:
     """Return the stopper force of locked legs in the air, N; 0 for the other legs."""
-    return jnp.where(dynamics.airborne, dynamics.s.m * _free_outward_acceleration(forces), 0.0)
+    sin, cos = forces.legs
+    ax, az, _ = forces.solution.hub
+    # Acceleration of each leg's length without forces of slots and stoppers, m/s^2.
+    free_acceleration = forces.free_legs + sin * ax + cos * az
+    return jnp.where(dynamics.airborne, dynamics.s.m * free_acceleration, 0.0)
 
 
 def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementwise:

@@ -139,7 +139,7 @@ def build_contact_step_jacobian(
         cached_lane_function(config.compute_tangents, make_template, cache_key)
     )
 
-    def jacobian(*leaves: Array) -> tuple:
+    def evaluate_jacobian(*leaves: Array) -> tuple:
         *settings, options = jax.tree.unflatten(structure, leaves)
         leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
         units = np.eye(sum(np.size(leaves[i]) for i in input_indices))
@@ -152,7 +152,7 @@ def build_contact_step_jacobian(
         value, aux = jax.tree.map(lambda x: x[0], (value, aux))
         return (split_jacobian(columns, leaves, input_indices), value), aux
 
-    return jacobian
+    return evaluate_jacobian
 
 
 class IntervalLog(NamedTuple):

@@ -281,6 +281,8 @@ def state_tangents(
 
 
 class _NewtonState(NamedTuple):
+    """State of Newton's method for all lanes."""
+
     iteration: Int[Array, ""]
     state: CollocationState
     monodromy: LaneArray
@@ -288,22 +290,6 @@ class _NewtonState(NamedTuple):
     converged: Bool[Array, " lanes"]
     is_running: Bool[Array, " lanes"]
     n_newton_iterations: Int[Array, " lanes"]
-
-
-def _init_newton(
-    system: CollocationSystem, start: CollocationState, pending: Bool[Array, " lanes"]
-) -> _NewtonState:
-    size, dtype = system.sequence.section_size, start.found.dtype
-    n_lanes = pending.shape[-1]
-    return _NewtonState(
-        iteration=jnp.zeros((), jnp.int32),
-        state=start,
-        monodromy=jnp.zeros((size, size, n_lanes), dtype),
-        residual=jnp.ones((n_lanes,), dtype),
-        converged=jnp.zeros((n_lanes,), bool),
-        is_running=pending,
-        n_newton_iterations=jnp.zeros((n_lanes,), jnp.int32),
-    )
 
 
 def run_newton(
@@ -369,7 +355,17 @@ def run_newton(
         jnp.any(newton_state.is_running)
         & (newton_state.iteration < max_iterations + homotopy_steps)
     )
-    last_state = lax.while_loop(is_active, newton_iteration, _init_newton(system, start, pending))
+    size, dtype, n_lanes = system.sequence.section_size, start.found.dtype, pending.shape[-1]
+    first_state = _NewtonState(
+        iteration=jnp.zeros((), jnp.int32),
+        state=start,
+        monodromy=jnp.zeros((size, size, n_lanes), dtype),
+        residual=jnp.ones((n_lanes,), dtype),
+        converged=jnp.zeros((n_lanes,), bool),
+        is_running=pending,
+        n_newton_iterations=jnp.zeros((n_lanes,), jnp.int32),
+    )
+    last_state = lax.while_loop(is_active, newton_iteration, first_state)
     failed_check = first_failed_check(system, parameters, last_state.state)
     is_found = (last_state.converged & (failed_check == 0.0)).astype(parameters.dtype)
     failed_check = jnp.where(last_state.converged, failed_check, 0.0)

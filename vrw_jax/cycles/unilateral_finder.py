@@ -109,7 +109,12 @@ class UnilateralFinder(AbstractReturnMapFinder):
         if is_traced(params, guess):
             return eqx.filter_vmap(self.find_cycle)(params, guess)
         values = jax.vmap(self.model.parameter_values)(params)
-        return self.find_cycles_near(values, _full_section_states(self.model, params, guess))
+        states = getattr(guess, "section_state", guess)
+        if states is None:
+            states = jax.vmap(self.model.default_start)(params)
+        else:
+            states = jax.vmap(self.model.embed_section)(params, jnp.asarray(states))
+        return self.find_cycles_near(values, states)
 
     def find_cycles_near(self, values: Any, states: Any) -> ReturnMapCycle:
         """Return the gaits near section states, one per wheel, without derivatives."""
@@ -174,14 +179,6 @@ def _add_batch_axis(x: Array) -> Array:
 def _remove_batch_axis(tree: Any) -> Any:
     """Return the first row of every leaf: the inverse of `_add_batch_axis`."""
     return jax.device_put(take_rows(tree, 0))
-
-
-def _full_section_states(model: AbstractWheel, params: WheelParams, guess: Any) -> Array:
-    """Return full section states of each wheel from a user's guess."""
-    x = getattr(guess, "section_state", guess)
-    if x is None:
-        return jax.vmap(model.default_start)(params)
-    return jax.vmap(model.embed_section)(params, jnp.asarray(x))
 
 
 class _FixedPoints(NamedTuple):

@@ -453,13 +453,13 @@ def build_step_jacobian(
         for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
     }
 
-    def jacobian(*leaves: Array) -> tuple:
+    def evaluate_jacobian(*leaves: Array) -> tuple:
         n_directions = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
         evaluate = calls[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
         columns, value, other = evaluate(*tighten_tolerances(*leaves))
         return (split_jacobian(columns, leaves, input_indices), value), other
 
-    return jacobian
+    return evaluate_jacobian
 
 
 def split_jacobian(columns: Any, leaves: Sequence[Array], input_indices: Sequence[int]) -> tuple:

@@ -116,7 +116,7 @@ class _RowAccess:
         """Store a result of the group in the memory that begins at `base`."""
         build = self.emitter.builder
 
-        def store_entry(index: EntryIndex, _: Any) -> list[Value]:
+        def store_row(index: EntryIndex, _: Any) -> list[Value]:
             address, kind = self.row_address(base, aval, index)
             stored_value = self.emitter.emitter.splat(self.emitter.get_entry(value, index))
             if self.is_single_lane:
@@ -126,7 +126,7 @@ class _RowAccess:
             build.store(stored_value, address, align=aval.dtype.itemsize)
             return []
 
-        self.emitter.loop_over_indices(aval.shape[:-1], store_entry)
+        self.emitter.loop_over_indices(aval.shape[:-1], store_row)
 
     def row_address(self, base: Value, aval: Any, index: EntryIndex) -> tuple[Value, ir.Type]:
         """Return the address of a row's lanes, and the type in which they are stored."""

@@ -58,7 +58,7 @@ class PendingUpdate(LazyArray):
         """Overwrite the part in memory; the update must be materialized."""
         emitter = self.emitter
 
-        def store_entry(index: EntryIndex, _: Any = None) -> list[Value]:
+        def store_updated_entry(index: EntryIndex, _: Any = None) -> list[Value]:
             memory.store(
                 emitter.add_indices(index, self.begin), emitter.get_entry(self.update, index)
             )
@@ -66,9 +66,9 @@ class PendingUpdate(LazyArray):
 
         if isinstance(self.update, np.ndarray) and any(self.update.strides):
             for index in np.ndindex(self.update.shape):
-                store_entry(index)
+                store_updated_entry(index)
         else:
-            emitter.loop_over_indices(self.update.shape, store_entry)
+            emitter.loop_over_indices(self.update.shape, store_updated_entry)
 
 
 class MemoryArray(LazyArray):
