@@ -483,6 +483,7 @@ def _vmapped_step(
     input_indices: tuple[int, ...],
     rows: Array,
 ) -> tuple[Array, ...]:
+    """Return one step of each row of inputs, with the Jacobian if requested."""
     n_parameters = len(PARAMETER_NAMES)
 
     def step_one(inputs: Array) -> tuple[Array, ...]:

@@ -120,6 +120,8 @@ NodeAccelerations = tuple[Vector, ...]
 
 
 class _SweepState(NamedTuple):
+    """State of the Newton sweeps of one step."""
+
     h: Array
     nodes: NodeAccelerations
     correction: Array
@@ -127,6 +129,8 @@ class _SweepState(NamedTuple):
 
 
 class _SolvedStep(NamedTuple):
+    """Solution of one step."""
+
     step: _SweepState
     end: tuple[Vector, Vector]
     event_shift: Array  # s
@@ -189,6 +193,7 @@ def _estimate_correction(step: _SweepState) -> Array:
 
 
 def _weighted_sum(weights: np.ndarray, nodes: NodeAccelerations, coordinate: int) -> Any:
+    """Return the weighted sum of one coordinate over the nodes."""
     return sum(
         float(weight) * acceleration[coordinate]
         for weight, acceleration in zip(weights, nodes, strict=True)
@@ -326,6 +331,7 @@ def _solve_step(
 def _add_nodes(
     nodes: NodeAccelerations, other_nodes: NodeAccelerations, factor: float
 ) -> NodeAccelerations:
+    """Return the accelerations plus a factor times other ones."""
     pairs = zip(nodes, other_nodes, strict=True)
     return tuple(tuple(x + factor * y for x, y in zip(*pair, strict=True)) for pair in pairs)
 
@@ -365,14 +371,17 @@ ComplexPair = tuple[Array, Array]
 
 
 def _multiply(x: ComplexPair, y: ComplexPair) -> ComplexPair:
+    """Return the product of complex numbers."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
 def _subtract(x: ComplexPair, y: ComplexPair) -> ComplexPair:
+    """Return the difference of complex numbers."""
     return x[0] - y[0], x[1] - y[1]
 
 
 def _add_terms(terms: Sequence[ComplexPair]) -> ComplexPair:
+    """Return the sum of complex numbers."""
     first, *others = terms
     real, imaginary = first
     for term in others:

@@ -193,6 +193,8 @@ def _walk_with_diffrax(
 def _vmapped_walk(
     model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, columns: Any
 ) -> tuple:
+    """Return the last step of a walk from each state, and its outcome and counts."""
+
     def walk_one(x: Any, columns: Any) -> tuple:
         *values, friction = columns
         model_with_friction = eqx.tree_at(lambda model: model.friction, model, friction)

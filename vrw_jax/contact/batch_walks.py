@@ -306,10 +306,11 @@ class _WalkConfig(NamedTuple):
         has_tangents: bool,
         n_columns: int,
     ) -> "_WalkConfig":
+        """Return the configuration of a model and these options."""
         if model.restitution is not None:
             raise ValueError(
-                "restitution is given, but in lanes feet don't come back: walk wheels one by one, "
-                "by vrw.walk, or map vrw.return_map over them."
+                "restitution is given, but batches do not support it: walk wheels one by one with "
+                "vrw.walk, or map vrw.return_map over them."
             )
         static_options = eqx.filter(options, eqx.is_array, inverse=True)
         uneven = n_columns > N_PARAMETERS + 1

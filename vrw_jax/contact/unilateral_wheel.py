@@ -377,6 +377,7 @@ def _run_event_loop(
     is_detailed: bool,
     has_log: bool = False,
 ) -> _EventLoopState:
+    """Return the state at the end of the step."""
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
     is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, tilt)
     s, n = params.symbols(), params.n_legs

@@ -174,14 +174,13 @@ class BatchWalk(NamedTuple):
         return make_mode_dynamics(s, friction, *given)
 
     def unpack_columns(self, columns: Array) -> tuple[Symbols, Friction]:
-        s, friction = (
-            compute_symbols(self.n, *columns[:N_PARAMETERS]),
-            apply_friction_rule(columns[N_PARAMETERS], self.uses_paper_rule),
-        )
-        return s, (
-            friction,
-            apply_friction_rule(columns[N_PARAMETERS + 1], self.uses_paper_rule),
-        ) if self.uneven else friction
+        """Return symbols and friction from the columns of the lanes."""
+        s = compute_symbols(self.n, *columns[:N_PARAMETERS])
+        friction = apply_friction_rule(columns[N_PARAMETERS], self.uses_paper_rule)
+        if not self.uneven:
+            return s, friction
+        previous_friction = apply_friction_rule(columns[N_PARAMETERS + 1], self.uses_paper_rule)
+        return s, (friction, previous_friction)
 
     def tilt(self, columns: Array) -> Array | None:
         """Return the angle by which the next line is steeper, rad; None on flat ground."""
@@ -296,6 +295,7 @@ class BatchWalk(NamedTuple):
         outcome: Array,
         tilt: Array | None,
     ) -> StepSummary:
+        """Return the summary of a step that has ended."""
         step_length = jnp.where(
             outcome == Outcome.STEPPED, landing_position(self.n, final_state[0]), 0.0
         )

@@ -198,6 +198,7 @@ def _mark_missing_gaits(is_missing: np.ndarray, cycle: Any) -> Any:
 
 
 def _count_section_coordinates(finder: Any) -> int:
+    """Return the number of continuous entries of a section state."""
     return int(finder.model.n_continuous(WheelParams(n_legs=finder.n_legs)))
 
 

@@ -90,11 +90,13 @@ class CollocationFinder(AbstractGaitFinder):
 
     @property
     def system(self) -> CollocationSystem:
+        """Return the collocation system of the search."""
         return CollocationSystem(
             self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
         )
 
     def finer(self) -> "CollocationFinder":
+        """Return the finder on a finer mesh."""
         return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod

@@ -81,15 +81,18 @@ class CollocationSystem(NamedTuple):
 
     @property
     def sequence(self) -> PhaseSequence:
+        """Return the phases of one gait step."""
         return held_landing_sequence(self.n_legs, self.stop_at_lift_off)
 
     @property
     def meshes(self) -> tuple[PhaseMesh, ...]:
+        """Return the mesh of each phase."""
         dls, sls1, sls2 = self.options.mesh_intervals
         return PhaseMesh(dls, 1.0), PhaseMesh(sls1, self.options.mesh_grading), PhaseMesh(sls2, 1.0)
 
     @property
     def constants_of(self) -> Callable:
+        """Return the function from parameters to the constants of the equations."""
         return functools.partial(compute_constants, self.n_legs)
 
     def linearize_at(
@@ -98,6 +101,7 @@ class CollocationSystem(NamedTuple):
         state: "CollocationState",
         tangent_indices: tuple[int, ...] = (),
     ) -> CycleLinearization:
+        """Return the linearization at a state, with tangents by these parameters."""
         return linearize_cycle(
             self.sequence,
             self.meshes,
@@ -441,6 +445,7 @@ def first_failed_check(
 
 
 def _is_attempt(attempt_index: Array, *names: str) -> Array:
+    """Return whether the attempt has one of these names."""
     return functools.reduce(
         operator.or_, [attempt_index == SEARCH_ATTEMPTS.index(name) for name in names]
     )
@@ -453,6 +458,7 @@ def _run_attempt(
     result: SearchResult,
     guess: CollocationState | None,
 ) -> SearchResult:
+    """Return the result after one attempt on the lanes that are without a cycle."""
     options, n_segments = system.options, system.limits.n_homotopy_segments
     table_1 = stack_parameters(WheelParams(n_legs=system.n_legs)).astype(parameters.dtype)
     max_iterations = dict.fromkeys(SEARCH_ATTEMPTS, options.max_newton_iterations) | {
@@ -619,6 +625,7 @@ def _needs_attempt(attempt_index: Int[Array, ""], result: SearchResult) -> Bool[
 
 
 def init_search_result(system: CollocationSystem, parameters: Parameters) -> SearchResult:
+    """Return the result before the first attempt."""
     size, n_phases = system.sequence.section_size, len(system.sequence.phases)
     zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
     return SearchResult(

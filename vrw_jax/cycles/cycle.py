@@ -236,14 +236,17 @@ MASKED_FIELDS = (
 
 
 def _read_property(name: str) -> Callable[[AbstractCycle], Array]:
+    """Return the function that reads a property of a cycle."""
     return lambda cycle: getattr(cycle, name)
 
 
 def _read_duration(phase_index: int) -> Callable[[AbstractCycle], Array]:
+    """Return the function that reads the duration of a phase."""
     return lambda cycle: cycle.combine_steps(cycle.durations[..., phase_index], jnp.sum)
 
 
 def _read_indicator(name: str) -> Callable[[Any], Array]:
+    """Return the function that reads an indicator of double support."""
     return lambda cycle: cycle.combine_steps(getattr(cycle.indicators, name), jnp.min)
 
 

@@ -192,6 +192,8 @@ _step_slope_response = eqx.filter_jit(step_slope_response)
 
 
 class GaitMeasures(NamedTuple):
+    """Measures of a gait with their derivatives."""
+
     values: Float[Array, " n_names"]
     jacobian: Float[Array, "n_names n_values"]
     outcome: Array
@@ -201,6 +203,8 @@ class GaitMeasures(NamedTuple):
 def measure_from_cycle(
     finder: AbstractGaitFinder, values: Values, guess: Any, names: tuple[str, ...]
 ) -> GaitMeasures:
+    """Return measures that need the cycle alone, with their derivatives."""
+
     def measures_and_outcome(values: Values) -> tuple[Array, Array]:
         cycle = finder.find_cycle_from_values(values, guess)
         return jnp.stack(list(cycle.measures(names).values())), cycle.outcome
@@ -233,6 +237,7 @@ def evaluate_on_gait(function: Callable, gait: Gait) -> tuple[Any, Any]:
 
 @eqx.filter_jit
 def evaluate_on_gaits(function: Callable, gait: Gait) -> tuple[Any, Any]:
+    """Return `evaluate_on_gait` of a batch of gaits."""
     arguments = (gait.cycle, gait.step), (gait.d_cycle, gait.d_step)
     return eqx.filter_vmap(
         lambda arguments, tangents: value_and_tangents(function, arguments, tangents)

@@ -243,6 +243,7 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 
 def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
+    """Return the chosen attracting gait of each wheel."""
     n_wheels, rank = params.damping.shape[0], parse_gait_choice(which)
     wheel_index, gaits = find_attracting_gaits(
         finder, jax.vmap(finder.model.parameter_values)(params)
@@ -307,6 +308,7 @@ def _search_with_fallbacks(
 
 
 def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+    """Return the cycle of one wheel, or the cycles of a batch."""
     return (finder.find_cycles if params.damping.ndim else finder.find_cycle)(params, guess)
 
 
@@ -316,6 +318,8 @@ def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
 
 
 def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
+    """Return a tree of arrays with these rows replaced."""
+
     def replace(leaf: Any, new_rows: Any) -> np.ndarray:
         leaf = np.array(leaf)
         leaf[row_indices] = new_rows
@@ -362,6 +366,7 @@ def _walk_from_all_starts(
     is_wanted: np.ndarray,
     options: FallbackOptions,
 ) -> _WalkResults:
+    """Return the walks that repeat best, from all starts of the wheels that need one."""
     n_wheels, indices = len(is_wanted), np.flatnonzero(is_wanted)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
     for compute_starts in (compute_walk_starts, compute_fallback_starts):

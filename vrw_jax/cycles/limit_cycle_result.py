@@ -213,6 +213,7 @@ def _describe_outcome(outcome: int, failed_check: float) -> str:
 def _mesh_error_if_found(
     system: CollocationSystem, is_found: Array, solution: CollocationSolution
 ) -> Array:
+    """Return the estimated mesh error of a cycle; 0 if none was found."""
     solution_with_lane = jax.tree.map(lambda x: x[..., None], solution)
     return jnp.where(
         is_found, estimate_mesh_error(system.sequence, system.meshes, solution_with_lane)[0], 0.0
@@ -223,6 +224,7 @@ def _mesh_error_if_found(
 def _takeoff_acceleration(
     system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> Array:
+    """Return the least take-off acceleration over the steps of a cycle, m/s^2."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
     _, steps = system.evaluate_passages(parameters, collocation_state.solution)
     return jnp.min(jnp.stack([gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
@@ -234,6 +236,7 @@ _compiled_attach_monodromy = jax.jit(attach_monodromy, static_argnums=0)
 def find_limit_cycle(
     params: WheelParams, system: CollocationSystem, guess: CollocationState | None
 ) -> LimitCycle:
+    """Return the cycle of one wheel by the search, without fallbacks."""
     find_cycle = _find_cycle if is_inside_jit() else _compiled_find_cycle
     return find_cycle(params, system, guess)
 
@@ -241,6 +244,7 @@ def find_limit_cycle(
 def _find_cycle(
     params: WheelParams, system: CollocationSystem, guess: CollocationState | None
 ) -> LimitCycle:
+    """Return `find_limit_cycle`, to be compiled."""
     is_usable = params.is_in_domain()
     table_1 = WheelParams(n_legs=system.n_legs)
     safe_params = jax.tree.map(

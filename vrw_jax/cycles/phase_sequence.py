@@ -45,6 +45,7 @@ def compute_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
 
 
 def _symbols(n_legs: int, constants: PhaseConstants) -> Symbols:
+    """Return all symbols from those that vary between lanes."""
     alpha = 2.0 * math.pi / n_legs
     fields: tuple[Any, ...] = (
         *constants[:N_LANE_CONSTANTS],
@@ -113,6 +114,7 @@ def _make_collocation_phase(
 
 
 def _admissibility_checks() -> tuple[str, ...]:
+    """Return the checks of all phases and transitions, each as a phrase."""
     checks: list[str] = []
     for phase_class in PAPER_PHASES:
         other_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURES)

@@ -148,6 +148,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
     def _solve_and_read(
         self, read_wheel: Callable, values: Any, states: Any, with_parameter_derivatives: bool
     ) -> Any:
+        """Return `read_wheel` of the fixed point of each wheel."""
         arguments = np.asarray(values), np.asarray(states), with_parameter_derivatives
         fixed_points = _find_fixed_points(
             self.model, self.n_legs, self.step_options, self.period_n, *arguments
@@ -202,6 +203,7 @@ class PeriodMap(NamedTuple):
     values: np.ndarray  # (wheels, n_values)
 
     def select(self, indices: np.ndarray) -> "PeriodMap":
+        """Return the map of some of the wheels."""
         return self._replace(values=self.values[indices])
 
     def evaluate_period(
@@ -405,12 +407,14 @@ def _map_over_wheels(
     values: Array,
     fixed_points: _FixedPoints,
 ) -> Any:
+    """Return `read_wheel` of each wheel, compiled for the batch."""
     return eqx.filter_vmap(
         lambda values, fixed_points: read_wheel(model, n_legs, values, fixed_points)
     )(values, fixed_points)
 
 
 def _return_jacobian(fixed_points: _FixedPoints, n_values: int) -> Array:
+    """Return the Jacobian of the return map over one period."""
     return_jacobian = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
     for jacobian in fixed_points.step_jacobians.section_state:
         return_jacobian = jacobian[:, n_values:] @ return_jacobian
@@ -420,6 +424,7 @@ def _return_jacobian(fixed_points: _FixedPoints, n_values: int) -> Array:
 def _make_cycle(
     model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
 ) -> ReturnMapCycle:
+    """Return the cycle of a fixed point."""
     diagnostics = fixed_points.residual, fixed_points.converged, fixed_points.n_iterations
     params = model.from_values(values, n_legs)[1]
     fixed_point = FixedPointResult(
@@ -431,6 +436,7 @@ def _make_cycle(
 def _make_gait(
     model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
 ) -> Gait:
+    """Return the gait of a fixed point, with derivatives by the implicit function."""
     n_values = values.shape[0]
     identity = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
     value_jacobian = jnp.zeros((len(identity), n_values), identity.dtype)

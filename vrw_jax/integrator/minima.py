@@ -141,6 +141,8 @@ class MinimaResult(NamedTuple):
 
 
 class _MinimumSearch(NamedTuple):
+    """State of the secant steps to the minimum of one margin."""
+
     length: Array  # of the next try
     best_length: Array  # length with the smallest rate so far
     best_rate: Array

@@ -145,6 +145,8 @@ def _stage_jacobians(
     held_constants: Vector,
     stages: list[StageState],
 ) -> StageJacobians:
+    """Return the Jacobians of the accelerations at all stages of a step except the last."""
+
     def linearize_stage(row: Array) -> tuple[Array, Array]:
         state, dynamics = _unpack_state(row), dynamics_of(constants, held_constants)
         dynamics = ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
@@ -188,12 +190,14 @@ def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
 
 
 def _pack_state(state: StageState) -> Array:
+    """Return a state as one array."""
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
     return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
 
 
 def _unpack_state(row: Array) -> StageState:
+    """Return the state that `_pack_state` packed."""
     n = (len(row) - 2) // 3
     numbers = tuple(row)
     acceleration = StageAcceleration(numbers[2 * n], numbers[2 * n + 1], numbers[2 * n + 2 :])
@@ -201,6 +205,7 @@ def _unpack_state(row: Array) -> StageState:
 
 
 def _unit_rows(template: Vector) -> list[Vector]:
+    """Return the unit vectors over the components of a vector."""
     n = len(template)
     return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
 
@@ -219,6 +224,7 @@ def _acceleration_tangent(
 
 
 def _solve_acceleration(dynamics: ImplicitDynamics, state: StageState, rows: Vector) -> Array:
+    """Return the tangent of the accelerations for a tangent of the residual."""
     return -jnp.stack(dynamics.solve(state, rows))
 
 

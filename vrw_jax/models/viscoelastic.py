@@ -126,6 +126,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
+        """Return the result of the compiled step."""
         leaves, structure = jax.tree.flatten((params, x, options))
         return eqx.combine(*_compile_step(self, structure, is_detailed)(*leaves))
 

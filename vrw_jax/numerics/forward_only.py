@@ -13,6 +13,7 @@ _FORWARD_ONLY = Primitive("forward_only")
 
 
 def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
+    """Raise the error of reverse mode."""
     raise ValueError(
         f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
         "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "

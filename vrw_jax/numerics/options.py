@@ -47,10 +47,12 @@ REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", 
 
 
 def _positive_field(name: str, default: float) -> Any:
+    """Return the field of a positive number."""
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
 def _int_field(name: str, default: int) -> Any:
+    """Return the field of a positive integer."""
     return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
 
 
@@ -183,5 +185,6 @@ class StepOptions(AbstractPrintable):
 def _tighten_tolerances(
     tolerances: tuple[Scalar, ...], factor: Scalar | float
 ) -> tuple[Scalar, ...]:
+    """Return tolerances divided by a factor, down to round-off."""
     min_tolerance = TIGHTENING_FLOOR_EPS * jnp.finfo(tolerances[0].dtype).eps
     return tuple(jnp.maximum(x / factor, jnp.minimum(min_tolerance, x)) for x in tolerances)

@@ -71,6 +71,7 @@ _differentiable_sine_cosine = jax.custom_jvp(jax.jit(lambda angle: _evaluate_ser
 @_differentiable_sine_cosine.defjvp
 @with_default_settings
 def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return sine and cosine and their tangents."""
     sin, cos = _differentiable_sine_cosine(*primals)
     (angle_tangent,) = tangents
     return (sin, cos), (cos * angle_tangent, -sin * angle_tangent)

@@ -44,6 +44,7 @@ def emit_elementwise(
 def _add(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
 ) -> Value:
+    """Emit a sum, or the other operand if one is zero."""
     if _is_constant(y, 0):
         return x
     return y if _is_constant(x, 0) else _emit_binary(emitter, in_dtype, ("fadd", "add"), x, y)
@@ -52,12 +53,14 @@ def _add(
 def _sub(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
 ) -> Value:
+    """Emit a difference, or the first operand if the second is zero."""
     return x if _is_constant(y, 0) else _emit_binary(emitter, in_dtype, ("fsub", "sub"), x, y)
 
 
 def _mul(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
 ) -> Value:
+    """Emit a product, or an operand if the product is known."""
     if _is_constant(y, 1) or _is_constant(x, 0):
         return x
     return (
@@ -70,6 +73,7 @@ def _mul(
 def _div(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
 ) -> Value:
+    """Emit a quotient of floats."""
     _require_float("div", in_dtype)  # an integer division by zero would stop the process
     if _is_constant(y, 1):
         return x
@@ -80,6 +84,7 @@ def _div(
 
 
 def _square(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Emit a square."""
     return _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, x)
 
 
@@ -102,10 +107,12 @@ def _integer_pow(
 
 
 def _neg(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Emit a change of sign."""
     return emitter.builder.fneg(x) if in_dtype.kind == "f" else emitter.builder.neg(x)
 
 
 def _abs(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Emit an absolute value."""
     if in_dtype.kind == "f":
         return _emit_intrinsic(emitter, "fabs", x)
     negative = _emit_comparison(emitter, "<", in_dtype, x, emitter.constant(x.type, 0))
@@ -113,14 +120,18 @@ def _abs(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: V
 
 
 def _not(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Emit a logical or bitwise negation."""
     return emitter.builder.not_(x)
 
 
 def _identity(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Return the operand."""
     return x
 
 
 def _bitwise_rule(method: str) -> ElementwiseRule:
+    """Return the rule of a bitwise instruction, a method of the builder."""
+
     def write(
         emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
     ) -> Value:
@@ -130,6 +141,8 @@ def _bitwise_rule(method: str) -> ElementwiseRule:
 
 
 def _comparison_rule(operator: str) -> ElementwiseRule:
+    """Return the rule of a comparison."""
+
     def write(
         emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
     ) -> Value:
@@ -139,6 +152,8 @@ def _comparison_rule(operator: str) -> ElementwiseRule:
 
 
 def _extremum_rule(operator: str) -> ElementwiseRule:
+    """Return the rule of the maximum (">") or the minimum ("<") of two operands."""
+
     def write(
         emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
     ) -> Value:
@@ -159,6 +174,7 @@ def _extremum_rule(operator: str) -> ElementwiseRule:
 def _select_n(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, *values: Value
 ) -> Value:
+    """Emit a selection between two cases by a condition."""
     condition, *cases = values
     if all(_is_constant(case, 0) for case in cases) or cases[0] is cases[1]:
         return cases[0]
@@ -169,12 +185,14 @@ def _select_n(
 
 
 def _convert(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+    """Emit a conversion to the type of the result."""
     return convert_value(emitter, x, in_dtype, out_dtype)
 
 
 def _is_finite(
     emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
 ) -> Value:
+    """Emit the test whether a float is finite."""
     size = _emit_intrinsic(emitter, "fabs", x)
     return emitter.builder.fcmp_ordered("<", size, emitter.constant(size.type, np.inf))
 
@@ -196,6 +214,7 @@ def _intrinsic_rule(
 
 
 def _require_float(name: str, dtype: Any) -> None:
+    """Raise an error unless the numbers are floats."""
     if dtype.kind != "f":
         raise NotImplementedError(f"{name} of {dtype} has no machine code: convert to floats.")
 
@@ -211,6 +230,7 @@ def _emit_binary(
 
 
 def _emit_comparison(emitter: ValueEmitter, operator: str, dtype: Any, x: Value, y: Value) -> Value:
+    """Emit a comparison of numbers of one type."""
     if dtype.kind == "b":  # as a signed number, true is -1
         return emitter.builder.icmp_unsigned(operator, x, y)
     if dtype.kind != "f":
@@ -247,6 +267,7 @@ def convert_value(emitter: ValueEmitter, value: Value, in_dtype: Any, out_dtype:
 
 
 def _emit_intrinsic(emitter: ValueEmitter, name: str, value: Value) -> Value:
+    """Emit a call of an intrinsic function of LLVM."""
     kind = value.type
     vector = isinstance(kind, ir.VectorType)
     number = kind.element if vector else kind
@@ -310,6 +331,7 @@ def _is_constant(value: Value, number: int) -> bool:
 
 
 def _is_constant_everywhere(constant: Any, number: int) -> bool:
+    """Return whether all entries of a constant equal the number."""
     if isinstance(constant, (list, tuple)):
         return all(_is_constant_everywhere(entry.constant, number) for entry in constant)
     return isinstance(constant, (int, float)) and constant == number

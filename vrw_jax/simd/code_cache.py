@@ -130,6 +130,7 @@ def load_machine_code(name: str, store: CodeStore | None) -> MachineCode | None:
 
 
 def _digest(content: bytes) -> str:
+    """Return the SHA-256 digest in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 
 
@@ -159,6 +160,7 @@ _compiler_pool = ThreadPoolExecutor(1, "llvm")
 
 
 def _parse_result_types(encoded: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
+    """Return the result types of `MachineCode` from their JSON text."""
     return tuple((tuple(n), np.dtype(kind)) for n, kind in json.loads(encoded))
 
 

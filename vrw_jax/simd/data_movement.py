@@ -117,6 +117,7 @@ def emit_unstack(
 def _concatenate_along(
     emitter: ArrayEmitter, call: PrimitiveCall, axis: int, values: Sequence[ArrayValue]
 ) -> ArrayValue:
+    """Return arrays joined along an existing axis."""
     shape = shape_without_lanes(call.out_aval)
     if axis == len(shape):
         raise lane_mixing_error(call.name)

@@ -40,6 +40,7 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 def _abstract_results(
     *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
+    """Return shapes and types of the results of a call."""
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 
@@ -47,6 +48,7 @@ def _abstract_results(
 def _call_in_program(
     *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
+    """Return the results of a call outside of `jax.jit`."""
     with jax.disable_jit(False):  # only a compiled program can call machine code
         return _make_program(code, tuple(result_shapes))(*arguments)
 
@@ -64,11 +66,13 @@ def _make_program(
 def _lower_call(
     context: Any, *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
+    """Register the code and lower its call for XLA."""
     register_code(code)
     return jax.ffi.ffi_lowering(code.name)(context, *arguments)
 
 
 def _refuse_transform(*_: Any, **__: Any) -> Any:
+    """Raise an error for a transform that machine code does not support."""
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
         "all lanes at once, on the last axis, and for derivatives the function that returns them."

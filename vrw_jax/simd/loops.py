@@ -129,6 +129,7 @@ class _LoopCarry:
         ]
 
     def choose_memory(self, aval: Any, initial_value: ArrayValue) -> MemoryArray:
+        """Return the memory of the initial value if no other array uses it, else new memory."""
         kind = self.emitter.entry_type_of(aval)
         initial_value = (
             initial_value.base_array if isinstance(initial_value, PendingUpdate) else initial_value
@@ -202,6 +203,7 @@ class _LoopCarry:
         return isinstance(array.base, ir.AllocaInstr) and array.base not in memory_bases
 
     def _flatten_registers(self, arrays: Sequence[ArrayValue]) -> list[Value]:
+        """Return the entries of the arrays that are carried in registers."""
         triples = zip(arrays, self.avals, self.memory_slots, strict=True)
         register_pairs = [(array, aval) for array, aval, slot in triples if slot is None]
         return self.emitter.flatten_entries(

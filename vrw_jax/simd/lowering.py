@@ -97,6 +97,7 @@ class JaxprLowering:
         return [read_atom(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
 
     def _lower_equation(self, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
+        """Return the results of one equation of a trace."""
         name = equation.primitive.name
         if name not in self.rules:
             raise NotImplementedError(

@@ -86,6 +86,7 @@ def compile_wasm(text: str, entry_point: str, name: str) -> bytes:
 
 
 def _emit_object(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
+    """Return object code of a module after the passes in `LLVM_PASSES`."""
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     passes = llvm.create_new_module_pass_manager()
     for name in LLVM_PASSES:
@@ -140,6 +141,7 @@ class LoadedCode:
 
 
 def _make_target_machine() -> llvm.TargetMachine:
+    """Return the target machine of this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     triple, name, features = describe_processor()

@@ -122,6 +122,7 @@ def reduction_rule(name: str) -> Callable[..., ArrayValue]:
 
 
 def _reduce_over_lanes(emitter: ArrayEmitter, name: str, value: Value) -> Value:
+    """Return whether any ("or") or all ("and") lanes of a group are true."""
     build = emitter.builder
     if not isinstance(value.type, ir.VectorType):
         return value

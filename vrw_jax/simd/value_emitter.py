@@ -86,6 +86,7 @@ class ValueEmitter:
         return self.emit_once(("spread", id(value)), lambda: self._emit_splat(value, kind))
 
     def _emit_splat(self, value: Value, kind: ir.VectorType) -> Value:
+        """Emit a vector whose entries equal a scalar."""
         empty = ir.Constant(kind, ir.Undefined)
         first_lane_set = self.builder.insert_element(empty, value, ir.Constant(I32, 0))
         order = ir.Constant(ir.VectorType(I32, kind.count), [0] * kind.count)

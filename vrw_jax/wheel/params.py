@@ -110,6 +110,7 @@ class Symbols(NamedTuple):
 
 
 def _parameter_field(name: str, default: float) -> Any:
+    """Return the field of a float parameter."""
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 

@@ -250,9 +250,11 @@ class DoubleSupport(AbstractPhase):
     )  # fmt: skip
 
     def _circle(self, sin: Elementwise, cos: Elementwise) -> DoubleSupportCircle:
+        """Return the hub's circle at an angle of Leg 1."""
         return double_support_circle(self.s, self.constants[0], sin, cos)
 
     def _equation(self, motion: Motion) -> dynamics.SingleDofEquation:
+        """Return the equation of motion on that circle."""
         return dynamics.double_support_equation(self.s, self.constants[0], motion)
 
     def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
