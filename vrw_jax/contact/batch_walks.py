@@ -125,10 +125,8 @@ def _pack_tangents(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     owners.
     """
     lane_rows = np.maximum(-(-counts // MAX_TANGENTS_PER_LANE), 1)
-    first_lane, position = (
-        np.cumsum(lane_rows) - lane_rows,
-        np.concatenate([np.arange(n) for n in counts]),
-    )
+    first_lane = np.cumsum(lane_rows) - lane_rows
+    position = np.concatenate([np.arange(n) for n in counts])
     lane = np.repeat(first_lane, counts) + position // MAX_TANGENTS_PER_LANE
     return lane, position % MAX_TANGENTS_PER_LANE, np.repeat(np.arange(len(counts)), lane_rows)
 
@@ -176,11 +174,9 @@ class _IndependentRates(NamedTuple):
                 remainder
                 - direction[:, :, None] * np.sum(direction[:, :, None] * remainder, 1)[:, None]
             )
-            indices, is_used, directions = (
-                [*indices, largest_index],
-                [*is_used, is_significant],
-                [*directions, direction],
-            )
+            indices = [*indices, largest_index]
+            is_used = [*is_used, is_significant]
+            directions = [*directions, direction]
         if not indices:
             empty = np.zeros((len(is_requested), 0), int)
             return cls(empty, empty > 0, np.zeros((len(is_requested), 0, is_requested.shape[1])))

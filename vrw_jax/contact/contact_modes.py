@@ -185,10 +185,8 @@ def _eliminate_stoppers(
     regular.
     """
     sin, cos, m_inv = inertia.sin, inertia.cos, 1.0 / s.m
-    H, K = (
-        ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3])),
-        ((inertia.K[0], inertia.K[1]), inertia.K[1:]),
-    )
+    H = ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3]))
+    K = ((inertia.K[0], inertia.K[1]), inertia.K[1:])
     compliance = _make_pair(lambda i: jnp.where(foot_equations.is_sticking[i], 0.0, m_inv))
     N = _make_matrix(
         lambda i, j: jnp.where(
@@ -224,16 +222,12 @@ def _solve_feet(
 
     The feet's equations are solved with the stoppers of `_eliminate_stoppers` inserted.
     """
-    row_e, row_u, to_e, to_u = (
-        foot_equations.row_e,
-        foot_equations.row_u,
-        foot_equations.force_e,
-        foot_equations.force_u,
-    )
-    G, H = (
-        ((inertia.G[0], inertia.G[1]), inertia.G[1:]),
-        ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3])),
-    )
+    row_e = foot_equations.row_e
+    row_u = foot_equations.row_u
+    to_e = foot_equations.force_e
+    to_u = foot_equations.force_u
+    G = ((inertia.G[0], inertia.G[1]), inertia.G[1:])
+    H = ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3]))
     R = _make_matrix(lambda i, k: _identity_entry(i, k) * row_u[i] - row_e[i] * H[k][i])
     C = _make_matrix(
         lambda i, j: (
@@ -482,12 +476,10 @@ def _violation(
             pair[i]
             for pair in (solution.tangential, solution.normal, solution.foot_x, solution.foot_z)
         )
-        pull_violation, cone_violation = (
-            -n / tolerances.force,
-            zero_if(
-                _friction_of_slot(i, is_infinite),
-                jnp.abs(t) - _friction_of_slot(i, coefficient) * n,
-            ),
+        pull_violation = -n / tolerances.force
+        cone_violation = zero_if(
+            _friction_of_slot(i, is_infinite),
+            jnp.abs(t) - _friction_of_slot(i, coefficient) * n,
         )
         stick_violation = zero_if(
             is_untested, jnp.maximum(pull_violation, cone_violation / tolerances.force)

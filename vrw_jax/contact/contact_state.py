@@ -100,10 +100,8 @@ def make_mode_dynamics(
 ) -> ModeDynamics:
     """Return the dynamics of the wheel in this contact state."""
     slots = find_slots(contact_state.contact != ContactMode.OFF)
-    contact, held = (
-        slots.gather_codes(contact_state.contact),
-        slots.gather_flags(contact_state.locked),
-    )
+    contact = slots.gather_codes(contact_state.contact)
+    held = slots.gather_flags(contact_state.locked)
     airborne = contact_state.locked & ~slots.is_filled
     friction = slot_friction(friction, slots)
     return ModeDynamics(

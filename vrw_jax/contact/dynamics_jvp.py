@@ -213,10 +213,10 @@ def residual_jvp(
         range(2),
     )
     b, db, dtheta = configuration.motion.L - s.a, tangent.motion.L - ds.a, tangent.motion.theta
-    slip_signs, coefficient_tangent = (
-        slip_sign(configuration.contact),
-        jax.jvp(finite_friction, (configuration.friction,), (tangent.friction,))[1],
-    )
+    slip_signs = slip_sign(configuration.contact)
+    coefficient_tangent = jax.jvp(finite_friction, (configuration.friction,), (tangent.friction,))[
+        1
+    ]
     coefficient_tangent = (
         coefficient_tangent
         if isinstance(coefficient_tangent, tuple)
@@ -240,10 +240,8 @@ def residual_jvp(
     )
     legs = jnp.where(inertia.is_released, legs, 0.0)
     net_legs = legs + row_tangents.radial
-    x, z = (
-        frozen.radial * sin + frozen.transverse * cos,
-        frozen.radial * cos - frozen.transverse * sin,
-    )
+    x = frozen.radial * sin + frozen.transverse * cos
+    z = frozen.radial * cos - frozen.transverse * sin
     torque = db * lever + b * (row_tangents.transverse + outward * dtheta - cos * dx + sin * dz)
     return ResidualTangent(
         legs=legs,
@@ -321,10 +319,8 @@ def motion_row_tangents(
     ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
     b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
     spin, double_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
-    spin_tangent, double_rate_tangent = (
-        double_rate * motion_tangent.dtheta,
-        2.0 * motion_tangent.dtheta,
-    )
+    spin_tangent = double_rate * motion_tangent.dtheta
+    double_rate_tangent = 2.0 * motion_tangent.dtheta
     springs = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
     springs = springs + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
     frozen = _FrozenTerms(
@@ -365,12 +361,10 @@ def _impact_row_tangents(
     solution: ForceSolution,
 ) -> tuple[_FrozenTerms, _RowTangents]:
     """Return the frozen terms and the tangents of the rows of the impact equations."""
-    s, motion, motion_tangent, slots = (
-        configuration.s,
-        configuration.motion,
-        tangent.motion,
-        configuration.slots,
-    )
+    s = configuration.s
+    motion = configuration.motion
+    motion_tangent = tangent.motion
+    slots = configuration.slots
     dtheta_after = solution.hub[2]
     rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
     frozen = _FrozenTerms(

@@ -273,10 +273,8 @@ def _limit_energy_gain(
     energy_midpoint = kinetic(
         jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic.motion, restituted.motion)
     )
-    curvature, linear_term = (
-        2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_restituted),
-        4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_restituted,
-    )
+    curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_restituted)
+    linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_restituted
     allowed_gain = jnp.maximum(kinetic(motion) - energy_inelastic, 0.0)
     has_gain = energy_restituted > kinetic(motion)
     root = jnp.sqrt(
@@ -304,10 +302,8 @@ def _solve_velocity_level(
     friction = slot_friction(law.friction, slots)
     at_stopper = contact_state.locked | event.meets_stopper
     is_loaded = jnp.stack([jnp.any(slots.first, axis=0), jnp.any(slots.second, axis=0)])
-    slot_locked, slot_modes = (
-        slots.gather_flags(at_stopper),
-        slots.gather_codes(contact_state.contact),
-    )
+    slot_locked = slots.gather_flags(at_stopper)
+    slot_modes = slots.gather_codes(contact_state.contact)
     is_landing = jnp.any(event.lands, axis=0)
     is_planted = (
         (slot_modes == ContactMode.STICK)
@@ -331,10 +327,8 @@ def _solve_velocity_level(
         law: ContactLaw, motion: WheelMotion, airborne: Array, chosen: ChosenCombination | None
     ) -> _LevelSolution:
         s, friction = law.s, slot_friction(law.friction, slots)
-        legs, inertia = (
-            leg_directions(s, motion.theta),
-            make_inverse_inertia(s, motion, slots, airborne),
-        )
+        legs = leg_directions(s, motion.theta)
+        inertia = make_inverse_inertia(s, motion, slots, airborne)
         free = free_velocity(s, motion, slots, inertia)
         restituted_free = _apply_restitution(law, motion, slots, inertia, free)
         if chosen is None:
@@ -618,10 +612,8 @@ def resolve_event(
         has_just_unlocked=(contact_state.locked | event.meets_stopper) & ~is_locked,
         has_just_slid=slots.scatter(is_sliding & was_resting) > 0,
     )
-    n_impact_solutions, n_force_solutions = (
-        velocity_level.chosen.n_solutions,
-        acceleration_level.n_solutions,
-    )
+    n_impact_solutions = velocity_level.chosen.n_solutions
+    n_force_solutions = acceleration_level.n_solutions
     if_impact = lambda pair: (
         jnp.where(is_impact, pair[0], 0.0),
         jnp.where(is_impact, pair[1], 0.0),

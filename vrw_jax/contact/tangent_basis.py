@@ -126,10 +126,8 @@ class _PointLinearization(NamedTuple):
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]:
         """Return the residual tangent of some legs along a tangent, and the slots of these legs."""
         rest = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
-        configuration, directions = (
-            _restrict_legs(self.configuration, leg_slice),
-            LegDirections(*(row[leg_slice] for row in self.hub.legs)),
-        )
+        configuration = _restrict_legs(self.configuration, leg_slice)
+        directions = LegDirections(*(row[leg_slice] for row in self.hub.legs))
         hub = self.hub._replace(legs=directions, is_released=self.hub.is_released[leg_slice])
         solution = self.solution._replace(lengths=self.solution.lengths[leg_slice])
 
@@ -237,10 +235,8 @@ class TangentBasis(NamedTuple):
         cls, dynamics: ModeDynamics, motion: WheelMotion, has_more_moving: Array
     ) -> "TangentBasis":
         """Return the basis at this motion; `has_more_moving`: more than the first legs move."""
-        linearization, current_forces = (
-            _PointLinearization.from_motion(dynamics, motion),
-            compute_forces(dynamics, motion),
-        )
+        linearization = _PointLinearization.from_motion(dynamics, motion)
+        current_forces = compute_forces(dynamics, motion)
         whole_residual = linearization.make_leg_residual(slice(None))
         first_responses, n = linearization.unit_length_responses(_LEG_SLICES[0]), len(motion.L)
         make_zeros = lambda x: jnp.zeros(

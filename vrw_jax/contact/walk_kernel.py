@@ -277,10 +277,8 @@ class BatchWalk(NamedTuple):
 
     def compute_result(self, lane: LaneState, tilt: Array | None) -> Any:
         """Of the last step of lanes that go no further."""
-        final_state, outcome = (
-            (motion_from_point(lane.interval.point), lane.interval.contact_state),
-            lane.outcome,
-        )
+        final_state = (motion_from_point(lane.interval.point), lane.interval.contact_state)
+        outcome = lane.outcome
         if lane.details is not None and lane.accumulators is not None:
             accumulators = Accumulators(jnp.zeros_like(lane.accumulators[0]), *lane.accumulators)
             return make_unilateral_step(
@@ -345,9 +343,9 @@ def advance_round(
     - `waits_for_events`: integrate every lane to its next event.
     """
     processed = walk.process_events(columns, lane)
-    is_walking, dynamics_at = (
-        processed.outcome == STATUS_UNFINISHED,
-        lambda columns_at: walk.make_dynamics(columns_at, processed.interval.contact_state),
+    is_walking = processed.outcome == STATUS_UNFINISHED
+    dynamics_at = lambda columns_at: walk.make_dynamics(
+        columns_at, processed.interval.contact_state
     )
     is_walking = is_walking & (not waits_for_events)
     interval = integrate_interval(

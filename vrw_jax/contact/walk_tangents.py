@@ -191,10 +191,8 @@ def walk_with_tangents(
             )
 
         tangents = tangents._replace(rows=tangents.map_tangents(pass_event, tangents.rows))
-        is_unfinished, dynamics_at = (
-            next_lane.outcome == STATUS_UNFINISHED,
-            lambda c: walk.make_dynamics(c, next_lane.interval.contact_state),
-        )
+        is_unfinished = next_lane.outcome == STATUS_UNFINISHED
+        dynamics_at = lambda c: walk.make_dynamics(c, next_lane.interval.contact_state)
         arguments = (
             dynamics_at,
             columns,
@@ -244,10 +242,8 @@ def _integrate_with_tangents(
     """Return the result of `integrate_interval`, with the tangents propagated to the event."""
     dynamics = dynamics_at(columns)
     scales, last_stage = guard_scales(dynamics), len(tableau.nodes) - 1
-    has_more_moving, max_h = (
-        _has_more_moving(tangents, template, initial.contact_state),
-        _max_stable_step(dynamics, tableau),
-    )
+    has_more_moving = _has_more_moving(tangents, template, initial.contact_state)
+    max_h = _max_stable_step(dynamics, tableau)
 
     def try_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
         interval, rows = state
@@ -279,10 +275,8 @@ def _integrate_with_tangents(
                 stage_tangents[:, :n][:, leg_slice],
                 interval.h,
             )
-            first_coordinates, other_coordinates = (
-                slice(0, 3 + N_MOVING_LEGS),
-                slice(3 + N_MOVING_LEGS, None),
-            )
+            first_coordinates = slice(0, 3 + N_MOVING_LEGS)
+            other_coordinates = slice(3 + N_MOVING_LEGS, None)
             unchanged = point.q[other_coordinates], point.v[other_coordinates]
             ends = zip(
                 stage_of(first_coordinates),

@@ -80,10 +80,8 @@ def _monodromy_tangents(
         if i not in (hub_index, leg_index, *scales.SCALING_BY_PARAMETER)
     ]
     ones, zeros = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
-    first_indices, second_indices = (
-        jnp.asarray([*other_indices, leg_index]),
-        jnp.asarray([*other_indices, hub_index]),
-    )
+    first_indices = jnp.asarray([*other_indices, leg_index])
+    second_indices = jnp.asarray([*other_indices, hub_index])
     weights = (
         jnp.stack([ones] * len(other_indices) + [hub_share]),
         jnp.stack([zeros] * len(other_indices) + [-leg_share]),

@@ -511,11 +511,9 @@ def _retry_from_other_steps(
     missing = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
     if not len(missing):
         return None
-    subset_params, section_states, best_result = (
-        _take_rows_on_device(params, missing),
-        np.array(section_states[missing]),
-        None,
-    )
+    subset_params = _take_rows_on_device(params, missing)
+    section_states = np.array(section_states[missing])
+    best_result = None
     collocation_state = cycle.collocation_state
     for _ in range(1, finder.period_n):
         section_states = np.asarray(

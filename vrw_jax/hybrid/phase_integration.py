@@ -338,10 +338,8 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
     _, monitored_functions, options, event_options = context
     n, search = monitored_functions.n_guards, loop.search
     previous_step, length = loop.accepted_step, loop.next_length
-    is_starting, is_searching = (
-        loop.purpose == StepPurpose.START,
-        loop.purpose == StepPurpose.EVENT_SEARCH,
-    )
+    is_starting = loop.purpose == StepPurpose.START
+    is_searching = loop.purpose == StepPurpose.EVENT_SEARCH
     step, error = _try_step(context, loop)
     guards, rates = step.values[:n], step.rates[:n]
     is_met, is_falling = guards_met_at_start(monitored_functions, guards, rates)
@@ -473,10 +471,8 @@ def _assess_step(
     """Accept or reject the step, and detect crossings and dips within it."""
     stepper, monitored_functions, options, _ = context
     n, previous_step, length = monitored_functions.n_guards, loop.accepted_step, loop.next_length
-    is_starting, is_integrating = (
-        loop.purpose == StepPurpose.START,
-        loop.purpose == StepPurpose.INTEGRATION,
-    )
+    is_starting = loop.purpose == StepPurpose.START
+    is_integrating = loop.purpose == StepPurpose.INTEGRATION
     nominal_length = jnp.where(is_starting, options.dt0, length)
     is_kept, next_length, controller_state = stepper.control_step(
         previous_step.state, step.state, error, nominal_length, loop.controller_state

@@ -84,10 +84,8 @@ def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
         is_reached = (
             jnp.abs(end[-1] - duration) <= 1e-9 * duration
         )  # otherwise the solver steps were spent
-        reset_jacobian, guard_gradient = (
-            jax.jacfwd(guard.reset)(state_before),
-            jax.jacfwd(guard.value)(state_before),
-        )
+        reset_jacobian = jax.jacfwd(guard.reset)(state_before)
+        guard_gradient = jax.jacfwd(guard.value)(state_before)
         flow_before = mode.field(state_before)
         saltation = reset_jacobian + jnp.outer(
             next_flow - reset_jacobian @ flow_before, guard_gradient

@@ -94,10 +94,8 @@ def _integrate_segments(
         is_reached = (
             jnp.abs(end_state[-1] - length) <= 1e-9 * length
         )  # otherwise the solver steps were spent
-        tangents, growth_factors = (
-            end_state[dim:size].reshape(n_tangents, dim),
-            jnp.exp(end_state[size : size + n_tangents]),
-        )
+        tangents = end_state[dim:size].reshape(n_tangents, dim)
+        growth_factors = jnp.exp(end_state[size : size + n_tangents])
         jacobian = jnp.where(is_reached, tangents[:, :n_tangents].T * growth_factors, jnp.nan)
         return end_state[:dim], (end_state[:dim], jacobian, end_state[-2])
 
@@ -138,11 +136,9 @@ def product_multipliers(
             "maps contains a number that is not finite: the flow left its domain, or its steps "
             "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
         )
-    n, basis, closing_matrix = (
-        jacobians.shape[1],
-        np.eye(jacobians.shape[1]),
-        np.eye(jacobians.shape[1]),
-    )
+    n = jacobians.shape[1]
+    basis = np.eye(jacobians.shape[1])
+    closing_matrix = np.eye(jacobians.shape[1])
     triangles = np.zeros_like(jacobians)
     for _ in range(N_SCHUR_SWEEPS):
         next_basis = basis
@@ -186,11 +182,9 @@ def _block_multipliers(
         log_diagonal = np.log(diagonal)
         error_amplification = np.where(diagonal > 0.0, norms[:, None] / diagonal, 0.0)
         error = tolerance * np.max(np.sum(error_amplification, axis=0))
-        scaled_product, log_scale, spread = (
-            np.eye(size),
-            0.0,
-            np.ptp(np.sum(log_diagonal, axis=0)) if size > 1 else 0.0,
-        )
+        scaled_product = np.eye(size)
+        log_scale = 0.0
+        spread = np.ptp(np.sum(log_diagonal, axis=0)) if size > 1 else 0.0
         for factor in diagonal_blocks:
             scaled_product = factor @ scaled_product
             largest = np.max(np.abs(scaled_product)) or 1.0

@@ -32,10 +32,8 @@ def emit_broadcast(
     emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, *_: Any
 ) -> ArrayValue:
     """Repeat an array along new axes, including the lanes'."""
-    shape, axes = (
-        shape_without_lanes(call.out_aval),
-        tuple(map(int, call.params["broadcast_dimensions"])),
-    )
+    shape = shape_without_lanes(call.out_aval)
+    axes = tuple(map(int, call.params["broadcast_dimensions"]))
     array = emitter.reshape_if_needed(array, array.shape[:-1], len(array.shape) > len(shape))
     if has_lanes(call.out_aval) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
         array = emitter.reshape_array(array, array.shape[:-1])  # one number has the axis of lanes

@@ -29,10 +29,8 @@ def emit_while(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) -
     n_condition_constants, n_body_constants = params["cond_nconsts"], params["body_nconsts"]
     # Each iteration reads the constants again.
     constants = list(map(as_shared, values[: n_condition_constants + n_body_constants]))
-    condition_constants, body_constants = (
-        constants[:n_condition_constants],
-        constants[n_condition_constants:],
-    )
+    condition_constants = constants[:n_condition_constants]
+    body_constants = constants[n_condition_constants:]
     initial_values = values[n_condition_constants + n_body_constants :]
     carry = _LoopCarry(
         arrays, params["body_jaxpr"].out_avals, arrays.limits.max_registers, initial_values
@@ -78,10 +76,8 @@ def emit_scan(traces: JaxprLowering, equation: Any, values: list[ArrayValue]) ->
         for aval in stacked_avals
     ]
     was_unrolled, arrays.is_unrolled = arrays.is_unrolled, not _contains_loop(body_jaxpr.jaxpr)
-    constants, initial_values = (
-        list(map(as_shared, values[:n_constants])),
-        values[n_constants : n_constants + n_carry],
-    )
+    constants = list(map(as_shared, values[:n_constants]))
+    initial_values = values[n_constants : n_constants + n_carry]
     limits = arrays.limits
     max_registers = limits.max_registers_inner if arrays.is_unrolled else limits.max_registers
     carry = _LoopCarry(arrays, body_jaxpr.out_avals[:n_carry], max_registers, initial_values)

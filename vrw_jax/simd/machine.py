@@ -133,10 +133,8 @@ class LoadedCode:
     def capsule(self, name: str) -> Any:
         """Return a function as a PyCapsule, for callers with its signature."""
         make = ctypes.pythonapi.PyCapsule_New
-        make.restype, make.argtypes = (
-            ctypes.py_object,
-            [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p],
-        )
+        make.restype = ctypes.py_object
+        make.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
         return make(self.address(name), None, None)
 
 

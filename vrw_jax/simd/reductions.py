@@ -25,10 +25,8 @@ def emit_cumsum(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -
     """Return cumulative sums along an axis, from either end."""
     if call.params["axis"] == len(array.shape):
         raise lane_mixing_error(call.name)
-    rows, dtype = (
-        np.moveaxis(emitter.get_entries(array), call.params["axis"], 0),
-        call.out_aval.dtype,
-    )
+    rows = np.moveaxis(emitter.get_entries(array), call.params["axis"], 0)
+    dtype = call.out_aval.dtype
     order = range(len(rows))[:: -1 if call.params["reverse"] else 1]
     add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
     sums = np.empty_like(rows)
