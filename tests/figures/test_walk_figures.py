@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import CONTACT_OFF, CONTACT_SLIP_DOWN, CONTACT_STICK
+from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.figures import contact_figures, tornado_figure
 
 
@@ -45,7 +45,7 @@ def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, re
             )
     lengths = np.linalg.norm(motion.feet - motion.hub[:, None], axis=-1)
     np.testing.assert_allclose(lengths[:, 2:], 1.0, atol=1e-12)
-    is_at_rest = motion.contact == CONTACT_STICK
+    is_at_rest = motion.contact == ContactMode.STICK
     np.testing.assert_array_equal(is_at_rest[:, 0], True)
     np.testing.assert_array_equal(is_at_rest[:, 1], walk.phase.values == 0)
     assert not is_at_rest[:, 2:].any()
@@ -57,7 +57,7 @@ def test_feet_with_unilateral_contact_are_those_of_the_walk(sliding_walk):
     np.testing.assert_array_equal(motion.feet[..., 1], sliding_walk.foot_z)
     np.testing.assert_array_equal(motion.contact, sliding_walk.contact)
     # A foot that slides downhill moves downhill between two samples of the same mode.
-    slides = sliding_walk.contact.values[:, 1] == CONTACT_SLIP_DOWN
+    slides = sliding_walk.contact.values[:, 1] == ContactMode.SLIP_DOWN
     is_inside = slides[:-1] & slides[1:] & (np.diff(sliding_walk.time.values) > 0.0)
     is_inside &= np.diff(sliding_walk.step.values) == 0
     assert is_inside.any()
@@ -71,7 +71,7 @@ def test_bars_of_contact_modes_cover_the_time_of_each_mode(sliding_walk):
         color = mpl.colors.to_hex(bar.get_facecolor()[0]).upper()
         duration_by_color[color] += np.ptp(bar.get_paths()[0].vertices[:, 0])
     modes, intervals = sliding_walk.contact.values, np.diff(sliding_walk.time.values)[:, None]
-    for mode, (color, duration) in enumerate(duration_by_color.items(), CONTACT_STICK):
+    for mode, (color, duration) in enumerate(duration_by_color.items(), ContactMode.STICK):
         known = np.sum(intervals * ((modes[:-1] == mode) & (modes[1:] == mode)))
         assert duration == pytest.approx(known, abs=1e-12), color
 
@@ -79,7 +79,7 @@ def test_bars_of_contact_modes_cover_the_time_of_each_mode(sliding_walk):
 def test_sticks_have_feet_in_the_colors_of_their_modes(sliding_walk):
     axes = vrw.plot.sticks(sliding_walk, interval=0.1).axes[0]
     colors = {line.get_color() for line in axes.lines if line.get_marker() in ("o", ">", "<")}
-    modes = (CONTACT_OFF, CONTACT_STICK, CONTACT_SLIP_DOWN)
+    modes = (ContactMode.OFF, ContactMode.STICK, ContactMode.SLIP_DOWN)
     assert {contact_figures.CONTACT_COLORS[mode] for mode in modes} <= colors
     names = [text.get_text() for text in axes.get_legend().get_texts()]
     assert {"at rest", "sliding downhill", "in the air"} <= set(names)
@@ -93,7 +93,7 @@ def test_a_walk_of_every_model_is_drawn(name, request):
     frames, milliseconds = vrw.plot.walk_frames(walk, n_frames=3, slow=1.0)
     assert len(frames) == 3
     assert milliseconds == round(1e3 * float(walk.time[-1]) / 3)
-    color = contact_figures.CONTACT_COLORS[CONTACT_STICK]
+    color = contact_figures.CONTACT_COLORS[ContactMode.STICK]
     wanted_pixel = np.round(255 * np.array(mpl.colors.to_rgb(color)))
     pixels = np.asarray(frames[0]).reshape(-1, 3)
     assert np.sum(np.all(pixels == wanted_pixel, axis=1)) > 5  # of the foot at rest

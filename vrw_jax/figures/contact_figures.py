@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vrw_jax.contact import CONTACT_OFF, CONTACT_STICK
+from vrw_jax.contact import ContactMode
 from vrw_jax.figures.style import (
     AMBER,
     DARK_GRAY,
@@ -91,9 +91,9 @@ def compute_foot_motion(walk: xr.Dataset) -> FootMotion:
     for leg in (1, 2):
         names = f"lambda_{2 * leg - 1}", f"lambda_{2 * leg}"
         forces[:, leg - 1] = np.stack([walk[name].values for name in names], -1)
-    modes = np.full(angles.shape, CONTACT_OFF)
-    modes[:, 0] = CONTACT_STICK
-    modes[walk.phase.values == 0, 1] = CONTACT_STICK
+    modes = np.full(angles.shape, ContactMode.OFF)
+    modes[:, 0] = ContactMode.STICK
+    modes[walk.phase.values == 0, 1] = ContactMode.STICK
     return FootMotion(walk.time.values, hub, feet, forces, modes, walk.step.values)
 
 
@@ -133,7 +133,7 @@ def _select_legs(is_drawn: np.ndarray) -> list[int]:
 def make_contact_panels(walk: xr.Dataset) -> Figure:
     """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time."""
     motion = compute_foot_motion(walk)
-    is_touching = motion.contact != CONTACT_OFF
+    is_touching = motion.contact != ContactMode.OFF
     touching_legs = _select_legs(is_touching)
     moving_legs = _select_legs(is_touching | ~walk.on_stopper.values.astype(bool))
     landings = np.flatnonzero(np.diff(motion.step)) + 1  # at which the legs are relabeled
@@ -176,7 +176,7 @@ def _draw_mode_bars(axes: Axes, motion: FootMotion, legs: list[int]) -> None:
         modes = motion.contact[:, leg - 1]
         ends = np.flatnonzero(np.diff(modes) | np.diff(motion.step)) + 1
         for begin, end in zip(np.r_[0, ends], np.r_[ends, len(modes)], strict=True):
-            if modes[begin] != CONTACT_OFF:
+            if modes[begin] != ContactMode.OFF:
                 span = motion.time[begin], motion.time[end - 1] - motion.time[begin]
                 axes.broken_barh([span], (row - 0.35, 0.7), color=CONTACT_COLORS[modes[begin]])
     axes.set_yticks(range(len(legs)), [str(leg) for leg in legs])
@@ -186,7 +186,7 @@ def _draw_mode_bars(axes: Axes, motion: FootMotion, legs: list[int]) -> None:
     patches = [
         Patch(color=CONTACT_COLORS[mode], label=CONTACT_MODE_NAMES[mode])
         for mode in present_modes
-        if mode != CONTACT_OFF
+        if mode != ContactMode.OFF
     ]
     axes.legend(handles=patches, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
@@ -195,7 +195,7 @@ def draw_contact_sticks(axes: Axes, walk: xr.Dataset, interval: float) -> None:
     """Draw Legs 1 and 2 and every leg that touches, with feet in the colors of their modes."""
     motion = compute_foot_motion(walk)
     samples = np.searchsorted(motion.time, np.arange(0.0, motion.time[-1], interval))
-    is_drawn = motion.contact != CONTACT_OFF
+    is_drawn = motion.contact != ContactMode.OFF
     is_drawn[:, :2] = True
     for i in samples:
         for leg in (np.flatnonzero(is_drawn[i]) + 1).tolist():
