@@ -115,6 +115,12 @@ def test_every_row_with_yes_or_refused_is_checked():
     assert rows == set(FUNCTIONS)
 
 
-def test_derivatives_of_multipliers_with_contact_are_marked_as_unknown():
+@pytest.mark.slow
+def test_derivatives_of_multipliers_with_contact_are_nan_as_the_table_says():
     cells = {(function, model): cells for function, model, cells in read_rows()}
     assert "multipliers NaN" in cells["limit_cycle", "unilateral"][0]
+    guess = vrw.limit_cycle(wheel_on(SLOPE, 300.0), model=GROUND)
+    radius = lambda slope: (
+        vrw.limit_cycle(wheel_on(slope, 300.0), model=GROUND, guess=guess).spectral_radius
+    )
+    assert jnp.isnan(jax.jacfwd(radius)(SLOPE))
