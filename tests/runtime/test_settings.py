@@ -41,6 +41,11 @@ CALLS = {
     "measures": lambda: vrw.limit_cycle(vrw.WheelParams()).measures(
         ("speed", "stability_margin", "spectral_margin", "takeoff_acceleration", "lambda_4_plus")
     ),
+    "properties": lambda: [
+        (cycle.mesh_error, cycle.takeoff_acceleration, cycle.margins, cycle.jury_margins)
+        for cycle in [vrw.limit_cycle(vrw.WheelParams())]
+    ],
+    "gait_sensitivity": lambda: vrw.gait_sensitivity(vrw.WheelParams(), "speed").norm,
     "grad": lambda: jax.grad(jax.jit(compute_speed))(150.0),  # its rule runs outside of any call
     "vmap": lambda: jax.vmap(jax.jit(compute_speed))(jnp.array([150.0, 160.0])),
     "continue_branch": lambda: (

@@ -41,6 +41,7 @@ from vrw_jax.cycles.slope_response import (
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
 from vrw_jax.printing import TextRow, describe_elements, format_numbers
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
@@ -110,7 +111,7 @@ class LimitCycle(AbstractCycle):
         """Map a function of one cycle over the axes of this batch."""
         for _ in range(self.outcome.ndim):
             function = jax.vmap(function)
-        return function
+        return with_default_settings(function)
 
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:

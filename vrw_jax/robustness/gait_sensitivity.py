@@ -20,6 +20,7 @@ from vrw_jax.cycles import (
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
 from vrw_jax.numerics import Scalar, StepOptions
 from vrw_jax.printing import AbstractPrintable, TextRow, describe_ending
+from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_known_name, check_names, is_traced
 from vrw_jax.wheel import Outcome, WheelParams
@@ -81,6 +82,7 @@ class GaitSensitivity(AbstractPrintable):
         return [*rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
 
 
+@with_default_settings
 def gait_sensitivity(
     params: WheelParams,
     measures: str | Sequence[str],
