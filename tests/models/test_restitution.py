@@ -67,7 +67,7 @@ def test_restitution_outside_its_domain_is_refused_in_one_sentence():
         vrw.UnilateralWheel(restitution=1.5)
     assert vrw.UnilateralWheel(restitution=0.0).restitution is None
     model = vrw.UnilateralWheel(restitution=0.5)
-    with pytest.raises(ValueError, match="in lanes"):
+    with pytest.raises(ValueError, match="batches do not support it"):
         vrw.step_batch(vrw.WheelParams(), np.array([START]), model=model)
     with pytest.raises(ValueError, match="engine='auto' or 'diffrax'"):
         vrw.step(vrw.WheelParams(), START, model=model, engine="lanes")
