@@ -705,7 +705,7 @@ def register_wrong_calls() -> None:
         "basin over half a grid",
         lambda: vrw.basin(table_1, {"theta_touchdown": 0.1}),
         "ValueError",
-        "must name all",
+        "must contain all",
     )
     for label, (value, kind) in {
         "text": ("a", "TypeError"), "nothing": (None, "TypeError"),
