@@ -10,6 +10,7 @@ import functools
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args, overload
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -294,16 +295,33 @@ def _search_with_fallbacks(
         return cycle
     finder, collocation_state = fallback
     if is_concrete:
-        cycle = map_in_batches(
+        retry = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
         )  # a compiled program
-        return cycle if is_batch else _take_rows_on_device(cycle, 0)
-    return _search(
-        finder,
-        params,
-        jax.device_put(collocation_state)
-        if is_batch
-        else _take_rows_on_device(collocation_state, 0),
+        retry = retry if is_batch else _take_rows_on_device(retry, 0)
+    else:
+        retry = _search(
+            finder,
+            params,
+            jax.device_put(collocation_state)
+            if is_batch
+            else _take_rows_on_device(collocation_state, 0),
+        )
+    return _keep_first_reason(cycle, retry)
+
+
+def _keep_first_reason(cycle: LimitCycle, retry: LimitCycle) -> LimitCycle:
+    """Return the cycles of the retry; a wheel without a gait keeps the reason of the first search.
+
+    It is the reason of every function, with fallbacks or without, and in any batch.
+    """
+    is_missing = ~cycle.found & ~retry.found
+    keep = lambda first, last: jnp.where(is_missing, first, last)
+    failed_check = keep(cycle.collocation_state.failed_check, retry.collocation_state.failed_check)
+    return eqx.tree_at(
+        lambda x: (x.outcome, x.collocation_state.failed_check),
+        retry,
+        (keep(cycle.outcome, retry.outcome), failed_check),
     )
 
 
@@ -486,10 +504,8 @@ def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle
     fallback = _fallback_starts(finder, params, search_result, refines_mesh=False)
     if fallback is None:
         return search_result
-    cycle: LimitCycle = map_in_batches(
-        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1]
-    )
-    return cycle
+    retry = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1])
+    return _keep_first_reason(search_result, retry)
 
 
 def _guess_section_state(guess: Any) -> Any:
