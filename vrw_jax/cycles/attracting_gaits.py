@@ -2,6 +2,7 @@
 method."""
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -46,12 +47,14 @@ experiments/gaits/off_the_box.py)."""
 
 FALLBACK_STARTS = (
     (0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
-    (0.35, 1.0), (0.35, 1.1),
+    (0.35, 1.0), (0.35, 1.1), (0.43, 1.6), (0.4, 1.35), (0.46, 1.6), (0.43, 1.35),
 )  # fmt: skip
-"""Starts of walks of the paper's model that are tried if none of WALK_STARTS leads to a gait. The
-first number is Leg 1's angle to the slope's normal at touchdown as a share of the angle between
-legs. The second number is the rate, as in WALK_STARTS. These starts reach the other 65 wheels. With
-many legs, gaits roll from double support into double support, with an angle near 0."""
+"""Starts of walks that are tried if none of WALK_STARTS leads to a gait. The first number is Leg
+1's angle to the slope's normal at touchdown as a share of the angle between legs. The second number
+is the rate, as in WALK_STARTS. The first nine starts reach the other 65 wheels. With many legs,
+gaits roll from double support into double support, with an angle near 0. The last four are chosen
+because some gaits of few legs are only reached from large angles and high rates: of 442 wheels with
+5 to 7 legs that walk from one of these starts or from a grid of 30, they reach the last 18."""
 
 
 def compute_walk_starts(params: WheelParams) -> np.ndarray:
@@ -109,27 +112,49 @@ def _walk_and_measure_defect(
 
 
 def find_attracting_gaits(
-    finder: Any,
-    values: Any,
-    n_starts: int = len(WALK_STARTS),
-    options: AttractingGaitOptions = ATTRACTING_GAIT_OPTIONS,
+    finder: Any, values: Any, options: AttractingGaitOptions = ATTRACTING_GAIT_OPTIONS
 ) -> tuple[np.ndarray, Any]:
     """Return the attracting gaits of each wheel, slowest first.
 
-    A wheel without an attracting gait gets one entry whose outcome is a failure.
+    Walks begin at WALK_STARTS; of a wheel for which none of them leads to a gait, also at
+    FALLBACK_STARTS. A wheel without an attracting gait gets one entry whose outcome is a failure.
 
     Args:
         finder: finds gaits with unilateral contact.
         values: of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
-        n_starts: number of WALK_STARTS to use, slow ones first.
         options: options of the walks and of the comparison of gaits.
 
     Returns:
         Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.
     """
+    values = np.asarray(values)
+    wheel_index, gaits = _find_gaits_from_starts(finder, values, compute_walk_starts, options)
+    is_missing = np.asarray(gaits.outcome) != Outcome.STEPPED
+    missing = wheel_index[is_missing]
+    if not len(missing):
+        return wheel_index, gaits
+    fallback_index, fallback_gaits = _find_gaits_from_starts(
+        finder, values[missing], compute_fallback_starts, options
+    )
+    is_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
+    found_wheels = missing[fallback_index[is_found]]
+    is_kept = ~np.isin(wheel_index, found_wheels)
+    all_gaits = concat_rows(take_rows(gaits, is_kept), take_rows(fallback_gaits, is_found))
+    wheel_index = np.concatenate([wheel_index[is_kept], found_wheels])
+    order = np.argsort(wheel_index, kind="stable")
+    return wheel_index[order], jax.device_put(take_rows(all_gaits, order))
+
+
+def _find_gaits_from_starts(
+    finder: Any,
+    values: np.ndarray,
+    compute_starts: Callable[[WheelParams], np.ndarray],
+    options: AttractingGaitOptions,
+) -> tuple[np.ndarray, Any]:
+    """Return the attracting gaits that walks from these starts reach, slowest first."""
     n_wheels = len(values)
-    wheel_index, x = _walk_to_distinct_states(finder, np.asarray(values), n_starts, options)
-    candidates = finder.find_cycles_near(np.asarray(values)[wheel_index], x)
+    wheel_index, x = _walk_to_distinct_states(finder, values, compute_starts, options)
+    candidates = finder.find_cycles_near(values[wheel_index], x)
     # Numpy is used because JAX compiles each operation for every number of wheels.
     is_attracting = np.abs(np.linalg.eigvals(candidates.monodromy_value)).max(-1) < 1.0
     is_valid = (np.asarray(candidates.outcome) == Outcome.STEPPED) & is_attracting
@@ -167,7 +192,8 @@ def find_slow_gaits(finder: Any, values: Any) -> Any:
     For 1,200 random wheels it is the slowest attracting gait of each.
     """
     values = np.asarray(values)
-    _, gaits = find_attracting_gaits(finder, values, 1)
+    slow_start = lambda params: compute_walk_starts(params)[:1]
+    _, gaits = _find_gaits_from_starts(finder, values, slow_start, ATTRACTING_GAIT_OPTIONS)
     missing = np.flatnonzero(np.asarray(gaits.outcome) != Outcome.STEPPED)
     if len(missing):
         wheel_index, other_gaits = find_attracting_gaits(finder, values[missing])
@@ -203,7 +229,10 @@ def _count_section_coordinates(finder: Any) -> int:
 
 
 def _walk_to_distinct_states(
-    finder: Any, values: np.ndarray, n_starts: int, options: AttractingGaitOptions
+    finder: Any,
+    values: np.ndarray,
+    compute_starts: Callable[[WheelParams], np.ndarray],
+    options: AttractingGaitOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the index of a wheel and the section state of each distinct end of a walk.
 
@@ -211,7 +240,7 @@ def _walk_to_distinct_states(
     the one with the smallest period defect is returned.
     """
     rows = jax.device_put(list(values.T[: len(PARAMETER_NAMES)]))
-    starts = compute_walk_starts(wheel_from_parameters(tuple(rows), finder.n_legs))[:n_starts]
+    starts = compute_starts(wheel_from_parameters(tuple(rows), finder.n_legs))
     n_wheels, n_coordinates = len(values), _count_section_coordinates(finder)
     wheel_index = np.tile(np.arange(len(values)), len(starts))
     columns = values.T[:, wheel_index]

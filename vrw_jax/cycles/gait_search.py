@@ -285,9 +285,11 @@ def _search_with_fallbacks(
         return cycle
     if not is_batch:
         params_and_cycle = _take_rows_on_device(params_and_cycle, None)
-    fallback = _fallback_starts(finder, *params_and_cycle, refines_mesh)
-    if finder.period_n > 1 and guess is not None:
-        section_state = np.asarray(_guess_section_state(guess))[None]
+    section_state = None
+    if guess is not None:
+        section_state = np.asarray(lax.stop_gradient(_guess_section_state(guess)))[None]
+    fallback = _fallback_starts(finder, *params_and_cycle, section_state, refines_mesh)
+    if finder.period_n > 1 and section_state is not None:
         if fallback is None:
             fallback = _retry_from_other_steps(finder, *params_and_cycle, section_state)
         fallback = _align_first_step(finder, *params_and_cycle, section_state, fallback)
@@ -358,17 +360,19 @@ def _walk_and_measure_defect(
     continues = np.asarray(walk_result.outcome) == Outcome.STEPPED
     period_defect = np.full(len(states), np.inf)
     if continues.any():
-        next_period = step_batch(
-            _take_rows_on_device(params, continues),
-            states[continues],
-            finder.period_n,
-            model=finder.model,
-        )
-        distance = np.abs(np.asarray(next_period.section_state) - states[continues]).max(-1)
-        period_defect[continues] = np.where(
-            np.asarray(next_period.outcome) == Outcome.STEPPED, distance, np.inf
+        period_defect[continues] = _measure_period_defect(
+            finder, _take_rows_on_device(params, continues), states[continues]
         )
     return states, period_defect
+
+
+def _measure_period_defect(
+    finder: CollocationFinder, params: WheelParams, states: np.ndarray
+) -> np.ndarray:
+    """Return the largest change of each state over one period, infinite if a step fails."""
+    period = step_batch(params, states, finder.period_n, model=finder.model)
+    distance = np.abs(np.asarray(period.section_state) - states).max(-1)
+    return np.where(np.asarray(period.outcome) == Outcome.STEPPED, distance, np.inf)
 
 
 class _WalkResults(NamedTuple):
@@ -382,11 +386,19 @@ def _walk_from_all_starts(
     finder: CollocationFinder,
     params: WheelParams,
     is_wanted: np.ndarray,
+    guess_states: np.ndarray | None,
     options: FallbackOptions,
 ) -> _WalkResults:
-    """Return the walks that repeat best, from all starts of the wheels that need one."""
-    n_wheels, indices = len(is_wanted), np.flatnonzero(is_wanted)
+    """Return the walks that repeat best, from all starts of the wheels that need one.
+
+    A guess that nearly repeats replaces the walks of its wheel.
+    """
+    n_wheels = len(is_wanted)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
+    if guess_states is not None and is_wanted.any():
+        smallest_defect = _measure_period_defect(finder, params, guess_states)
+        section_states = guess_states.copy()
+    indices = np.flatnonzero(is_wanted & (smallest_defect >= options.max_walk_defect))
     for compute_starts in (compute_walk_starts, compute_fallback_starts):
         own_params = _take_rows_on_device(params, indices)
         for start in compute_starts(own_params) if len(indices) else ():
@@ -435,12 +447,14 @@ def _fallback_starts(
     finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
+    guess_states: np.ndarray | None,
     refines_mesh: bool,
     options: FallbackOptions = FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
     """Return a finder, and starts from which it finds more of a batch's gaits.
 
-    Returns None if there are none. `refines_mesh` allows a finer mesh.
+    Returns None if there are none. `guess_states` are the section states of guesses, (wheels, 3).
+    `refines_mesh` allows a finer mesh.
     """
     outcome = np.asarray(cycle.outcome)
     is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > options.refine_above)
@@ -448,7 +462,7 @@ def _fallback_starts(
     is_open = is_missing | is_rough
     if not is_open.any():
         return None
-    walk_results = _walk_from_all_starts(finder, params, is_missing, options)
+    walk_results = _walk_from_all_starts(finder, params, is_missing, guess_states, options)
     # Best start of each wheel so far, found by a search, on the mesh of `finder`.
     collocation_state, has_state = cycle.collocation_state, is_rough.copy()
     is_coarse = outcome == Outcome.MESH_TOO_COARSE
@@ -501,7 +515,7 @@ def _fallback_starts(
 def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
     """Return the search's result, with cycles from walks where the search found none, on the same
     mesh."""
-    fallback = _fallback_starts(finder, params, search_result, refines_mesh=False)
+    fallback = _fallback_starts(finder, params, search_result, None, refines_mesh=False)
     if fallback is None:
         return search_result
     retry = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1])
