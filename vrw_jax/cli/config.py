@@ -349,7 +349,10 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
         file_name=file_name,
     )
     config.make_wheel()
-    config.make_model()
+    try:
+        config.make_model()
+    except TypeError as error:  # A setting that no file can write, such as uneven ground.
+        raise ValueError(str(error)) from error
     options = config.make_options()
     options.check_tolerances(np.dtype(float))
     make_solver(options.solver, options)
