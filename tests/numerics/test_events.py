@@ -50,6 +50,15 @@ def test_simultaneous_guards_give_the_first_in_the_list():
     assert int(find_phase_end((twice, compute_same)).guard) == 0
 
 
+@pytest.mark.parametrize("jump_time", [0.3, 0.5, 0.7, 1.1, 1.3, 1.7])
+def test_a_guard_that_jumps_below_zero_ends_the_phase_and_no_other_guard(jump_time):
+    """A guard without a rate has no Newton step; the end is still its own."""
+    positive, jumping = lambda y: 1.0 + y[0], lambda y: jnp.where(y[0] < jump_time, 1.0, -1.0)
+    end = find_phase_end((positive, jumping))
+    assert int(end.guard) == 1
+    assert abs(float(end.duration) - jump_time) < 1e-9
+
+
 def test_an_event_has_the_accuracy_of_the_integrator():
     # s = sin t falls through 0 at pi; the guard sees only the integrated s.
     for tolerance in (1e-6, 1e-9, 1e-12):

@@ -590,7 +590,9 @@ def _propose_event(
     # A guard that rises below zero has crossed at an unknown earlier time.
     missed_time = jnp.where(search.is_crossing & (guards < 0.0), -jnp.inf, jnp.inf)
     proposals = jnp.where(is_falling, length + change, missed_time)
-    guard = jnp.argmin(proposals).astype(jnp.int32)
+    # If no crossing guard falls here, the lowest of them is taken, never one that did not cross.
+    lowest = jnp.argmin(jnp.where(search.is_crossing, guards, jnp.inf))
+    guard = jnp.where(jnp.any(proposals < jnp.inf), jnp.argmin(proposals), lowest).astype(jnp.int32)
     is_rising = (guards == 0.0) & (rates > 0.0)  # at the start of the step
     is_before_event = jnp.all(jnp.where(search.is_crossing, (guards > 0.0) | is_rising, True))
     lower_bound = jnp.where(is_before_event, lax.stop_gradient(length), search.lower_bound)
