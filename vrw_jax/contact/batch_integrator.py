@@ -22,6 +22,7 @@ from vrw_jax.contact.contact_state import (
     ModeDynamics,
     accumulator_rates,
     compute_forces,
+    compute_state_units,
     contact_quantities,
     evaluate_guards,
     guard_scales,
@@ -30,7 +31,7 @@ from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, p
 from vrw_jax.hybrid import GUARD_ROUNDOFF_EPS
 from vrw_jax.integrator import ButcherTableau, find_dip, fit_guard_parabola, step_size_factor
 from vrw_jax.numerics import StepOptions, tree_where
-from vrw_jax.wheel import Outcome
+from vrw_jax.wheel import Outcome, Symbols, compute_own_units
 
 N_CONTACT_ROWS = 9
 """Number of rows after the accelerations that hold the contact quantities of the guards. They are
@@ -71,7 +72,8 @@ class IntervalOptions:
     """Number of event iterations after which a guard that starts at its own event may be the
     event."""
     max_roundoff_fall: float = 1e-3
-    """Time within which a guard must fall by its own round-off to count as falling, s."""
+    """Time within which a guard must fall by its own round-off to count as falling, in the wheel's
+    own unit: seconds for a wheel of Table 1's size."""
     event_time_factor: float = 30.0
     """Largest last correction to the time of an event, in tolerances of the step.
 
@@ -234,7 +236,8 @@ def init_interval(
     # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
     # rises from below has no event before it falls; events without duration leave several such.
     roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_EPS * jnp.finfo(values.dtype).eps)
-    min_rate = -roundoff / interval_options.max_roundoff_fall
+    time_unit = compute_own_units(dynamics.s).time
+    min_rate = -roundoff / (interval_options.max_roundoff_fall * time_unit)
     is_own = is_own | ((values <= roundoff) & (rates > min_rate))
     has_passed = ~is_own & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
     first_passed = jnp.zeros(has_passed.shape[1:], jnp.int32)
@@ -250,7 +253,7 @@ def init_interval(
         accumulated=jnp.zeros((N_ACCUMULATOR_ROWS, *zero.shape), zero.dtype)
         if dynamics.accumulates
         else None,
-        h=zero + h,
+        h=zero + h * time_unit,
         time=zero,
         search=EventBracket(
             zero_count > 0, jnp.zeros_like(is_own), zero, zero, zero, zero_count, zero, values
@@ -281,7 +284,7 @@ def integrate_interval(
     event.
     """
     dynamics = dynamics_at(columns)
-    scales = guard_scales(dynamics)
+    scales, options = guard_scales(dynamics), compute_own_units(dynamics.s).scale_times(options)
 
     def try_step(state: IntervalState) -> IntervalState:
         return integrator_step(
@@ -388,7 +391,7 @@ def finish_attempt(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
     errors = h * h * weighted_sum(tableau.b_error_position), h * weighted_sum(tableau.b_error)
-    squared_error = _squared_error(options, errors, point, points[-1], values)
+    squared_error = _squared_error(dynamics.s, options, errors, point, points[-1], values)
     middle_values = (
         inner_values[tableau.guard_stages.index(tableau.middle_stage)]
         if inner_values
@@ -551,6 +554,7 @@ def _search_event(
 
 
 def _squared_error(
+    s: Symbols,
     options: StepOptions,
     errors: tuple[Array, Array],
     point: IntervalPoint,
@@ -561,8 +565,9 @@ def _squared_error(
     finite.
     """
     total = 0.0 * jnp.sum(guards, axis=0)
-    for error, a, b in zip(errors, point[:2], end[:2], strict=True):
-        tolerance = options.atol + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+    units = compute_state_units(s)
+    for error, a, b, unit in zip(errors, point[:2], end[:2], units, strict=True):
+        tolerance = options.atol * unit + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
         total = total + jnp.sum(jnp.square(error / tolerance), axis=0)
     return jnp.where(jnp.isfinite(total), total / (2 * point.q.shape[0]), jnp.inf)
 

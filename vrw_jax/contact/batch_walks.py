@@ -20,6 +20,7 @@ from vrw_jax.contact.impacts import project_motion
 from vrw_jax.contact.mechanics import WheelMotion
 from vrw_jax.contact.section import (
     LOCKED_CODE_OFFSET,
+    compute_section_units,
     embed_section_state,
     full_section_size,
     unpack_section_state,
@@ -37,7 +38,7 @@ from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.runtime import cached_lane_program
-from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_own_units_of_rows, compute_symbols
 
 
 def walk_batch(
@@ -93,9 +94,15 @@ def step_batch_with_jacobian(
     if input_indices is not None:
         has_tangent &= np.isin(np.arange(numbers.shape[1]), input_indices)
     rate_indices = len(columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
-    independent_rates = _IndependentRates.from_projection(
-        _project_rates(columns, states, n), has_tangent[:, rate_indices]
+    section_units = compute_section_units(compute_own_units_of_rows(columns.T, n), n)
+    rate_units = np.stack(section_units, -1)[:, rate_indices - len(columns)]
+    projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n)]]  # in the order of `coordinates`
+    projection = _project_rates(columns, states, n) * (
+        rate_units[:, None] / projected_units[:, :, None]
     )
+    independent_rates = _IndependentRates.from_projection(
+        projection, has_tangent[:, rate_indices]
+    ).convert_to_si(rate_units)
     has_tangent[:, rate_indices] = independent_rates.is_independent()
     wheel, input_index = np.nonzero(has_tangent)
     lane, slot, owner = _pack_tangents(has_tangent.sum(1))
@@ -192,6 +199,11 @@ class _IndependentRates(NamedTuple):
             norm = components[wheels, i, index_array[:, i]]
             combination[:, i] = component / np.where(is_significant[:, i], norm, np.inf)[:, None]
         return cls(index_array, is_significant, combination)
+
+    def convert_to_si(self, units: np.ndarray) -> "_IndependentRates":
+        """Return the same for rates in SI, given rates in `units`, (wheels, rates)."""
+        own_units = np.take_along_axis(units, self.indices, 1)
+        return self._replace(combination=self.combination * own_units[:, :, None] / units[:, None])
 
     def is_independent(self) -> np.ndarray:
         """Return whether each rate is independent, (wheels, rates)."""

@@ -64,7 +64,7 @@ class ContactSolution(NamedTuple):
     length: SlotPair  # of each slot's leg
     foot_x: SlotPair  # of each slot's foot
     foot_z: SlotPair
-    painleve_determinant: Any  # zero if no force holds a sliding foot: Painlevé's singularity
+    painleve_determinant: Any  # 1; zero if no force holds a sliding foot: Painlevé's singularity
 
 
 Matrix2 = tuple[tuple[Any, Any], tuple[Any, Any]]
@@ -209,6 +209,11 @@ def _eliminate_stoppers(
     )
 
 
+REFERENCE_MASS_RATIO = 18.0
+"""Ratio of total mass to leg mass at which feet at rest and sliding feet have the same scale in the
+determinant. It is that of Table 1's wheel, chosen because `PAINLEVE_ATOL` is measured there."""
+
+
 def _solve_feet(
     s: Symbols,
     inertia: ContactInverseInertia,
@@ -255,7 +260,11 @@ def _solve_feet(
     along_u = _make_pair(
         lambda i: jnp.where(foot_equations.is_sticking[i], if_sticking[i], to_u[i] * c[i])
     )
-    painleve_determinant = s.m * s.m * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
+    masses = _make_pair(
+        lambda i: jnp.where(foot_equations.is_sticking[i], s.Mt / REFERENCE_MASS_RATIO, s.m)
+    )
+    masses = _make_pair(lambda i: jnp.where(foot_equations.is_loaded[i], masses[i], 1.0))
+    painleve_determinant = masses[0] * masses[1] * (C[0][0] * C[1][1] - C[0][1] * C[1][0])
     return prevent_fusion((stopper, along_e, along_u, painleve_determinant), unit)
 
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.contact.contact_modes import ContactMode, Friction, finite_friction
@@ -31,7 +32,7 @@ from vrw_jax.contact.mechanics import (
     sum_over_legs,
 )
 from vrw_jax.numerics import Elementwise, Scalar
-from vrw_jax.wheel import Symbols
+from vrw_jax.wheel import Symbols, compute_own_units
 
 PackedState = Float[Array, "dim ..."]
 """Hub (x, z, theta) and rates, lengths, rates of lengths, then the accumulators: see
@@ -294,6 +295,22 @@ def guard_scales(dynamics: ModeDynamics) -> Array:
     weight, speed = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     scales = [s.L0] * 2 * s.n + [weight] * 6 + [speed] * 2 + [weight] * 2 + [speed / s.L0, s.L0]
     return jnp.stack(scales + [weight] * s.n * dynamics.is_one_sided)
+
+
+def compute_state_units(s: Symbols) -> tuple[Array, Array]:
+    """Return the wheel's own units of (hub x, z, theta, lengths) and of their rates."""
+    units, one = compute_own_units(s), jnp.ones_like(s.L0)
+    position_units = [units.length, units.length, one, *[units.length] * s.n]
+    rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
+    return jnp.stack(position_units), jnp.stack(rate_units)
+
+
+def compute_packed_units(s: Symbols) -> PackedState:
+    """Return the wheel's own units of the numbers of `pack_state`."""
+    units, (positions, rates) = compute_own_units(s), compute_state_units(s)
+    accumulators = Accumulators(units.time, units.energy, units.energy, units.length)
+    state = positions[:3], rates[:3], positions[3:], rates[3:], jnp.stack(accumulators)
+    return lax.stop_gradient(jnp.concatenate(state))
 
 
 def guard_values(dynamics: ModeDynamics, state: PackedState) -> Float[Array, " n_guards"]:

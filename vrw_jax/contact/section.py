@@ -10,7 +10,7 @@ from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions
 from vrw_jax.models import PAPER_START, is_valid_slope, is_valid_start, replace_invalid
 from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import Symbols, WheelParams, length_at_touchdown
+from vrw_jax.wheel import OwnUnits, Symbols, WheelParams, length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
 """(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
@@ -27,6 +27,13 @@ LOCKED_CODE_OFFSET = 4
 def full_section_size(n: int) -> int:
     """Return the length of a full section state of a wheel with `n` legs."""
     return 4 + 3 * n
+
+
+def compute_section_units(units: OwnUnits, n: int) -> list[Elementwise]:
+    """Return the wheel's own units of each number of a full section state; 1 for the codes."""
+    one = units.length / units.length
+    hub = [one, units.rate, units.speed, units.speed]
+    return [*hub, *[units.length] * n, *[units.speed] * n, *[one] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:

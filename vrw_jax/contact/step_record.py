@@ -55,8 +55,8 @@ def min_dip_depth(
     L0: Elementwise, options: StepOptions, rest_options: RestOptions = REST_OPTIONS
 ) -> Array:
     """Return the smallest depth of a dip that a step follows, m."""
-    roundoff_depth = rest_options.dip_depth_eps * jnp.finfo(L0.dtype).eps * L0
-    return jnp.maximum(rest_options.dip_depth_per_atol * options.atol, roundoff_depth)
+    roundoff_depth = rest_options.dip_depth_eps * jnp.finfo(L0.dtype).eps
+    return jnp.maximum(rest_options.dip_depth_per_atol * options.atol, roundoff_depth) * L0
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:

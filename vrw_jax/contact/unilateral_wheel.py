@@ -19,6 +19,7 @@ from vrw_jax.contact.contact_state import (
     GuardLayout,
     PackedState,
     compute_forces,
+    compute_packed_units,
     guard_scales,
     guard_values,
     make_guard_layout,
@@ -32,6 +33,7 @@ from vrw_jax.contact.impacts import ContactLaw
 from vrw_jax.contact.mechanics import landing_position
 from vrw_jax.contact.section import (
     FullState,
+    compute_section_units,
     embed_section_state,
     full_section_size,
     replace_invalid_start,
@@ -61,7 +63,7 @@ from vrw_jax.contact.step_record import (
     record_interval,
 )
 from vrw_jax.contact.walk_kernel import StepSummary
-from vrw_jax.hybrid import MonitoredFunctions, integrate_phase, sample_phase
+from vrw_jax.hybrid import MonitoredFunctions, integrate_in_units, sample_in_units
 from vrw_jax.models import (
     PAPER_START,
     AbstractWheel,
@@ -89,7 +91,15 @@ from vrw_jax.validation import (
     check_type,
     refuse_renamed_arguments,
 )
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    Outcome,
+    OwnUnits,
+    WheelParams,
+    compute_own_units,
+    convert_friction,
+)
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Effect of stoppers on legs in the air: they hold with any force, or only push."""
@@ -238,6 +248,9 @@ class UnilateralWheel(AbstractWheel):
     def n_continuous(self, params: WheelParams) -> int:
         return full_section_size(params.n_legs) - params.n_legs
 
+    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+        return compute_section_units(units, n_legs)
+
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for (theta-, dtheta-, dL1-), with Leg 1 on the ground."""
         return _embedded(params, x) if x.shape == (3,) else x
@@ -343,7 +356,15 @@ class UnilateralWheel(AbstractWheel):
             dynamics = make_mode_dynamics(
                 s, friction, False, ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
             )
-            arguments = partial(vector_field, dynamics), log.state, log.duration, n_samples, options
+            units = compute_packed_units(s), compute_own_units(s).time
+            arguments = (
+                partial(vector_field, dynamics),
+                log.state,
+                log.duration,
+                n_samples,
+                options,
+                *units,
+            )
 
             def foot_forces(state: PackedState) -> tuple:
                 solution = compute_forces(dynamics, unpack_state(state)[0]).solution
@@ -351,7 +372,7 @@ class UnilateralWheel(AbstractWheel):
                     solution.normal
                 )
 
-            states = sample_phase(*arguments)
+            states = sample_in_units(*arguments)
             return states, *jax.vmap(foot_forces)(states)
 
         section_state, durations, *_ = _minimal_result(loop_state, tilt)
@@ -433,7 +454,10 @@ def _advance_to_event(
     guard_spec = MonitoredFunctions(
         partial(guard_values, dynamics), layout.total, guard_scales=guard_scales(dynamics)
     )
-    end = integrate_phase(partial(vector_field, dynamics), guard_spec, start, is_valid, options)
+    units = compute_packed_units(dynamics.s), compute_own_units(dynamics.s).time
+    end = integrate_in_units(
+        partial(vector_field, dynamics), guard_spec, start, is_valid, options, *units
+    )
 
     counters = loop_state.counters._replace(n_events=loop_state.counters.n_events + 1)
     counters = add_interval(counters, result.contact_state, end.duration, end.solver_steps)

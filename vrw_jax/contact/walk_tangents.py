@@ -43,6 +43,7 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.integrator import ButcherTableau, real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any, tree_where
+from vrw_jax.wheel import compute_own_units
 
 
 class _IntervalTangent(NamedTuple):
@@ -242,6 +243,7 @@ def _integrate_with_tangents(
     """Return the result of `integrate_interval`, with the tangents propagated to the event."""
     dynamics = dynamics_at(columns)
     scales, last_stage = guard_scales(dynamics), len(tableau.nodes) - 1
+    options = compute_own_units(dynamics.s).scale_times(options)
     has_more_moving = _has_more_moving(tangents, template, initial.contact_state)
     max_h = _max_stable_step(dynamics, tableau)
 

@@ -15,12 +15,19 @@ import numpy as np
 from vrw_jax.contact import embed_section_states, walk_batch
 from vrw_jax.numerics import StepOptions, concat_rows, take_rows
 from vrw_jax.runtime import with_default_settings
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
+from vrw_jax.wheel import (
+    PARAMETER_NAMES,
+    Outcome,
+    WheelParams,
+    compute_own_units_of_rows,
+    wheel_from_parameters,
+)
 
 
 @dataclass(frozen=True)
 class AttractingGaitOptions:
-    """Walks toward attracting gaits. Distances are those of section states, rad, rad/s, m/s."""
+    """Walks toward attracting gaits. Distances are those of section states, in the wheel's
+    own units."""
 
     round_steps: tuple[int, ...] = (8, 12, 30, 50, 100)
     """Numbers of steps toward a gait. After each round, settled walks stop and walks to the same
@@ -103,7 +110,9 @@ def _walk_and_measure_defect(
     states, _, outcome, *_ = walk_batch(columns, x, n_steps, *settings)
     next_states, _, next_outcome, *_ = walk_batch(columns, states, finder.period_n, *settings)
     is_walking = outcome == Outcome.STEPPED
-    distance = np.abs(next_states - states)[:, : _count_section_coordinates(finder)].max(-1)
+    units = stack_section_units(finder.model, columns.T, finder.n_legs)
+    distance = np.abs((next_states - states) / units)
+    distance = distance[:, : _count_section_coordinates(finder)].max(-1)
     return (
         states,
         is_walking,
@@ -163,7 +172,8 @@ def _find_gaits_from_starts(
     speed = sum_over_steps(candidates.step_length) / np.where(
         is_valid, sum_over_steps(candidates.durations), 1.0
     )
-    coordinates = states[:, :, : _count_section_coordinates(finder)]
+    units = stack_section_units(finder.model, np.asarray(values)[wheel_index], finder.n_legs)
+    coordinates = (states / units[:, None])[:, :, : _count_section_coordinates(finder)]
     # A gait that repeats earlier has a shorter period.
     step_distances = np.abs(coordinates[:, :-1] - coordinates[:, -1:]).max(-1)
     is_valid &= ~(step_distances < options.duplicate_distance).any(1)
@@ -223,6 +233,11 @@ def _mark_missing_gaits(is_missing: np.ndarray, cycle: Any) -> Any:
     return jax.device_put(masked_cycle)
 
 
+def stack_section_units(model: Any, values: np.ndarray, n_legs: int) -> np.ndarray:
+    """Return each wheel's own units of its section state, (wheels, section)."""
+    return np.stack(model.section_units(compute_own_units_of_rows(values, n_legs), n_legs), -1)
+
+
 def _count_section_coordinates(finder: Any) -> int:
     """Return the number of continuous entries of a section state."""
     return int(finder.model.n_continuous(WheelParams(n_legs=finder.n_legs)))
@@ -248,6 +263,8 @@ def _walk_to_distinct_states(
     x, period_defect = np.array(start_states), np.full(len(wheel_index), np.inf)
     active = np.arange(len(wheel_index))
     is_walking, is_duplicate = np.ones(len(wheel_index), bool), np.zeros(len(wheel_index), bool)
+    units = stack_section_units(finder.model, columns.T, finder.n_legs)
+    scaled = lambda x: (x / units)[:, :n_coordinates]
     with ThreadPoolExecutor(1) as pool:
         pool.submit(with_default_settings(finder.precompile_newton), values[:1], start_states[:1])
         for n_steps in options.round_steps:
@@ -256,14 +273,14 @@ def _walk_to_distinct_states(
             )
             x[active], is_walking[active], period_defect[active] = walk_result
             is_duplicate |= _find_duplicates(
-                x[:, :n_coordinates], period_defect, n_wheels, options.settled_defect, options
+                scaled(x), period_defect, n_wheels, options.settled_defect, options
             )
             is_unsettled = period_defect >= options.settled_defect
             active = np.flatnonzero(is_walking & ~is_duplicate & is_unsettled)
             if not len(active):
                 break
     is_duplicate = _find_duplicates(
-        x[:, :n_coordinates], period_defect, n_wheels, options.start_defect, options
+        scaled(x), period_defect, n_wheels, options.start_defect, options
     )
     is_selected = ~is_duplicate & (period_defect < options.start_defect)
     # The first start is selected for a wheel without any usable walk.

@@ -6,6 +6,7 @@ tangents of the cycle, one parameter after another. Both are machine code on a C
 """
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -15,10 +16,12 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import simd
+from vrw_jax.collocation import CollocationSolution
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
     CollocationSystem,
     Parameters,
+    SearchResult,
     register_export_names,
     search_in_stages,
     search_lanes,
@@ -36,7 +39,7 @@ from vrw_jax.numerics import (
     zero_tangent,
 )
 from vrw_jax.runtime import cached_lane_function, cached_trace, with_default_settings
-from vrw_jax.wheel import PARAMETER_NAMES
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_own_units, compute_symbols
 
 
 def _collocation_tangents(
@@ -182,6 +185,46 @@ def _make_tangent_function(system: CollocationSystem) -> Callable:
     return tangents
 
 
+def _search_in_own_units(
+    system: CollocationSystem,
+    search: BatchFunction,
+    parameters: Parameters,
+    *guess: CollocationState,
+) -> SearchResult:
+    """Return the result of `search_in_stages`, searched in own units of length and time, in SI.
+
+    The section is (theta, dtheta) after a landing; the ends are (theta, L1) and their rates. Mass
+    is not converted, because no unknown contains it.
+    """
+    units = compute_own_units(compute_symbols(system.n_legs, *parameters))._replace(mass=1.0)
+    one, time = jnp.ones_like(units.time), units.time
+    position_units = jnp.stack([one, units.length, units.length])
+    section_units = jnp.stack([one, 1.0 / time])
+    end_units = jnp.concatenate([position_units[:2], position_units[:2] / time])
+
+    def convert(
+        state: CollocationState, scale: Callable[[Array, Array], Array]
+    ) -> CollocationState:
+        """Return the state with each number scaled by its unit."""
+        solution = state.solution
+        accelerations = tuple(
+            scale(x, position_units[: x.shape[-2]] / (time * time)) for x in solution.accelerations
+        )
+        solution = CollocationSolution(
+            scale(solution.section_state, section_units),
+            scale(solution.durations, time),
+            accelerations,
+        )
+        return state._replace(solution=solution, ends=scale(state.ends, end_units))
+
+    own_guess = tuple(convert(state, operator.truediv) for state in guess)
+    parameter_units = [units.si_value(domain.unit) for domain in PARAMETER_DOMAINS.values()]
+    own_parameters = [x / unit for x, unit in zip(parameters, parameter_units, strict=True)]
+    result = search_in_stages(system, search, jnp.stack(own_parameters), *own_guess)
+    monodromy = section_units[:, None] * result.monodromy / section_units
+    return result._replace(state=convert(result.state, operator.mul), monodromy=monodromy)
+
+
 def solve_cycle_with_derivatives(
     system: CollocationSystem, parameters: Array, guess: CollocationState | None
 ) -> tuple[CollocationState, tuple]:
@@ -192,7 +235,7 @@ def solve_cycle_with_derivatives(
     batched_search = compile_batched(
         search_problem, make_template, ("search", system), system.options.batch_size
     )
-    search_one = unbatch(functools.partial(search_in_stages, system, batched_search))
+    search_one = unbatch(functools.partial(_search_in_own_units, system, batched_search))
     tangents_of = _make_tangent_function(system)
 
     @jax.custom_jvp

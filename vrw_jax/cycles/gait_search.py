@@ -23,6 +23,7 @@ from vrw_jax.cycles.attracting_gaits import (
     compute_walk_starts,
     find_attracting_gaits,
     find_slowest_indices,
+    stack_section_units,
 )
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
@@ -369,9 +370,13 @@ def _walk_and_measure_defect(
 def _measure_period_defect(
     finder: CollocationFinder, params: WheelParams, states: np.ndarray
 ) -> np.ndarray:
-    """Return the largest change of each state over one period, infinite if a step fails."""
+    """Return the largest change of each state over one period, infinite if a step fails.
+
+    Changes are relative to the wheel's units of angle, angular velocity and velocity.
+    """
     period = step_batch(params, states, finder.period_n, model=finder.model)
-    distance = np.abs(np.asarray(period.section_state) - states).max(-1)
+    units = stack_section_units(finder.model, np.asarray(stack_parameters(params)).T, params.n_legs)
+    distance = np.abs((np.asarray(period.section_state) - states) / units).max(-1)
     return np.where(np.asarray(period.outcome) == Outcome.STEPPED, distance, np.inf)
 
 

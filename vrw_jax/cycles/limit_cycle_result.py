@@ -66,7 +66,7 @@ class LimitCycle(AbstractCycle):
     - `step_length`: distance between the feet at the landing, m; (n,) for n > 1;
     - `indicators`: of the landing; (n,) each for n > 1;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
-    - `residual`: last correction of Newton's method, rad, rad/s, s or m;
+    - `residual`: last correction of Newton's method, in the wheel's own units;
     - `n_newton_iterations`: number of linearized passes of the search;
     - `parameters`: in the order of params.PARAMETER_NAMES;
     - `collocation_state`: the solution with its phases, a start for neighbors;

@@ -30,7 +30,7 @@ class CycleOptions:
 
     - `mesh_intervals`: of order 8, in DLS, SLS-I and SLS-II;
     - `mesh_grading`: length of the last over the first mesh interval in SLS-I;
-    - `tolerance`: of Newton's last correction, rad, rad/s, s or m;
+    - `tolerance`: of Newton's last correction, in the wheel's own units;
     - `max_newton_iterations`: of one attempt;
     - `first_newton_iterations`: number after which a batch collects the wheels that need more;
     - `homotopy_steps`: of a homotopy from Table 1, used if the first attempt fails;

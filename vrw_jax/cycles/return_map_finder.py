@@ -34,7 +34,7 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
 from vrw_jax.printing import TextRow, format_numbers
 from vrw_jax.simulation import validate_arguments, walk_toward_gait
-from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wheel import Outcome, WheelParams, compute_own_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
 """Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
@@ -60,7 +60,7 @@ class ReturnMapCycle(AbstractCycle):
     - `steps`: the model's step results, with an axis over the steps of one cycle;
     - `monodromy_value`: Jacobian of the return map;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
-    - `residual`: largest entry of map(x) - x, rad, rad/s or m/s;
+    - `residual`: largest entry of map(x) - x, in the wheel's own units;
     - `n_iterations`: of Newton's method.
 
     Examples:
@@ -135,9 +135,15 @@ def find_return_map_cycle(
         if uses_jvp_rule
         else (model.advance, solve_fixed_point)
     )
-    return_map = lambda section_state: take_step(params, section_state, options).section_state
+    units = jnp.stack(model.section_units(compute_own_units(params.symbols()), params.n_legs))
+    return_map = lambda section_state: (
+        take_step(params, section_state * units, options).section_state / units
+    )
     fixed_point = solver(
-        return_map, section_state, period_n=period_n, tolerance=newton_tolerance(options)
+        return_map, section_state / units, period_n=period_n, tolerance=newton_tolerance(options)
+    )
+    fixed_point = fixed_point._replace(
+        x=fixed_point.x * units, jacobian=units[:, None] * fixed_point.jacobian / units
     )
     section_state, results = fixed_point.x, []
     for _ in range(period_n):

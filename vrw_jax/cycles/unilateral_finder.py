@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from vrw_jax.contact import UnilateralWheel, step_batch_with_jacobian
 from vrw_jax.continuation import FixedPointResult
-from vrw_jax.cycles.attracting_gaits import find_slow_gaits
+from vrw_jax.cycles.attracting_gaits import find_slow_gaits, stack_section_units
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import (
     Gait,
@@ -202,6 +202,11 @@ class PeriodMap(NamedTuple):
     period_n: int
     values: np.ndarray  # (wheels, n_values)
 
+    @property
+    def section_units(self) -> np.ndarray:
+        """Return each wheel's own units of its section state, (wheels, section)."""
+        return stack_section_units(self.model, self.values, self.n_legs)
+
     def select(self, indices: np.ndarray) -> "PeriodMap":
         """Return the map of some of the wheels."""
         return self._replace(values=self.values[indices])
@@ -305,14 +310,15 @@ def _find_fixed_points(
     )
     is_near = rough_solution.converged
     x = np.where(is_near[:, None], rough_solution.x, start)
+    units = period_map.section_units
     exact_period = period_map.evaluate_period(options, x, False, False)
     correction = exact_period.newton_correction(x, return_jacobian)
     x[is_near] += correction[is_near] * (
-        np.abs(correction[is_near]).max(-1, keepdims=True) < newton_options.near_correction
+        np.abs(correction / units)[is_near].max(-1, keepdims=True) < newton_options.near_correction
     )
     is_near = is_near | (
         exact_period.is_valid
-        & (np.abs(exact_period.end_state - x).max(-1) < newton_options.near_correction)
+        & (np.abs((exact_period.end_state - x) / units).max(-1) < newton_options.near_correction)
     )
     solution, _ = _run_newton(
         period_map,
@@ -346,7 +352,7 @@ def _run_newton(
     the two states where feet dip.
     """
     n_wheels, n_legs = len(start), period_map.n_legs
-    x, last_x = start.copy(), start.copy()
+    x, last_x, units = start.copy(), start.copy(), period_map.section_units
     residual, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
     is_small, is_found, n_halvings = (np.zeros(n_wheels, dtype) for dtype in (bool, bool, int))
     return_jacobian = np.zeros((n_wheels, start.shape[1], start.shape[1]))
@@ -362,9 +368,9 @@ def _run_newton(
         ):
             stored_leaf[active] = new_leaf
         correction = period.newton_correction(x[active], period.return_jacobian)
-        correction_size = np.abs(correction).max(-1)
+        correction_size = np.abs(correction / units[active]).max(-1)
         is_valid = period.is_valid & np.isfinite(correction).all(-1)
-        residual[active] = np.abs(period.end_state - x[active]).max(-1)
+        residual[active] = np.abs((period.end_state - x[active]) / units[active]).max(-1)
         return_jacobian[active] = period.return_jacobian
         n_iterations[active] += 1
         is_small_now = is_valid & (correction_size <= tolerance)

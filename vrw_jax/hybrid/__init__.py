@@ -11,11 +11,11 @@ from vrw_jax.hybrid.phase_integration import (
     VectorField,
     integrate_phase,
     make_solver,
-    sample_phase,
 )
 from vrw_jax.hybrid.program_cache import find_program
 from vrw_jax.hybrid.return_map import ReturnMap
 from vrw_jax.hybrid.saltation import flow_jacobian_determinant
+from vrw_jax.hybrid.scaled_integration import integrate_in_units, sample_in_units
 from vrw_jax.hybrid.segments import product_multipliers, segment_maps
 from vrw_jax.hybrid.simulation import (
     Guard,

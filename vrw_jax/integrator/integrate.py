@@ -62,6 +62,8 @@ class BatchPhase(NamedTuple):
     is_noinline: bool = False
     """Whether machine code calls the phase's functions instead of inlining them at each use; it
     then compiles in half of the time and runs a sixth slower."""
+    state_units: Vector | None = None
+    """Units of q and of v in which the absolute tolerance holds; those of SI by default."""
 
 
 class BatchPhaseEnd(NamedTuple):
@@ -380,7 +382,7 @@ def _integrate_until_crossing(
         stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
         end_values = phase.guards(rk_step.end)
         squared_error = _mean_squared_error(
-            rk_step, integrator_state.state, end_values, options.rtol, options.atol
+            rk_step, integrator_state.state, end_values, options, phase.state_units
         )
         dip_fraction = earliest_dip_fraction(
             tableau, [integrator_state.guard_values, *stage_values, end_values]
@@ -523,7 +525,11 @@ def _classify_step(
 
 
 def _mean_squared_error(
-    rk_step: RKStep, start: StageState, guards: Vector, rtol: Array, atol: Array
+    rk_step: RKStep,
+    start: StageState,
+    guards: Vector,
+    options: StepOptions,
+    state_units: Vector | None,
 ) -> Array:
     """Return the mean square of the error over its tolerance; infinite if the step is not finite.
 
@@ -532,8 +538,9 @@ def _mean_squared_error(
     start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
     to_float32 = lambda x: x.astype(jnp.float32)
     total: Any = 0.0
-    for error, a, b in zip(rk_step.error, start_numbers, end_numbers, strict=True):
-        tolerance = atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+    units: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
+    for error, a, b, unit in zip(rk_step.error, start_numbers, end_numbers, units, strict=True):
+        tolerance = options.atol * unit + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
         ratio = to_float32(error) / to_float32(tolerance)
         total = total + ratio * ratio
     for value in guards:
@@ -556,7 +563,7 @@ def sample_batch_phase(
 
     def step_function(state: StageState, length: Array) -> tuple[StageState, Array]:
         advanced = rk_step(tableau, phase.evaluate, state, length)
-        return advanced.end, _mean_squared_error(advanced, state, (), options.rtol, options.atol)
+        return advanced.end, _mean_squared_error(advanced, state, (), options, phase.state_units)
 
     pack_state = lambda state: jnp.stack([*state.q, *state.v])
     start = StageState(q, v, phase.evaluate(q, v))

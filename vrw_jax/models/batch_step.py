@@ -64,6 +64,7 @@ from vrw_jax.wheel import (
     SingleSupport1,
     Symbols,
     WheelParams,
+    compute_own_units,
     transitions,
 )
 
@@ -138,7 +139,9 @@ def make_lane_phase(
         MarginFunctions(margins, phase.margins_counted_at_start) if records_margins else None
     )
     guards = lambda stage: phase.guards(instant(stage))
-    return BatchPhase(evaluate, guards, monitored_margins, implicit_dynamics, is_noinline)
+    return BatchPhase(
+        evaluate, guards, monitored_margins, implicit_dynamics, is_noinline, phase.coordinate_units
+    )
 
 
 def gait_step(
@@ -269,7 +272,8 @@ def run_batch_phases(
     def run(
         phase: AbstractPhase, q: Vector, v: Vector, active: Array, previous_end: PhaseResult | None
     ) -> PhaseResult:
-        dt0 = options.dt0 + jnp.zeros_like(q[0])
+        limited = compute_own_units(phase.s).scale_times(options)
+        dt0 = limited.dt0 + jnp.zeros_like(q[0])
         if previous_end is not None:
             carry: _PhaseCarry = previous_end.engine_carry
             dt0 = carry.next_dt
@@ -295,7 +299,7 @@ def run_batch_phases(
             v,
             active,
             dt0,
-            options,
+            limited,
             straggler_count,
         )
         return PhaseResult(
@@ -406,7 +410,12 @@ def build_step_sampler(structure: Any, stop_at_lift_off: bool, n_samples: int) -
         sequence, tableau, options = config.run(*leaves)
         samples = [
             sample_batch_phase(
-                make_lane_phase(phase, False), tableau, *start, end.duration, n_samples, options
+                make_lane_phase(phase, False),
+                tableau,
+                *start,
+                end.duration,
+                n_samples,
+                compute_own_units(phase.s).scale_times(options),
             )
             for phase, start, end in zip(
                 sequence.phases, sequence.starts, sequence.ends, strict=True

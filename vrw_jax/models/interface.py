@@ -13,7 +13,13 @@ from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import is_traced
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams, wheel_from_parameters
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    OwnUnits,
+    WheelParams,
+    wheel_from_parameters,
+)
 
 StepGround = tuple[Array, ...]
 """Ground of one step, or of all steps: what `with_ground` needs."""
@@ -134,6 +140,10 @@ class AbstractWheel(eqx.Module):
         are codes.
         """
         return self.section_size(params)
+
+    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+        """Return the wheel's own units of each of the section's numbers."""
+        return [units.length / units.length, units.rate, units.speed]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
         """Return the model's section state for a three-number one; others are returned

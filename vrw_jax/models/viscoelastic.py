@@ -15,8 +15,8 @@ from vrw_jax.hybrid import (
     MonitoredFunctions,
     StateVector,
     VectorField,
-    integrate_phase,
-    sample_phase,
+    integrate_in_units,
+    sample_in_units,
 )
 from vrw_jax.models.batch_step import (
     build_step_function,
@@ -44,6 +44,7 @@ from vrw_jax.wheel import (
     Motion,
     PhaseInstant,
     WheelParams,
+    compute_own_units,
     require_known_friction,
 )
 
@@ -147,7 +148,10 @@ class ViscoelasticWheel(AbstractWheel):
         for phase, start, end in zip(sequence.phases, sequence.starts, sequence.ends, strict=True):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
             y = jnp.stack([*start[0], *start[1]])
-            samples.append(sample_phase(vector_field, y, end.duration, n_samples, options))
+            units = jnp.stack(phase.coordinate_units), compute_own_units(phase.s).time
+            samples.append(
+                sample_in_units(vector_field, y, end.duration, n_samples, options, *units)
+            )
         return make_trajectory(sequence, samples)
 
     def _run_phases(
@@ -159,12 +163,14 @@ class ViscoelasticWheel(AbstractWheel):
             phase: AbstractPhase, q: Vector, v: Vector, active: Array, _: PhaseResult | None
         ) -> PhaseResult:
             diffrax_phase = make_diffrax_phase(phase, records_margins)
-            end = integrate_phase(
+            end = integrate_in_units(
                 diffrax_phase.vector_field,
                 diffrax_phase.guards,
                 jnp.stack([*q, *v]),
                 active,
                 options,
+                jnp.stack(phase.coordinate_units),
+                compute_own_units(phase.s).time,
             )
             state = tuple(end.state)
             return PhaseResult(

@@ -64,6 +64,10 @@ def _int_field(name: str, default: int) -> Any:
 class StepOptions(AbstractPrintable):
     """Numerical options of an event-driven step; the tolerances may change without recompiling.
 
+    Lengths and times are in the wheel's own units, which are those of SI for a wheel of Table 1's
+    size. For another wheel `atol`, `max_phase_time` and `dt0` are multiplied by its own units: the
+    length L_0 / 1 m and the time sqrt((L_0 / 1 m) (9.81 m/s^2 / g)).
+
     - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
     - `engine`: "diffrax" is the reference for any solver, device and order of derivative; "lanes"
       is its machine code for explicit solvers on CPUs; "auto" takes "lanes" if it is available;

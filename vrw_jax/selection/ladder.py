@@ -38,9 +38,16 @@ from vrw_jax.models import (
     ViscoelasticWheel,
     replace_invalid,
 )
-from vrw_jax.numerics import RealInput, Scalar, StepOptions
+from vrw_jax.numerics import Elementwise, RealInput, Scalar, StepOptions
 from vrw_jax.printing import AbstractPrintable, TextRow, describe_elements
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, WheelParams, convert_friction
+from vrw_jax.wheel import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    Outcome,
+    OwnUnits,
+    WheelParams,
+    convert_friction,
+)
 
 
 class ModelCode(enum.IntEnum):
@@ -265,6 +272,9 @@ class LadderWheel(AbstractWheel):
 
     def n_continuous(self, params: WheelParams) -> int:
         return self.unilateral_model.n_continuous(params)
+
+    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+        return self.unilateral_model.section_units(units, n_legs)
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
         return self.unilateral_model.embed_section(params, x)

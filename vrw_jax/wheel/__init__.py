@@ -38,3 +38,4 @@ from vrw_jax.wheel.phases import (
     make_phases,
 )
 from vrw_jax.wheel.transitions import Landing
+from vrw_jax.wheel.units import OwnUnits, compute_own_units, compute_own_units_of_rows

@@ -28,6 +28,7 @@ from vrw_jax.wheel.geometry import (
 )
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.units import compute_own_units
 
 SHARED_FAILURES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
 """Outcomes by which every phase may leave the paper's sequence."""
@@ -143,6 +144,14 @@ class AbstractPhase(abc.ABC):
         sin = motion.sin * turn_cos - motion.cos * turn_sin
         cos = motion.cos * turn_cos + motion.sin * turn_sin
         return motion._replace(sin=sin, cos=cos)
+
+    @property
+    def coordinate_units(self) -> Vector:
+        """The wheel's own units of the phase's coordinates (theta, L1, L2), then of their rates."""
+        units = compute_own_units(self.s)
+        positions = jnp.ones_like(units.length), units.length, units.length
+        rates = units.rate, units.speed, units.speed
+        return *positions[: self.n_dof], *rates[: self.n_dof]
 
     def motion_at(self, q: Vector, v: Vector) -> Motion:
         """Return the full motion at the phase's own coordinates q and rates v."""

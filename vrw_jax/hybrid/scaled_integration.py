@@ -1,0 +1,57 @@
+"""Integration of phases in units of the system's own size.
+
+Tolerances, the first step and the time limit of `StepOptions` then hold in these units.
+"""
+
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
+from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase, sample_phase
+from vrw_jax.numerics import Scalar, StepOptions
+
+
+def integrate_in_units(
+    field: VectorField,
+    monitored_functions: MonitoredFunctions,
+    start: StateVector,
+    active: Bool[Array, ""],
+    options: StepOptions,
+    state_units: StateVector,
+    time_unit: Scalar,
+) -> PhaseEnd:
+    """Return the result of `integrate_phase`, integrated in these units, in SI.
+
+    All arguments but `options` are in SI, guards and margins too.
+    """
+    state_units, time_unit = lax.stop_gradient((state_units, time_unit))
+    values = lambda y: monitored_functions.values(y * state_units)
+    end = integrate_phase(
+        _scale_field(field, state_units, time_unit),
+        monitored_functions._replace(values=values),
+        start / state_units,
+        active,
+        options,
+    )
+    return end._replace(state=end.state * state_units, duration=end.duration * time_unit)
+
+
+def sample_in_units(
+    field: VectorField,
+    start: StateVector,
+    duration: Scalar,
+    n_samples: int,
+    options: StepOptions,
+    state_units: StateVector,
+    time_unit: Scalar,
+) -> Float[Array, "n_samples dim"]:
+    """Return the states of `sample_phase`, integrated in these units, in SI."""
+    state_units, time_unit = lax.stop_gradient((state_units, time_unit))
+    scaled_field = _scale_field(field, state_units, time_unit)
+    start, duration = start / state_units, duration / time_unit
+    return sample_phase(scaled_field, start, duration, n_samples, options) * state_units
+
+
+def _scale_field(field: VectorField, state_units: StateVector, time_unit: Scalar) -> VectorField:
+    rate_factors = time_unit / state_units
+    return lambda y: field(y * state_units) * rate_factors
