@@ -47,6 +47,59 @@ def test_a_solver_that_runs_out_of_steps_is_a_code():
     assert int(result.solver_steps) >= vrw.StepOptions().max_solver_steps
 
 
+N_RESTING = 64
+"""Random wheels on gentle slopes, some of which come to rest."""
+
+
+def draw_wheels_on_gentle_slopes():
+    draw = np.random.default_rng(1).uniform
+    box = {
+        "damping": (400.0, 2000.0), "stiffness": (900.0, 1500.0), "natural_length": (0.95, 1.05),
+        "slope": (0.06, 0.11), "leg_mass": (0.2, 2.0),
+    }  # fmt: skip
+    params = vrw.WheelParams(**{name: draw(*ends, N_RESTING) for name, ends in box.items()})
+    limits = (0.0, 0.3), (0.4, 1.2), (-1.0, 0.0)
+    return params, np.stack([draw(*ends, N_RESTING) for ends in limits], 1)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-10])
+def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
+    params, starts = draw_wheels_on_gentle_slopes()
+    options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
+    lanes, diffrax = (
+        np.asarray(vrw.step_batch(params, starts, options=options, engine=engine).outcome)
+        for engine in ("lanes", "diffrax")
+    )
+    np.testing.assert_array_equal(lanes, diffrax)
+    assert np.sum(lanes == Outcome.CAME_TO_REST) >= 5
+    assert not np.any(lanes == Outcome.SOLVER_FAILED)
+
+
+def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight():
+    """Reference: statics, the sum of both feet's forces against gravity in the slope's frame."""
+    vectors, start = OUTCOME_CASES[Outcome.CAME_TO_REST]
+    params = truth.make_wheel(vectors[0])
+    for engine in ("lanes", "diffrax"):
+        options = vrw.StepOptions(engine=engine)
+        trace = vrw.ViscoelasticWheel().sample_step(params, jnp.asarray(start), options, 2)
+        tangential, normal = np.asarray(trace.forces)[0, -1].reshape(2, 2).sum(0)
+        weight = 9.81 * (10.0 + 8.0 * 0.53)
+        assert tangential == pytest.approx(-weight * np.sin(0.1), rel=1e-6)
+        assert normal == pytest.approx(weight * np.cos(0.1), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_wheels_with_unilateral_contact_come_to_rest_alike_by_both_engines():
+    """A foot's slide and the rolling may end together; rounding must not decide the outcome."""
+    params, starts = draw_wheels_on_gentle_slopes()
+    ground, options = vrw.UnilateralWheel(friction=0.7), vrw.StepOptions(engine="diffrax")
+    lanes = np.asarray(vrw.step_batch(params, starts, 8, model=ground).outcome)
+    walk_one = lambda p, x: vrw.walk(p, x, 8, model=ground, options=options).outcome
+    diffrax = jax.jit(jax.vmap(walk_one, (params.in_axes, 0)))(params, jnp.asarray(starts))
+    np.testing.assert_array_equal(lanes, diffrax)
+    assert np.sum(lanes == Outcome.CAME_TO_REST) > 5
+
+
 @pytest.mark.parametrize(
     "start", [[np.nan, 1.6, -0.1], [0.1, np.inf, -0.1], [0.1, -1.0, -0.1], [2.0, 1.0, 0.0]], ids=str
 )

@@ -43,6 +43,12 @@ OUTCOME_CASES = {
         [-0.33, 5.4, -1.989],
     ),
     Outcome.LEG_1_LIFTED_OFF: (make_parameter_rows(), [0.1027, 6.0, -0.109]),
+    Outcome.CAME_TO_REST: (
+        make_parameter_rows(
+            damping=508.0, stiffness=1229.0, natural_length=0.962, slope=0.1, leg_mass=0.53
+        ),
+        [0.207, 0.824, -0.659],
+    ),
     Outcome.BAD_INPUT: (make_parameter_rows(damping=np.nan), TABLE_1_SECTION_STATE),
 }
 """Of each outcome a wheel and a start that end so."""

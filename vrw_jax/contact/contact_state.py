@@ -1,5 +1,6 @@
 """Motion of the wheel between events, and the guards of the next event."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ from vrw_jax.contact.mechanics import (
     sum_over_legs,
 )
 from vrw_jax.numerics import Elementwise, Scalar
-from vrw_jax.wheel import Symbols, compute_own_units
+from vrw_jax.wheel import Symbols, compute_own_units, is_at_rest, is_still
 
 PackedState = Float[Array, "dim ..."]
 """Hub (x, z, theta) and rates, lengths, rates of lengths, then the accumulators: see
@@ -303,6 +304,36 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     position_units = [units.length, units.length, one, *[units.length] * s.n]
     rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
     return jnp.stack(position_units), jnp.stack(rate_units)
+
+
+def is_wheel_at_rest(
+    s: Symbols, rates: Array, accelerations: Iterable[Array], atol: Elementwise
+) -> Bool[Array, "..."]:
+    """Return whether the wheel is at rest, from the rates and accelerations of all coordinates."""
+    rate_units, time_unit = compute_state_units(s)[1], compute_own_units(s).time
+    return is_at_rest(rates, accelerations, rate_units, time_unit, atol)
+
+
+def choose_stopping_guard(
+    layout: GuardLayout,
+    dynamics: ModeDynamics,
+    rates: Array,
+    guard: Int[Array, "..."],
+    atol: Elementwise,
+) -> Int[Array, "..."]:
+    """Return the end of a foot's slide instead of the end of rolling if both end together.
+
+    Rounding decides which of the two vanishes first. The friction of the stopped foot then decides
+    whether the wheel rests or falls back.
+    """
+    slip_signs = slip_sign(dynamics.contact)
+    has_just_slid = dynamics.slots.gather_flags(dynamics.contact_state.has_just_slid)
+    is_stopping = guard == layout.rolling_rate
+    is_stopping &= is_still(rates, compute_state_units(dynamics.s)[1], atol)
+    for slot in reversed(range(2)):
+        slide_ends = is_stopping & (slip_signs[slot] != 0.0) & ~has_just_slid[slot]
+        guard = jnp.where(slide_ends, layout.slip_stop + slot, guard)
+    return guard
 
 
 def compute_packed_units(s: Symbols) -> PackedState:

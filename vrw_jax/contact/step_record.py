@@ -28,7 +28,7 @@ from vrw_jax.contact.section import FullState, pack_section_state
 from vrw_jax.measures import STOPPER_MARGIN_MEASURES
 from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
-from vrw_jax.wheel import Outcome, Symbols
+from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 
 
 @dataclass(frozen=True)
@@ -161,16 +161,19 @@ def interval_outcome(
     guard: Array,
     has_landed: Array,
     failure: Array,
+    is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
     """Return STEPPED if the walk continues from the guard or the foremost foot `has_landed`.
 
-    If the interval ended at no event, the result is `failure`.
+    If the interval ended at no event, the result is `failure`. CAME_TO_REST replaces either if
+    the wheel `is_resting`.
     """
     code = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
     code = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, code)
     code = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, code)
-    return jnp.where(is_at_event, jnp.where(has_landed, Outcome.STEPPED, code), failure)
+    code = jnp.where(is_at_event, jnp.where(has_landed, Outcome.STEPPED, code), failure)
+    return replace_rest_outcome(code, is_resting)
 
 
 class StepDetails(NamedTuple):

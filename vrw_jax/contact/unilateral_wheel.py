@@ -11,17 +11,19 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.contact.batch_integrator import is_at_singularity
+from vrw_jax.contact.batch_integrator import is_at_singularity, pack_coordinates
 from vrw_jax.contact.contact_modes import Friction
 from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
     GuardLayout,
     PackedState,
+    choose_stopping_guard,
     compute_forces,
     compute_packed_units,
     guard_scales,
     guard_values,
+    is_wheel_at_rest,
     make_guard_layout,
     make_mode_dynamics,
     min_stopper_force,
@@ -475,11 +477,15 @@ def _advance_to_event(
     failure = jnp.where(
         is_valid, jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, failure), outcome
     )
-    has_event = is_valid & (end.guard >= 0) & ~is_singular
-    has_landed = has_event & (end.guard == layout.foremost_landing)
-    outcome = interval_outcome(
-        counters, layout, has_event, end.guard, has_landed, failure, max_events
-    )
+    end_motion, end_solution = unpack_state(end.state)[0], end_forces[1].solution
+    rates = lax.stop_gradient(pack_coordinates(end_motion)[1])
+    accelerations = lax.stop_gradient([*end_solution.hub, *end_solution.lengths])
+    guard = choose_stopping_guard(layout, dynamics, rates, end.guard, options.atol)
+    is_resting = is_wheel_at_rest(dynamics.s, rates, accelerations, options.atol)
+    has_event = is_valid & (guard >= 0) & ~is_singular
+    has_landed = has_event & (guard == layout.foremost_landing)
+    arguments = counters, layout, has_event, guard, has_landed, failure
+    outcome = interval_outcome(*arguments, is_resting, max_events)
     details, log = loop_state.details, loop_state.log
     if details is not None:
         details = record_event(details, loop_state.counters.n_events == 0, result, event)
@@ -497,7 +503,7 @@ def _advance_to_event(
     return _EventLoopState(
         state=end.state,
         contact_state=result.contact_state,
-        guard=end.guard,
+        guard=guard,
         outcome=outcome.astype(jnp.int32),
         is_running=(outcome == Outcome.STEPPED) & ~has_landed,
         counters=counters,

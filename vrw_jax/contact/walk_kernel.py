@@ -29,7 +29,9 @@ from vrw_jax.contact.contact_state import (
     Accumulators,
     ContactState,
     ModeDynamics,
+    choose_stopping_guard,
     compute_forces,
+    is_wheel_at_rest,
     make_guard_layout,
     make_mode_dynamics,
     min_stopper_force,
@@ -221,12 +223,17 @@ class BatchWalk(NamedTuple):
         """Return the stopped lanes after their events, or at the end of their walk."""
         interval, layout = lane.interval, make_guard_layout(self.n, self.is_one_sided)
         s, friction = self.unpack_columns(columns)
+        dynamics_before = self.make_dynamics(columns, interval.contact_state)
+        rates = lax.stop_gradient(interval.point.v)
+        accelerations = lax.stop_gradient(interval.point.dynamics_rows[: len(rates)])
+        is_resting = is_wheel_at_rest(s, rates, accelerations, self.options.atol)
+        guard_arguments = layout, dynamics_before, rates, interval.guard, self.options.atol
+        interval = interval._replace(guard=choose_stopping_guard(*guard_arguments))
         counters = add_interval(
             lane.counters, interval.contact_state, interval.time, interval.n_solver_steps
         )
         details, accumulators = lane.details, lane.accumulators
         if details is not None and accumulators is not None and interval.accumulated is not None:
-            dynamics_before = self.make_dynamics(columns, interval.contact_state)
             details = record_stopper_force(
                 details, dynamics_before, motion_from_point(interval.point), interval.time
             )
@@ -234,7 +241,7 @@ class BatchWalk(NamedTuple):
         at_event = interval.status == LaneStatus.EVENT
         has_landed = at_event & (interval.guard == layout.foremost_landing)
         arguments = counters, layout, at_event, interval.guard, has_landed, interval.status
-        outcome = interval_outcome(*arguments, self.max_events).astype(jnp.int32)
+        outcome = interval_outcome(*arguments, is_resting, self.max_events).astype(jnp.int32)
         n_stepped = lane.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         ended_lane = LaneState(interval, counters, details, accumulators, n_stepped, outcome)

@@ -90,6 +90,7 @@ OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
     Outcome.EVENT_ORDER_MISMATCH: ("other order of events", "#BABABA"),
     Outcome.BRANCH_ENDS_BEFORE_TARGET: ("branch ends on the way", "#454545"),
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
+    Outcome.CAME_TO_REST: ("came to rest", "#8C6D31"),
 }
 """Label and color of each outcome."""
 

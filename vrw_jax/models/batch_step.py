@@ -312,7 +312,7 @@ def run_batch_phases(
             engine_carry=_PhaseCarry(end.next_dt, active, end.is_unfinished),
         )
 
-    return run_phases(run, params, x, stop_at_lift_off, with_batched_jvp(land))
+    return run_phases(run, params, x, options, stop_at_lift_off, with_batched_jvp(land))
 
 
 def can_use_lanes(options: StepOptions) -> bool:

@@ -20,7 +20,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import Elementwise, Vector, sine_cosine, tree_where
+from vrw_jax.numerics import Elementwise, StepOptions, Vector, sine_cosine, tree_where
 from vrw_jax.wheel import (
     AbstractPhase,
     Landing,
@@ -32,6 +32,7 @@ from vrw_jax.wheel import (
     WheelParams,
     dynamics,
     make_phases,
+    replace_rest_outcome,
     transitions,
 )
 
@@ -74,6 +75,7 @@ def run_phases(
     run: PhaseRunner,
     params: WheelParams,
     x: StateValues,
+    options: StepOptions,
     stop_at_lift_off: bool,
     land: Callable[..., Landing] = transitions.land,
 ) -> PhaseSequenceResult:
@@ -107,9 +109,11 @@ def run_phases(
             motion = previous_phase.reset_map(motion)
         start = phase.own_coordinates(theta, motion)
         end = run(phase, *start, is_active, ends[-1] if ends else None)
-        outcome_code = jnp.where(
-            is_active, phase.outcome_of_guard(end.guard, end.is_timed_out), outcome_code
-        )
+        outcome_of_end = phase.outcome_of_guard(end.guard, end.is_timed_out)
+        if phase.can_come_to_rest:
+            is_resting = phase.is_at_rest(end.q, end.v, options.atol)
+            outcome_of_end = replace_rest_outcome(outcome_of_end, is_resting)
+        outcome_code = jnp.where(is_active, outcome_of_end, outcome_code)
         starts.append(start)
         ends.append(end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.

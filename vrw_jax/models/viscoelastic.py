@@ -183,7 +183,7 @@ class ViscoelasticWheel(AbstractWheel):
                 end.minima if records_margins else None,
             )
 
-        return run_phases(run_phase, params, tuple(x), self.stop_at_lift_off)
+        return run_phases(run_phase, params, tuple(x), options, self.stop_at_lift_off)
 
 
 @functools.cache

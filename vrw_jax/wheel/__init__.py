@@ -37,5 +37,6 @@ from vrw_jax.wheel.phases import (
     SingleSupport1,
     make_phases,
 )
+from vrw_jax.wheel.rest import is_at_rest, is_still, replace_rest_outcome
 from vrw_jax.wheel.transitions import Landing
 from vrw_jax.wheel.units import OwnUnits, compute_own_units, compute_own_units_of_rows

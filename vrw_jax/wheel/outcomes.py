@@ -46,3 +46,4 @@ class Outcome(StatusCode):
     PAINLEVE_PARADOX = (
         15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
     )  # fmt: skip
+    CAME_TO_REST = 17, "The wheel came to rest: it neither rolls on nor falls back."

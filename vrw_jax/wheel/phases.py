@@ -13,6 +13,7 @@ import functools
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.numerics import Elementwise, Vector, sine_cosine
@@ -28,6 +29,7 @@ from vrw_jax.wheel.geometry import (
 )
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.rest import is_at_rest
 from vrw_jax.wheel.units import compute_own_units
 
 SHARED_FAILURES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
@@ -74,6 +76,8 @@ class AbstractPhase(abc.ABC):
 
     A margin that is zero there by construction does not count.
     """
+    can_come_to_rest: ClassVar[bool] = False
+    """Whether the phase contains a stable equilibrium of the wheel."""
     has_stiff_start: ClassVar[bool] = False
     """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays at
     once."""
@@ -211,6 +215,13 @@ class AbstractPhase(abc.ABC):
             code = jnp.where(guard == index, jnp.int32(meaning), code)
         return jnp.where(timed_out, jnp.int32(Outcome.NO_TOUCHDOWN_IN_TIME), code)
 
+    def is_at_rest(self, q: Vector, v: Vector, atol: Elementwise) -> Bool[Array, "..."]:
+        """Return whether the wheel is at rest at these coordinates and rates."""
+        q, v = lax.stop_gradient((q, v))
+        acceleration = self.acceleration(self.motion_at(q, v))[: self.n_dof]
+        time_unit = compute_own_units(self.s).time
+        return is_at_rest(v, acceleration, self.coordinate_units[self.n_dof :], time_unit, atol)
+
     @classmethod
     def own_coordinates(cls, theta: Elementwise, motion: Motion) -> tuple[Vector, Vector]:
         """Return the phase's own coordinates and rates of a motion."""
@@ -254,6 +265,7 @@ class DoubleSupport(AbstractPhase):
     """DLS, over theta: the hub moves on a circle until the rear foot lifts off (Section 3.3.1)."""
 
     name, n_dof = "DLS", 1
+    can_come_to_rest = True
     guard_outcomes = (
         Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
     )  # fmt: skip

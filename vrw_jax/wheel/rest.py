@@ -1,0 +1,65 @@
+"""Whether a wheel whose step has ended without a touchdown is at rest.
+
+Rounding decides by which guard the step of such a wheel ends, or whether any guard ends it. The
+outcome therefore depends on the state at the end, and is the same from every engine.
+"""
+
+import functools
+import operator
+from collections.abc import Iterable, Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from vrw_jax.numerics import Elementwise
+from vrw_jax.wheel.outcomes import Outcome
+
+OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
+"""Outcomes by which the step of a wheel at rest may end."""
+
+MAX_REST_SPEED = 1e-8
+"""Largest speed of a wheel at rest, in own units. Chosen because it is a thousand times the error
+of a solver step at the default tolerances."""
+REST_SPEED_PER_ATOL = 10.0
+"""Factor of the absolute tolerance that also bounds that speed. Chosen because the errors of solver
+steps stay below one tolerance."""
+MAX_REST_ACCELERATION = 1e-4
+"""Largest acceleration of a wheel at rest, in own units. Chosen between the errors of the
+accelerations of stiff legs, below 1e-5, and the accelerations of wheels that fall back, near 1."""
+
+
+def is_still(
+    rates: Iterable[Elementwise], rate_units: Iterable[Elementwise], atol: Elementwise
+) -> Bool[Array, "..."]:
+    """Return whether no coordinate moves, to the accuracy of the solver steps."""
+    max_speed = jnp.maximum(MAX_REST_SPEED, REST_SPEED_PER_ATOL * atol)
+    return _are_bounded(rates, rate_units, max_speed)
+
+
+def is_at_rest(
+    rates: Iterable[Elementwise],
+    accelerations: Iterable[Elementwise],
+    rate_units: Sequence[Elementwise] | Array,
+    time_unit: Elementwise,
+    atol: Elementwise,
+) -> Bool[Array, "..."]:
+    """Return whether the wheel is at rest, from the rates and accelerations of its coordinates."""
+    max_acceleration = MAX_REST_ACCELERATION / time_unit
+    return is_still(rates, rate_units, atol) & _are_bounded(
+        accelerations, rate_units, max_acceleration
+    )
+
+
+def _are_bounded(
+    values: Iterable[Elementwise], units: Iterable[Elementwise], limit: Elementwise
+) -> Bool[Array, "..."]:
+    conditions = [jnp.abs(x) <= limit * unit for x, unit in zip(values, units, strict=True)]
+    return functools.reduce(operator.and_, conditions)
+
+
+def replace_rest_outcome(
+    outcome: Int[Array, "..."], is_resting: Bool[Array, "..."]
+) -> Int[Array, "..."]:
+    """Return the outcomes of a step's end, with CAME_TO_REST for wheels that are at rest."""
+    may_rest = functools.reduce(operator.or_, [outcome == code for code in OUTCOMES_AT_REST])
+    return jnp.where(may_rest & is_resting, jnp.int32(Outcome.CAME_TO_REST), outcome)
