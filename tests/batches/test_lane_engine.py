@@ -506,3 +506,21 @@ def test_a_stiff_wheel_with_an_unexpectedly_long_phase_uses_an_implicit_solver()
     assert list(batch_result.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
     _, code = compute_values(vectors[1:], starts[1:], options)
     assert code[0] == Outcome.FELL_BACK
+
+
+@pytest.mark.slow
+def test_a_wheel_too_stiff_for_derivatives_gets_a_code_and_zeros():
+    """Reference: the codes of the values, and the derivatives of the other wheels alone."""
+    params = vrw.WheelParams(
+        damping=np.array([200.0, 1e5, 180.0]), leg_mass=np.array([1.0, 1e-2, 1.0])
+    )
+    starts, names = np.tile(vrw.paper_start(), (3, 1)), ("section_state", "damping")
+    result = vrw.step_batch(params, starts, derivatives=names)
+    np.testing.assert_array_equal(result.outcome, vrw.step_batch(params, starts).outcome)
+    assert result.outcome.tolist() == [Outcome.STEPPED, Outcome.FELL_BACK, Outcome.STEPPED]
+    alone = jax.tree.map(lambda x: x[::2] if jnp.ndim(x) else x, params)
+    expected = vrw.step_batch(alone, starts[::2], derivatives=names)
+    for name in names:
+        columns = result.derivatives[name].section_state
+        np.testing.assert_array_equal(columns[::2], expected.derivatives[name].section_state)
+        assert not columns[1].any()

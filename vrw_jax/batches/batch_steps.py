@@ -470,9 +470,39 @@ def _step_by_diffrax(
     """Take one step by the model's own step under `jax.vmap`; see `_BatchEngine.take_step`."""
     options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
     rows = np.concatenate([wheels, states, *(row[None] for row in next_slopes)]).T
-    step_rows = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
-    results = map_in_batches(step_rows, (batch_sizes.DIFFRAX_BATCH_SIZE,), rows)
-    return jax.tree.map(lambda x: np.array(x).T, results)
+
+    def step_rows(rows: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]) -> Any:
+        step = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
+        results = map_in_batches(step, (batch_sizes.DIFFRAX_BATCH_SIZE,), rows)
+        return jax.tree.map(lambda x: np.array(x).T, results)
+
+    def differentiate_rows(rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the step with derivatives; these are zeros for elements without them.
+
+        diffrax raises for the whole batch if the linear equations of an implicit solver's
+        derivative cannot be solved for one element. That element is isolated by bisection.
+        """
+        try:
+            results: tuple[np.ndarray, ...] = step_rows(rows, options, input_indices)
+        except eqx.EquinoxRuntimeError:
+            *values, n_solver_steps = step_rows(rows, options.with_derivative_tolerances(), ())
+            outcome = values[2]
+            jacobian = np.zeros((len(input_indices), 6, len(rows)), wheels.dtype)
+            results = (*values, n_solver_steps, jacobian)
+            has_stepped = np.flatnonzero(outcome == Outcome.STEPPED)
+            if len(has_stepped) < len(rows):
+                parts = [has_stepped]
+            elif len(rows) > 1:
+                parts = np.array_split(has_stepped, 2)
+            else:
+                parts, outcome[:] = [], Outcome.SOLVER_FAILED
+            for part in (part for part in parts if len(part)):
+                own_results = differentiate_rows(rows[part])
+                for all_values, own_values in zip(results, own_results, strict=True):
+                    all_values[..., part] = own_values
+        return results
+
+    return differentiate_rows(rows) if input_indices else step_rows(rows, options, ())
 
 
 @eqx.filter_jit
