@@ -142,3 +142,21 @@ def test_under_vmap_a_finer_mesh_finds_that_orbit_from_each_point(ten_step_orbit
     cycles = jax.vmap(find)(np.stack(ten_step_orbit_points))
     assert np.all(np.asarray(cycles.outcome) == vrw.Outcome.STEPPED)
     assert np.abs(cycles.section_state - np.stack(ten_step_orbit_points)).max() < 1e-7
+
+
+@pytest.mark.parametrize(
+    "model", [None, vrw.RigidWheel(), vrw.UnilateralWheel()], ids=lambda m: type(m).__name__
+)
+def test_a_batch_of_no_wheels_has_no_cycles(model):
+    empty = vrw.WheelParams(damping=np.zeros(0))
+    result = vrw.limit_cycles(empty, model=model)
+    one = vrw.limit_cycles(vrw.WheelParams(damping=np.full(1, np.nan)), model=model)
+    assert jax.tree.structure(result) == jax.tree.structure(one)
+    shapes = [leaf.shape for leaf in jax.tree.leaves(result)]
+    assert shapes == [(0, *leaf.shape[1:]) for leaf in jax.tree.leaves(one)]
+    assert result.found.shape == (0,)
+
+
+def test_vmap_over_no_wheels_has_no_cycles():
+    empty = vrw.WheelParams(damping=np.zeros(0))
+    assert jax.vmap(vrw.limit_cycle, in_axes=(empty.in_axes,))(empty).found.shape == (0,)

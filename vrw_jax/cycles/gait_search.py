@@ -225,6 +225,12 @@ def limit_cycles(
             return find_attracting_gaits(finder, finder.model.parameter_values(params)[None])[1]
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
+    if shape == (0,):
+        invalid = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
+        one_missing = limit_cycles(
+            invalid, period_n=period_n, model=model, options=options, which=which
+        )
+        return take_rows(one_missing, slice(0, 0))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
     single_params = jax.tree.map(lambda x: x[0], params)
     finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))

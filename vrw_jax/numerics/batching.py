@@ -30,13 +30,15 @@ def unbatch(function: BatchFunction) -> BatchFunction:
     @batched_function.def_vmap
     @with_default_settings
     def merge_axis(axis_size: int, is_batched_tree: PyTree, *arrays: PyTree) -> tuple:
+        n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
+
         def merge(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             transposed = jnp.moveaxis(x, 0, -2)
-            return transposed.reshape(*transposed.shape[:-2], -1)
+            return transposed.reshape(*transposed.shape[:-2], axis_size * n_lanes)
 
         def split(x: Array) -> Array:
-            return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, -1), -2, 0)
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
         outputs = batched_function(*jax.tree.map(merge, arrays, tuple(is_batched_tree)))
         return jax.tree.map(split, outputs), jax.tree.map(lambda _: True, outputs)
