@@ -47,6 +47,15 @@ def test_a_solver_that_runs_out_of_steps_is_a_code():
     assert int(result.solver_steps) >= vrw.StepOptions().max_solver_steps
 
 
+@pytest.mark.parametrize("engine", ["lanes", "diffrax"])
+@pytest.mark.parametrize("model", [None, vrw.UnilateralWheel()], ids=lambda m: type(m).__name__)
+def test_a_step_without_touchdown_ends_at_the_time_limit(model, engine):
+    options = vrw.StepOptions(max_phase_time=0.15, engine=engine)
+    result = vrw.step(vrw.WheelParams(), vrw.paper_start(), model=model, options=options)
+    assert int(result.outcome) == Outcome.NO_TOUCHDOWN_IN_TIME
+    assert float(result.durations[0]) == pytest.approx(0.15, abs=1e-15)
+
+
 N_RESTING = 64
 """Random wheels on gentle slopes, some of which come to rest."""
 

@@ -446,7 +446,12 @@ def integrator_step(
     length_factor = jnp.where(
         needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
     )
-    next_h = jnp.where(search.is_active | has_crossed, event.next_h, h * length_factor)
+    # The last step ends at the time limit.
+    limit = options.max_phase_time
+    end_time = jnp.where(is_accepted & (h == limit - state.time), limit, state.time + h)
+    reached_time = jnp.where(is_accepted, end_time, state.time)
+    integrating_h = jnp.minimum(h * length_factor, limit - reached_time)
+    next_h = jnp.where(search.is_active | has_crossed, event.next_h, integrating_h)
 
     time_shift = jnp.where(has_arrived, event.time_shift, 0.0)
     end = IntervalPoint(
@@ -458,9 +463,9 @@ def integrator_step(
     accumulated = state.accumulated
     if accumulated is not None and attempt.accumulated is not None:
         accumulated = accumulated + jnp.where(is_taken, attempt.accumulated, 0.0)
-    time = jnp.where(is_taken, state.time + h + time_shift, state.time)
-    is_late = is_accepted & (time >= options.max_phase_time)
-    is_late = is_late | (has_arrived & (time > options.max_phase_time))
+    time = jnp.where(is_taken, end_time + time_shift, state.time)
+    is_late = is_accepted & (time >= limit)
+    is_late = is_late | (has_arrived & (time > limit))
     is_stuck = (next_search.n_iterations >= options.max_event_iterations) | (
         state.n_solver_steps + 1 >= options.max_solver_steps
     )

@@ -492,7 +492,8 @@ def _classify_step(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return status, crossing guards, acceptance, time and next length of each element.
 
-    A dip that would not advance the time does not delay the element.
+    A dip that would not advance the time does not delay the element. The last step ends at the time
+    limit.
     """
     is_running = integrator_state.status == IntegrationStatus.RUNNING
     is_kept = is_running & ~is_rejected
@@ -501,11 +502,11 @@ def _classify_step(
         crossing_bits = crossing_bits | jnp.where(value <= 0.0, 1 << index, 0)
     has_crossed = is_kept & (crossing_bits > 0)
     is_accepted = is_kept & ~has_crossed
-    time = jnp.where(
-        is_accepted, integrator_state.time + integrator_state.dt, integrator_state.time
-    )
-    next_length = integrator_state.dt * length_factor
-    has_timed_out = is_accepted & (time >= options.max_phase_time)
+    dt, time, limit = integrator_state.dt, integrator_state.time, options.max_phase_time
+    end_time = jnp.where(dt == limit - time, limit, time + dt)
+    time = jnp.where(is_accepted, end_time, time)
+    next_length = jnp.minimum(dt * length_factor, limit - time)
+    has_timed_out = is_accepted & (time >= limit)
     is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
         time + next_length == time
     )
@@ -520,7 +521,7 @@ def _classify_step(
         jnp.where(is_running, crossing_bits, integrator_state.crossing_bits),
         is_accepted,
         time,
-        jnp.where(is_running & ~has_crossed, next_length, integrator_state.dt),
+        jnp.where(is_running & ~has_crossed, next_length, dt),
     )
 
 
