@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.cycles import gait_search
 from vrw_jax.cycles.gait_search import FALLBACK_OPTIONS
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
@@ -160,3 +161,11 @@ def test_a_batch_of_no_wheels_has_no_cycles(model):
 def test_vmap_over_no_wheels_has_no_cycles():
     empty = vrw.WheelParams(damping=np.zeros(0))
     assert jax.vmap(vrw.limit_cycle, in_axes=(empty.in_axes,))(empty).found.shape == (0,)
+
+
+@pytest.mark.parametrize("leg_mass", [1e-4, 1e-6, 1e-8])
+def test_a_search_takes_no_walks_by_an_implicit_solver(leg_mass, monkeypatch):
+    """Such walks take minutes. The search ends with a code instead; a call of None would fail."""
+    monkeypatch.setattr(gait_search, "step_batch", None)
+    cycle = vrw.limit_cycle(vrw.WheelParams(leg_mass=leg_mass))
+    assert vrw.Outcome(int(cycle.outcome)) in gait_search.RETRY_OUTCOMES

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vrw_jax.batches import step_batch
+from vrw_jax.batches import SolverIndex, select_solver, step_batch
 from vrw_jax.cycles.attracting_gaits import (
     ATTRACTING_GAIT_OPTIONS,
     compute_fallback_starts,
@@ -402,12 +402,18 @@ def _walk_from_all_starts(
 ) -> _WalkResults:
     """Return the walks that repeat best, from all starts of the wheels that need one.
 
-    A guess that nearly repeats replaces the walks of its wheel.
+    A guess that nearly repeats replaces the walks of its wheel. Wheels too stiff for explicit
+    solvers do not walk, because the walks of one such wheel would take minutes by an implicit
+    solver.
     """
+    solver_index = select_solver(np.asarray(stack_parameters(params)), StepOptions())
+    is_wanted = is_wanted & (solver_index != SolverIndex.IMPLICIT)
     n_wheels = len(is_wanted)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
     if guess_states is not None and is_wanted.any():
-        smallest_defect = _measure_period_defect(finder, params, guess_states)
+        smallest_defect[is_wanted] = _measure_period_defect(
+            finder, _take_rows_on_device(params, is_wanted), guess_states[is_wanted]
+        )
         section_states = guess_states.copy()
     indices = np.flatnonzero(is_wanted & (smallest_defect >= options.max_walk_defect))
     for compute_starts in (compute_walk_starts, compute_fallback_starts):
