@@ -156,39 +156,6 @@ def test_settings_are_stored_under_the_names_of_version_0_1() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["ViscoelasticWheel", "UnilateralWheel", "LadderWheel"])
-def test_the_two_stability_margins_of_version_0_1_are_distinguished(
-    tmp_path: Path, kind: str
-) -> None:
-    """There `stability_margin` was labelled 1 - rho, and was that with unilateral contact alone."""
-    radius, rung = np.array([0.5, 0.9]), np.array([1, 2], np.int8)
-    held_values = np.where(rung == 1, 0.123, 1.0 - radius)
-    label = {"symbol": "1 - ρ", "units": "1"}
-    xr.Dataset(
-        {
-            "spectral_radius": ("damping", radius),
-            "rung": ("damping", rung),
-            "stability_margin": ("damping", held_values, label),
-            "outcome": ("damping", np.zeros(2, np.int8)),
-            scan_store.LEGACY_MARKS_NAME: ("chunk", [1]),
-        },
-        {"damping": [100.0, 200.0]},
-        {scan_store.MANIFEST_ATTRIBUTE: {"model": {"kind": kind}}, "coordinates": "damping"},
-    ).to_zarr(tmp_path / "old", zarr_format=3, consolidated=False)
-    solution = open_scan(tmp_path / "old")
-    if kind == "ViscoelasticWheel":
-        np.testing.assert_array_equal(solution.stability_margin, held_values)
-        assert "spectral_margin" not in solution
-        assert solution.stability_margin.attrs["symbol"] != "1 - ρ"
-        return
-    np.testing.assert_array_equal(solution.spectral_margin, 1.0 - radius)
-    assert solution.spectral_margin.attrs["symbol"] == "1 - ρ"
-    if kind == "UnilateralWheel":
-        assert "stability_margin" not in solution
-    else:
-        np.testing.assert_array_equal(solution.stability_margin, [0.123, np.nan])
-
-
 KILLED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -43,21 +43,6 @@ def complete_store(tmp_path: Path) -> Path:
     return tmp_path / "s.zarr"
 
 
-def make_legacy_store(complete_store: Path) -> None:
-    """Makes a store what it would have been then: marks in sight, no digest, metadata apart."""
-    shutil.rmtree(complete_store / "bookkeeping")
-    root = json.loads((complete_store / "zarr.json").read_text())
-    del root["consolidated_metadata"], root["attributes"]["asked"]
-    for name in ("scan", "provenance"):
-        root["attributes"][name] = json.loads(root["attributes"][name])
-    (complete_store / "zarr.json").write_text(json.dumps(root))
-    n = make_plan().layout.n_chunks
-    done = zarr.open_group(complete_store, mode="r+").create_array(
-        "chunk_done", shape=(n,), chunks=(1,), dtype="u1", fill_value=0, dimension_names=("chunk",)
-    )
-    done[:] = 1
-
-
 # Damage
 
 DAMAGE_CASES = {
@@ -147,25 +132,6 @@ def test_a_damaged_chunk_is_not_recomputed_by_other_code(
     monkeypatch.setattr(planning, "source_digest", lambda: "other")
     with pytest.raises(ValueError, match=r"lacks 1 of 5 chunks \(1 of them damaged\)"):
         run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
-
-
-@pytest.mark.parametrize("what", [None, *DAMAGE_CASES])
-def test_a_store_of_version_0_1_opens_and_its_damage_is_found(
-    complete_store: Path, what: str | None
-) -> None:
-    before = open_scan(complete_store).load()
-    make_legacy_store(complete_store)
-    if what is None:
-        after = open_scan(complete_store).load()
-        xr.testing.assert_identical(
-            before.rename({SCANNED_MEASURES[2]: "d_dls_fraction_d_damping"}).drop_attrs(),
-            after.drop_attrs(),
-        )
-        assert run_plan(make_plan(), complete_store, evaluate=CountingEngine(1)).attrs["scan"]
-        return
-    DAMAGE_CASES[what](complete_store / "speed" / CHUNK_FILE)
-    with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\)"):
-        open_scan(complete_store)
 
 
 # Reading

@@ -4,7 +4,7 @@ A chunk's mark is the digest of the scan's settings, the chunk's number and the 
 variables. A mark means that the chunk is written, and it reveals a damaged, truncated, deleted or
 moved file. The attributes of the group of marks list the scan's variables, so that others are
 ignored, and repeat the store's attributes. In stores without that list a mark is the digest of the
-files alone. In stores of version 0.1 it is a 1, and a chunk is intact if it can be read.
+files alone.
 """
 
 from __future__ import annotations
@@ -20,16 +20,12 @@ import numpy as np
 
 from vrw_jax.scans.design import digest_columns
 from vrw_jax.scans.measure_catalog import get_variable_attrs, parse_derivative
-from vrw_jax.wheel import Outcome
 
 ZarrGroup = Any
 """A Zarr group; only the module `store` imports zarr."""
 
 MANIFEST_ATTRIBUTE = "scan"
 """Name of the attribute that holds the settings of a scan."""
-
-LEGACY_MARKS_NAME = "chunk_done"
-"""Name of the array of marks in a store of version 0.1."""
 
 CHECKSUM_GROUP_NAME = "bookkeeping"
 """Name of the group of marks, which is hidden from users of the store."""
@@ -120,7 +116,7 @@ class StoredMetadata:
             return sorted(self.mark_attrs[VARIABLES_KEY])
         manifest = read_manifest(self.attrs)
         measures, swept = manifest.get("measures", []), manifest.get("design", {}).get("swept", [])
-        excluded = (*self.coordinates, *swept, LEGACY_MARKS_NAME)
+        excluded = (*self.coordinates, *swept)
         return sorted(n for n in names if n not in excluded and (n in measures or _is_measure(n)))
 
     def find_damaged(self) -> list[str]:
@@ -192,8 +188,7 @@ class ChunkChecksums:
 
     def __init__(self, path: Path, group: ZarrGroup, metadata: StoredMetadata) -> None:
         self._path, self._group, self._metadata = path, group, metadata
-        self._is_legacy = LEGACY_MARKS_NAME in group
-        self._marks = group[LEGACY_MARKS_NAME if self._is_legacy else CHECKSUM_ARRAY_NAME]
+        self._marks = group[CHECKSUM_ARRAY_NAME]
         names = [name for name, _ in group.arrays()]
         self._arrays = {name: group[name] for name in metadata.select_variables(names)}
         outcome = self._arrays["outcome"]
@@ -209,9 +204,7 @@ class ChunkChecksums:
 
     def mark_chunk(self, index: int) -> None:
         """Mark a chunk as written, with the digest of its files."""
-        self._marks[index : index + 1] = (
-            1 if self._is_legacy else self._compute_chunk_digest(index)[None]
-        )
+        self._marks[index : index + 1] = self._compute_chunk_digest(index)[None]
 
     def find_damaged_chunks(self) -> list[int]:
         """Return the chunks that are marked but whose files differ from what was written.
@@ -220,11 +213,7 @@ class ChunkChecksums:
         written the files.
         """
         marks = np.asarray(self._marks[:])
-        is_intact = (
-            self._is_readable
-            if self._is_legacy
-            else lambda i: bool((self._compute_chunk_digest(i) == marks[i]).all())
-        )
+        is_intact = lambda i: bool((self._compute_chunk_digest(i) == marks[i]).all())
         return [int(i) for i in np.flatnonzero(_are_marks_set(marks)) if not is_intact(int(i))]
 
     def find_damaged_coordinates(self) -> list[str]:
@@ -277,22 +266,6 @@ class ChunkChecksums:
                 data = b"none"  # Zarr writes no file if all values of a chunk are missing.
             digest.update(f"{name} {len(data)} ".encode() + data)
         return np.frombuffer(digest.digest(), np.uint8)
-
-    def _is_readable(self, index: int) -> bool:
-        """Return whether every variable of a chunk can be read and holds numbers for each gait."""
-        chunk_indices = self._chunk_indices(index)
-        try:
-            variables = {name: array.blocks[chunk_indices] for name, array in self._arrays.items()}
-        except READ_ERRORS:
-            return False
-        outcome = np.asarray(variables.pop("outcome"))
-        has_gait = outcome == Outcome.STEPPED
-        is_lost = []
-        for name, variable in variables.items():
-            values = variable[has_gait]
-            has_no_number = values.size and bool(np.all(np.isnan(values) | (values == -1)))
-            is_lost.append(has_no_number and not self._chunk_file(name, index).exists())
-        return bool(np.all(outcome >= 0)) and not any(is_lost)
 
 
 def _are_marks_set(marks: np.ndarray) -> np.ndarray:

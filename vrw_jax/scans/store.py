@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from vrw_jax.measures import MEASURES
 from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.integrity import (
@@ -31,7 +30,6 @@ from vrw_jax.scans.integrity import (
     CHECKSUM_GROUP_NAME,
     COORDINATES_KEY,
     DIGEST_SIZE_BYTES,
-    LEGACY_MARKS_NAME,
     MANIFEST_ATTRIBUTE,
     METADATA_FILE_NAME,
     VARIABLES_KEY,
@@ -44,7 +42,6 @@ from vrw_jax.scans.integrity import (
     store_lock,
 )
 from vrw_jax.scans.measure_catalog import canonicalize_name
-from vrw_jax.selection import ModelCode
 from vrw_jax.validation import check_type
 
 if TYPE_CHECKING:
@@ -321,9 +318,7 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
             "it wrote, and delete others without dimension names."
         ) from error
     dataset = dataset.assign_attrs({k: v for k, v in metadata.attrs.items() if k != "coordinates"})
-    return _arrange_as_requested(
-        _split_legacy_stability_margin(dataset.drop_vars(LEGACY_MARKS_NAME, errors="ignore"))
-    )
+    return _arrange_as_requested(dataset)
 
 
 RECOMPUTE_REMEDY = (
@@ -375,32 +370,6 @@ def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
     return dataset[list(order)].rename(
         {n: requested_names[n] for n in requested_names if n != requested_names[n]}
     )
-
-
-def _split_legacy_stability_margin(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a store of version 0.1 with its two stability margins named apart.
-
-    The name `stability_margin` meant the smooth Jury margin for the paper's wheel, and 1 - spectral
-    radius with unilateral contact.
-    """
-    legacy_margin = dataset.get("stability_margin")
-    if (
-        legacy_margin is None
-        or legacy_margin.attrs.get("symbol") != MEASURES["spectral_margin"].symbol
-    ):
-        return dataset
-    smooth_attrs, plain_attrs = (MEASURES[n].attrs for n in ("stability_margin", "spectral_margin"))
-    kind = read_manifest(dataset.attrs)["model"]["kind"]
-    if kind == "ViscoelasticWheel":
-        return dataset.assign(stability_margin=legacy_margin.assign_attrs(smooth_attrs))
-    radius = dataset["spectral_radius"].astype(legacy_margin.dtype)
-    dataset = dataset.assign(spectral_margin=(1.0 - radius).assign_attrs(plain_attrs))
-    if kind == "UnilateralWheel":
-        return dataset.drop_vars("stability_margin")
-    paper_margin = legacy_margin.where(dataset["rung"] == ModelCode.VISCOELASTIC).assign_attrs(
-        smooth_attrs
-    )
-    return dataset.assign(stability_margin=paper_margin)
 
 
 def _read_scan_metadata(path: Path) -> StoredMetadata:
