@@ -99,6 +99,27 @@ def test_a_walk_reaches_a_gait_with_very_short_single_support():
     assert np.abs(batch_result.section_state[0] - cycle.section_state).max() < 1e-8
 
 
+@pytest.mark.parametrize(
+    ("n_legs", "damping", "stiffness", "natural_length", "slope", "state"),
+    [(5, 36.09, 845.4, 1.0281, 0.1435, (0.5661, 2.2441, 0.2098))],
+)  # fmt: skip
+def test_gaits_of_few_legs_that_only_fast_walks_reach_are_found(
+    n_legs, damping, stiffness, natural_length, slope, state
+):
+    """The states are the ends of walks of 200 steps from a grid of starts."""
+    params = vrw.WheelParams(
+        n_legs=n_legs, damping=damping, stiffness=stiffness, natural_length=natural_length,
+        slope=slope,
+    )  # fmt: skip
+    cycle = vrw.limit_cycle(params)
+    assert int(cycle.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(cycle.section_state, state, atol=1e-4)
+    # On the first mesh the search from the walk finds a cycle that the mesh does not resolve.
+    from_walk = vrw.limit_cycle(params, guess=jnp.asarray(state))
+    assert int(from_walk.outcome) == vrw.Outcome.STEPPED
+    np.testing.assert_allclose(from_walk.section_state, cycle.section_state, atol=1e-8)
+
+
 def test_gaits_of_a_finer_mesh_have_accurate_derivatives():
     period = lambda slope: vrw.limit_cycle(vrw.WheelParams(slope=slope)).period
     value_at, step = 0.12, 1e-6
