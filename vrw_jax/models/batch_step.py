@@ -323,8 +323,8 @@ def can_use_lanes(options: StepOptions) -> bool:
     is_explicit = load_explicit_tableau(options.solver) is not None
     if options.engine == "lanes" and not (is_explicit and simd.is_available()):
         raise ValueError(
-            f"engine is 'lanes', which needs a CPU and an explicit solver, but the solver is "
-            f"{options.solver} on a {jax.default_backend()}: take engine='diffrax'."
+            "engine is 'lanes', which needs a CPU, llvmlite and an explicit solver, but the solver "
+            f"is {options.solver} on a {jax.default_backend()}: take engine='diffrax'."
         )
     return is_explicit and simd.is_available() and options.engine != "diffrax"
 

@@ -7,9 +7,9 @@ its result, and the operands' values; it returns the result's value.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import llvmlite.ir as ir
 import numpy as np
 
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import I32, NUMBER_TYPES, Value, ValueEmitter
 
 FUSED_FLAGS = ("contract",)

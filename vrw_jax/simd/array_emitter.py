@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import llvmlite.ir as ir
 import numpy as np
 
 from vrw_jax.simd.arithmetic import emit_elementwise
@@ -26,6 +25,7 @@ from vrw_jax.simd.lazy_arrays import (
     PendingUpdate,
     Uninitialized,
 )
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import I64, NUMBER_TYPES, Value, ValueEmitter
 
 LANE_AXIS_SENTINEL = 1021

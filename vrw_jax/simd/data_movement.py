@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import llvmlite.ir as ir
 import numpy as np
 
 from vrw_jax.simd.arithmetic import convert_value
@@ -24,6 +23,7 @@ from vrw_jax.simd.lazy_arrays import (
     TransposedView,
     Uninitialized,
 )
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JaxprLowering
 from vrw_jax.simd.value_emitter import I64, Value
 

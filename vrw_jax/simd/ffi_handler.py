@@ -1,25 +1,55 @@
 """The machine-code function that XLA calls through its foreign function interface (FFI)."""
 
+import functools
+import re
+from pathlib import Path
 from typing import Any
 
-import llvmlite.ir as ir
+import jax
 
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import I8, I32, I64
 
 HANDLER_NAME = "handler"
 
+METADATA_EXTENSION_TYPE = 1
+"""Type of the extension by which XLA requests the metadata of a handler, from the same header."""
 
-def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, width: int) -> None:
+
+@functools.cache
+def read_api_version() -> tuple[int, int]:
+    """Return the version of the call interface in the installed header of XLA.
+
+    It is (0, 0), which XLA refuses, if the header is missing or has another form.
+    """
+    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    try:
+        text = header.read_text(encoding="utf-8")
+    except OSError:
+        return 0, 0
+    numbers = dict(re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", text))
+    return int(numbers.get("MAJOR", 0)), int(numbers.get("MINOR", 0))
+
+
+def add_handler(
+    module: ir.Module,
+    kernel: ir.Function,
+    n_in: int,
+    n_out: int,
+    width: int,
+    api_version: tuple[int, int],
+) -> None:
     """Add `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`, which calls the kernel, to the module.
 
-    Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends.
+    Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends. If
+    XLA requests the metadata, the handler reports `api_version`, for which it is compiled.
     """
     pointer = ir.PointerType()
     handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER_NAME)
     handler.attributes.add("nounwind")
     build = ir.IRBuilder(handler.append_basic_block("entry"))
-    metadata_block, execute_block = (
-        handler.append_basic_block(name) for name in ("metadata", "execute")
+    extension_block, metadata_block, execute_block = (
+        handler.append_basic_block(name) for name in ("extension", "metadata", "execute")
     )
     frame, null = handler.args[0], ir.Constant(pointer, None)
 
@@ -30,12 +60,17 @@ def add_handler(module: ir.Module, kernel: ir.Function, n_in: int, n_out: int, w
         return build.load(field_address(base, offset), typ=kind)
 
     extension = load_field(frame, 8)
-    build.cbranch(build.icmp_unsigned("==", extension, null), execute_block, metadata_block)
-    # XLA requests the version of the interface: return the caller's version.
+    has_extension = build.icmp_unsigned("!=", extension, null)
+    build.cbranch(has_extension, extension_block, execute_block)
+    build.position_at_end(extension_block)
+    is_metadata = build.icmp_unsigned(
+        "==", load_field(extension, 8, I32), ir.Constant(I32, METADATA_EXTENSION_TYPE)
+    )
+    build.cbranch(is_metadata, metadata_block, execute_block)
     build.position_at_end(metadata_block)
-    metadata, version = load_field(extension, 24), field_address(load_field(frame, 16), 16)
-    for field in (16, 20):
-        build.store(load_field(version, field, I32), field_address(metadata, 8 + field))
+    metadata = load_field(extension, 24)
+    for field, number in zip((24, 28), api_version, strict=True):
+        build.store(ir.Constant(I32, number), field_address(metadata, field))
     build.ret(null)
     build.position_at_end(execute_block)
 

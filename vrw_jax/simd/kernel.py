@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import llvmlite.ir as ir
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.simd.array_emitter import (
@@ -14,8 +13,9 @@ from vrw_jax.simd.array_emitter import (
     has_lanes,
     lane_axis_error,
 )
-from vrw_jax.simd.ffi_handler import add_handler
+from vrw_jax.simd.ffi_handler import add_handler, read_api_version
 from vrw_jax.simd.lazy_arrays import ArrayValue, EntryIndex, LazyArray
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JaxprLowering
 from vrw_jax.simd.rules import PRIMITIVE_RULES
 from vrw_jax.simd.value_emitter import I1, I8, I64, NUMBER_TYPES, Value, ValueEmitter
@@ -63,7 +63,7 @@ def write_module(
 
     arrays.loop_over_range(begin, end, emit_group)
     build.ret_void()
-    add_handler(module, kernel, len(inputs), len(outputs), width)
+    add_handler(module, kernel, len(inputs), len(outputs), width, read_api_version())
     return str(module)
 
 

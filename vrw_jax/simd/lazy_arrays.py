@@ -6,9 +6,9 @@ Those that compute hold the `ArrayEmitter` that they belong to.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import llvmlite.ir as ir
 import numpy as np
 
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import Value
 
 EntryIndex = tuple[Any, ...]

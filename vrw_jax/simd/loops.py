@@ -4,8 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import llvmlite.ir as ir
-
 from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
@@ -19,6 +17,7 @@ from vrw_jax.simd.lazy_arrays import (
     TransposedView,
     as_shared,
 )
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering
 from vrw_jax.simd.value_emitter import I64, Value
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import llvmlite.ir as ir
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
@@ -17,6 +16,7 @@ from vrw_jax.simd.array_emitter import (
     split_arrays,
 )
 from vrw_jax.simd.lazy_arrays import ArrayValue, as_shared
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import Value, ValueEmitter
 
 PrimitiveRule = Callable[["JaxprLowering", Any, list[ArrayValue]], list[ArrayValue]]

@@ -2,12 +2,13 @@
 
 import ctypes
 import functools
+import platform
 import struct
 import sys
 from enum import IntEnum
 from typing import Any
 
-import llvmlite.binding as llvm
+from vrw_jax.simd.llvm_library import has_llvm, llvm
 
 OPTIMIZATION_LEVEL = 2
 """LLVM's optimization level for register allocation and instruction scheduling."""
@@ -41,7 +42,12 @@ class ElfSectionKind(IntEnum):
 
 @functools.cache
 def describe_processor() -> tuple[str, str, str]:
-    """Return the target of machine code: target triple, processor, and its features."""
+    """Return the target of machine code: target triple, processor, and its features.
+
+    Without llvmlite it is the kind of machine alone.
+    """
+    if not has_llvm:
+        return platform.machine(), "", ""
     features = llvm.get_host_cpu_features().flatten()
     return llvm.get_process_triple(), llvm.get_host_cpu_name(), features
 
@@ -85,7 +91,7 @@ def compile_wasm(text: str, entry_point: str, name: str) -> bytes:
     return _emit_object(module, machine)
 
 
-def _emit_object(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
+def _emit_object(module: "llvm.ModuleRef", machine: "llvm.TargetMachine") -> bytes:
     """Return object code of a module after the passes in `LLVM_PASSES`."""
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     passes = llvm.create_new_module_pass_manager()
@@ -138,7 +144,7 @@ class LoadedCode:
         return make(self.address(name), None, None)
 
 
-def _make_target_machine() -> llvm.TargetMachine:
+def _make_target_machine() -> "llvm.TargetMachine":
     """Return the target machine of this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -8,6 +8,7 @@ store contains.
 """
 
 import ctypes
+import functools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.simd import fallback
 from vrw_jax.simd.array_emitter import DEFAULT_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
 from vrw_jax.simd.code_cache import (
     CodeStore,
@@ -27,6 +29,7 @@ from vrw_jax.simd.code_cache import (
 )
 from vrw_jax.simd.ffi_primitive import LOADED_BY_NAME, MACHINE_CODE_PRIMITIVE, register_code
 from vrw_jax.simd.kernel import KERNEL_NAME, write_module
+from vrw_jax.simd.llvm_library import has_llvm
 from vrw_jax.simd.machine import LoadedCode, compile_wasm, has_512_bit_vectors
 
 LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
@@ -36,8 +39,29 @@ GROUPS_PER_TASK = 64
 
 
 def is_available() -> bool:
-    """Return whether machine code is available for JAX's backend, which must be the CPU."""
-    return jax.default_backend() == "cpu"
+    """Return whether machine code is available.
+
+    It needs llvmlite, the CPU as JAX's backend, and a release of JAX with which it works.
+    """
+    if not has_llvm or jax.default_backend() != "cpu" or fallback.is_disabled():
+        return False
+    return fallback.is_tested_release() or _can_call_machine_code()
+
+
+@functools.cache
+def _can_call_machine_code() -> bool:
+    """Return whether XLA calls a small program of machine code and gets its results."""
+    increment = compile_lane_function(lambda x: x + 1.0, lambda x: x, "interface check", None)
+    with jax.ensure_compile_time_eval():
+        try:
+            results = jax.jit(increment)(jnp.arange(3.0))
+        except Exception as error:  # whatever XLA or LLVM raises
+            fallback.disable(error)
+            return False
+        if results.tolist() != [1.0, 2.0, 3.0]:
+            fallback.disable("XLA calls it in another way")
+            return False
+    return True
 
 
 def compile_lane_program(
@@ -65,7 +89,11 @@ def compile_lane_program(
         tuple(jax.ShapeDtypeStruct((), kind) for kind in scalar_dtypes),
         (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), dtype),) * n_lanes_in,
     )
-    return _LaneProgram(get_machine_code(function, shapes, key, width, store, limits), width)
+    try:
+        return _LaneProgram(get_machine_code(function, shapes, key, width, store, limits), width)
+    except Exception as error:
+        _require_untested_release(error)
+    return _compile_with_xla(function)
 
 
 def compile_wasm_object(
@@ -130,7 +158,13 @@ def compile_lane_function(
         flat_function = lambda *leaves: jax.tree.leaves(
             function(*jax.tree.unflatten(structure, leaves))
         )
-        code = get_machine_code(flat_function, shapes, (key, str(structure)), width, store, limits)
+        try:
+            code = get_machine_code(
+                flat_function, shapes, (key, str(structure)), width, store, limits
+            )
+        except Exception as error:
+            _require_untested_release(error)
+            return function(*arrays)
         if n_missing:
             pad_with_last = lambda x: jnp.concatenate(
                 [x, jnp.repeat(x[..., -1:], n_missing, -1)], -1
@@ -144,6 +178,19 @@ def compile_lane_function(
         return jax.tree.unflatten(result_structure, [x[..., :n_lanes] for x in results])
 
     return call_machine_code
+
+
+def _require_untested_release(error: Exception) -> None:
+    """Raise the error on a tested release of JAX; otherwise, use XLA from now on."""
+    if fallback.is_tested_release():
+        raise error
+    fallback.disable(error)
+
+
+def _compile_with_xla(function: Callable[..., tuple]) -> Callable[..., list[np.ndarray]]:
+    """Return `function(scalars, lanes)` of numpy arrays, compiled by XLA."""
+    compiled = jax.jit(function)
+    return lambda scalars, lanes: [np.asarray(x) for x in compiled(tuple(scalars), tuple(lanes))]
 
 
 def ensure_loaded(names: Sequence[str], store: CodeStore | None) -> bool:

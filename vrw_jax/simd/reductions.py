@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import llvmlite.ir as ir
 import numpy as np
 
 from vrw_jax.simd.arithmetic import emit_elementwise
@@ -18,6 +17,7 @@ from vrw_jax.simd.array_emitter import (
     shape_without_lanes,
 )
 from vrw_jax.simd.lazy_arrays import ArrayValue, EntryIndex, LazyArray
+from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import Value
 
 

@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import llvmlite.ir as ir
+from vrw_jax.simd.llvm_library import ir
 
 Value = Any
 """An LLVM value: a scalar or a vector of lanes."""

@@ -1,0 +1,69 @@
+"""Without llvmlite XLA computes the same, and a request for machine code names the library."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+
+PROGRAM = """
+import json, sys
+sys.modules["llvmlite"] = sys.modules["llvmlite.ir"] = sys.modules["llvmlite.binding"] = None
+import numpy as np
+import vrw_jax as vrw
+from vrw_jax import simd
+vrw.start_jax(sys.argv[1])
+params, start = vrw.WheelParams(), vrw.paper_start()
+wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
+results = {
+    "section_state": vrw.return_map(params, start).tolist(),
+    "period": float(vrw.limit_cycle(params).period),
+    "section_states": vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state.tolist(),
+    "is_available": simd.is_available(),
+}
+for name, call in {
+    "engine": lambda: vrw.step(params, start, engine="lanes"),
+    "program": lambda: simd.compile_lane_program(
+        lambda _, x: (x[0],), [], 1, np.dtype(float), 0, None
+    ),
+}.items():
+    try:
+        call()
+    except (ValueError, ImportError) as error:
+        results[name] = str(error)
+print(json.dumps(results))
+"""
+
+
+def test_the_library_is_imported_without_llvmlite():
+    hide = "import sys; sys.modules.update(dict.fromkeys(('llvmlite', 'llvmlite.ir', "
+    check = hide + "'llvmlite.binding'))); import vrw_jax.simd as s; assert not s.is_available()"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", check], env=environment, check=True)
+
+
+@pytest.mark.slow
+def test_the_library_computes_without_llvmlite():
+    """Reference: the same by machine code, to the tolerance of a step."""
+    cache = os.environ.get("VRW_TEST_CACHE", ".jax_cache")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.run(
+        [sys.executable, "-c", PROGRAM, cache], env=environment, capture_output=True, text=True
+    )
+    assert process.returncode == 0, process.stderr[-2000:]
+    results, params, start = json.loads(process.stdout), vrw.WheelParams(), vrw.paper_start()
+    wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
+    assert_close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
+    assert not results["is_available"]
+    assert_close(results["section_state"], vrw.return_map(params, start))
+    assert_close(results["period"], vrw.limit_cycle(params).period)
+    section_states = vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state
+    assert_close(results["section_states"], section_states)
+    assert "llvmlite" in results["engine"]
+    assert results["program"] == (
+        "machine code needs llvmlite, which is not installed: pip install it."
+    )

@@ -1,0 +1,115 @@
+"""On a release of JAX that was not tried, the library warns once and XLA computes the same."""
+
+import ctypes
+import json
+import os
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+from vrw_jax import simd
+from vrw_jax.simd import ffi_handler, ffi_primitive
+
+PROGRAM = """
+import json, sys, warnings
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from vrw_jax.simd import fallback, kernel, rules
+fallback.LATEST_TESTED_JAX = (0, 1)
+{change}
+import vrw_jax as vrw
+from vrw_jax import simd
+vrw.start_jax(sys.argv[1])
+def double_until_large(x):
+    return lax.while_loop(lambda y: jnp.any(y < 9.0), lambda y: jnp.where(y < 9.0, 2.0 * y, y), x)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    is_available = simd.is_available()
+    run = simd.compile_lane_function(double_until_large, double_until_large, "doubling", None)
+    x = jnp.linspace(1.0, 10.0, 9)
+    in_jit = (jax.jit(run) if is_available else jax.jit(double_until_large))(x).tolist()
+    program = simd.compile_lane_program(
+        lambda _, x: (double_until_large(x[0]),), [], 1, np.dtype(float), "doubling", None
+    )
+    of_arrays = program([], [np.asarray(x)])[0].tolist()
+messages = [str(w.message) for w in caught if "machine code does not work" in str(w.message)]
+print(json.dumps([in_jit, of_arrays, messages, simd.is_available()]))
+"""
+
+CHANGES = {
+    "a primitive is new": 'del rules.PRIMITIVE_RULES["while"]',
+    "the call interface differs": "kernel.read_api_version = lambda: (7, 0)",
+    "nothing differs": "",
+}
+
+
+def run_program(program, folder):
+    """Return the JSON that a program prints in a process of its own."""
+    process = subprocess.run(
+        [sys.executable, "-c", program, str(folder)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stderr[-2000:]
+    return json.loads(process.stdout)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_xla_computes_where_an_untested_jax_differs(change, tmp_path):
+    results = run_program(PROGRAM.format(change=CHANGES[change]), tmp_path)
+    in_jit, of_arrays, messages, is_available = results
+    x = np.linspace(1.0, 10.0, 9)
+    doubled = x * 2.0 ** np.ceil(np.log2(np.maximum(9.0 / x, 1.0)))
+    np.testing.assert_array_equal(in_jit, doubled)
+    np.testing.assert_array_equal(of_arrays, doubled)
+    assert len(messages) == (change != "nothing differs")
+    assert is_available == (change == "nothing differs")
+
+
+WHEEL_PROGRAM = """
+import json, sys, warnings
+import numpy as np
+from vrw_jax.simd import fallback, kernel
+fallback.LATEST_TESTED_JAX = (0, 1)
+kernel.read_api_version = lambda: (7, 0)
+import vrw_jax as vrw
+vrw.start_jax(sys.argv[1])
+warnings.simplefilter("ignore")
+wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
+result = vrw.step_batch(wheels, np.tile(vrw.paper_start(), (2, 1)))
+print(json.dumps(result.section_state.tolist()))
+"""
+
+
+@pytest.mark.slow
+def test_the_library_computes_where_machine_code_cannot_be_called(tmp_path):
+    section_states = run_program(WHEEL_PROGRAM, tmp_path)
+    wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
+    starts = np.tile(vrw.paper_start(), (2, 1))
+    # Both agree to the tolerance of a step.
+    reference = np.asarray(vrw.step_batch(wheels, starts).section_state)
+    np.testing.assert_allclose(section_states, reference, rtol=1e-8, atol=1e-10)
+
+
+def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
+    """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
+    run = simd.compile_lane_function(lambda x: x + 1.0, lambda x: x, "version test", None)
+    np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
+    code = list(ffi_primitive.LOADED_BY_NAME.values())[-1]
+    handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
+        code.address(ffi_handler.HANDLER_NAME)
+    )
+    metadata = (ctypes.c_int64 * 8)()
+    extension = (ctypes.c_int64 * 4)(32, ffi_handler.METADATA_EXTENSION_TYPE, 0)
+    extension[3] = ctypes.addressof(metadata)
+    frame = (ctypes.c_int64 * 32)(0, ctypes.addressof(extension))
+    assert not handler(ctypes.addressof(frame))
+    version = ffi_handler.read_api_version()
+    assert tuple((ctypes.c_int32 * 2).from_buffer(metadata, 24)) == version
+    assert version != (0, 0)
