@@ -230,7 +230,7 @@ def limit_cycles(
         one_missing = limit_cycles(
             invalid, period_n=period_n, model=model, options=options, which=which
         )
-        return take_rows(one_missing, slice(0, 0))
+        return _take_rows_on_device(one_missing, slice(0, 0))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
     single_params = jax.tree.map(lambda x: x[0], params)
     finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
