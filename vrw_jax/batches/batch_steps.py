@@ -468,7 +468,9 @@ def _step_by_diffrax(
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Take one step by the model's own step under `jax.vmap`; see `_BatchEngine.take_step`."""
-    options = jax.tree.map(lambda leaf: np.asarray(leaf, wheels.dtype), options)
+    convert = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, wheels.dtype))
+    tight_options = convert(options.with_derivative_tolerances())
+    options = convert(options)
     rows = np.concatenate([wheels, states, *(row[None] for row in next_slopes)]).T
 
     def step_rows(rows: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]) -> Any:
@@ -485,7 +487,7 @@ def _step_by_diffrax(
         try:
             results: tuple[np.ndarray, ...] = step_rows(rows, options, input_indices)
         except eqx.EquinoxRuntimeError:
-            *values, n_solver_steps = step_rows(rows, options.with_derivative_tolerances(), ())
+            *values, n_solver_steps = step_rows(rows, tight_options, ())
             outcome = values[2]
             jacobian = np.zeros((len(input_indices), 6, len(rows)), wheels.dtype)
             results = (*values, n_solver_steps, jacobian)
