@@ -157,6 +157,9 @@ GAITS = {
     "sensitivities": lambda m: is_successful(
         lambda: vrw.sensitivities(PULLED_WHEEL, measures=("speed",), model=m)
     ),
+    "gait_sensitivity": lambda m: is_successful(
+        lambda: vrw.gait_sensitivity(PULLED_WHEEL, ("period",), model=m)
+    ),
     "continue_branch": lambda m: is_branch_found(
         vrw.continue_branch(PULLED_WHEEL, "stiffness", STIFFNESS_BOUNDS, model=m)
     ),
@@ -199,7 +202,8 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     functions = {name: f for name, f in public.items() if inspect.isfunction(f)}
     taking = {name for name, f in functions.items() if "model" in inspect.signature(f).parameters}
     assert taking - {"return_map"} == set(OUTCOMES) | set(GAITS)
-    measured = {"step_batch", "walk", "simulate", "return_map"}  # tell no margin of friction
+    # These report no margin of friction, or only how it varies.
+    measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
     assert taking - measured == set(FRICTION)
 
 

@@ -98,7 +98,7 @@ def make_shared_programs() -> dict[str, Program]:
         columns, numbers, codes = jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
-    return {"linearised": Program(linearised, 2, N_STEP_INPUTS)}
+    return {"linearised": Program(linearised, 2, simd.RegisterLimits(N_STEP_INPUTS))}
 
 
 def programs(n_legs: int) -> dict[str, Program]:
@@ -182,7 +182,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         )
         (q, v, _), stance = past.interval.point, past.interval.contact_state
         codes = [stance.contact.astype(float), stance.locked.astype(float)]
-        step = walk.compute_result(after)
+        step = walk.compute_result(after, None)
         result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,
             step.energy_damping, step.energy_friction,
@@ -279,7 +279,7 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         return _numbers_of(step), codes, rows
 
     return {
-        "rigid_linearised": Program(linearised, 1, N_STEP_INPUTS),
+        "rigid_linearised": Program(linearised, 1, simd.RegisterLimits(N_STEP_INPUTS)),
         "rigid_told": Program(told, 2),
     }
 

@@ -164,7 +164,9 @@ class WheelParams(AbstractPrintable):
         """Refuse names that no parameter has, before the wheel is made."""
         for name in named_values:
             try:
-                check_parameter_name(name, (*PARAMETER_DOMAINS, "n_legs"), "parameter of the wheel")
+                check_parameter_name(
+                    name, tuple(cls.__dataclass_fields__), "parameter of the wheel"
+                )
             except ValueError as error:
                 raise TypeError(str(error)) from None
         return super().__new__(cls)
