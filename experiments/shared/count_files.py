@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 import vrw_jax as vrw
+from experiments.shared.command import make_parser
 
 LIBRARY = Path(vrw.__file__).parent
 UNCOUNTED_PACKAGES = ("validation", "printing", "runtime", "simd")
@@ -68,11 +69,14 @@ def list_files(call: Callable[[], object]) -> list[str]:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        if sys.argv[1] == "gradient":
+    parser = make_parser(__doc__)
+    parser.add_argument("call", nargs="?", choices=CALLS, help="only this call, in this process")
+    call_name = parser.parse_args().call
+    if call_name:
+        if call_name == "gradient":
             limit_cycle()  # The count is that of what the gradient adds.
-        files = list_files(CALLS[sys.argv[1]])
-        print(f"{sys.argv[1]}: {len(files)} files\n  " + "\n  ".join(files))
+        files = list_files(CALLS[call_name])
+        print(f"{call_name}: {len(files)} files\n  " + "\n  ".join(files))
     else:
         for name in CALLS:
             # Without `vrw.start_jax` there is no cache on disk.
