@@ -162,6 +162,7 @@ def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchSta
         options=options,
         parameter_name=request.parameter_name,
         period_n=request.period_n,
+        n_coordinates=model.n_continuous(params),
         n_legs=params.n_legs,
     )
     values = problem.parameter_values(wheels, request.parameter_values)

@@ -228,22 +228,45 @@ def linearize_with_quantities(
     return unbatch(compile_batched(linearize_trial, make_output_template, cache_key, batch_size=0))
 
 
-class ReturnMapProblem(AbstractGaitProblem):
-    """Continuation problem of fixed points of `period_n` steps of any model.
+class AbstractReturnMapProblem(AbstractGaitProblem):
+    """Continuation problem of fixed points of the return map over `period_n` steps.
 
     z is the section state. Its last entries are codes (see `AbstractWheel.n_continuous`), which are
     those of the image of the last iteration. Newton's method ends only if they are equal.
     """
+
+    period_n: eqx.AbstractVar[int]
+    n_coordinates: eqx.AbstractVar[int]
+
+    @property
+    def n_steps(self) -> int:
+        return self.period_n
+
+    def section_state(self, z: Unknowns) -> SectionVector:
+        return z[: self.n_coordinates]
+
+    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+        return interpolate_states(left, right, fraction, self.n_coordinates)
+
+    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
+        """Return whether the codes of both are the same."""
+        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
+
+    def read_state(
+        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        """Return the section state. The step's measures contain all other quantities."""
+        return z, {}
+
+
+class ReturnMapProblem(AbstractReturnMapProblem):
+    """Continuation problem of a model whose steps JAX differentiates."""
 
     model: AbstractWheel
     options: StepOptions
     parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
-
-    @property
-    def n_steps(self) -> int:
-        return self.period_n
 
     def _image(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
         """Return the section state after `period_n` steps, NaN if one fails."""
@@ -257,42 +280,19 @@ class ReturnMapProblem(AbstractGaitProblem):
         return_map = lambda z, p: self._image(wheel, z, p)
         return arclength.fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
-    def section_state(self, z: Unknowns) -> SectionVector:
-        return z[: self.n_coordinates]
 
-    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
-        return interpolate_states(left, right, fraction, self.n_coordinates)
-
-    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
-        """Whether the codes of both are the same."""
-        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
-
-    def read_state(
-        self, wheel: BranchWheel, z: Unknowns, p: Scalar
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state. The step's measures contain all other quantities."""
-        return z, {}
-
-
-class GroundProblem(AbstractGaitProblem):
-    """Continuation problem with unilateral contact by batched steps, as `ReturnMapProblem`."""
+class GroundProblem(AbstractReturnMapProblem):
+    """Continuation problem with unilateral contact by batched steps."""
 
     model: UnilateralWheel
     options: StepOptions
     parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
+    n_coordinates: int = eqx.field(static=True)
     n_legs: int = eqx.field(static=True)
 
     is_traceable: ClassVar[bool] = False
     has_kinks: ClassVar[bool] = True
-
-    @property
-    def n_steps(self) -> int:
-        return self.period_n
-
-    @property
-    def n_coordinates(self) -> int:
-        return self.model.n_continuous(WheelParams(n_legs=self.n_legs))
 
     def parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
         """Return the model's parameter values of many wheels with the continued parameter at p."""
@@ -325,21 +325,6 @@ class GroundProblem(AbstractGaitProblem):
         correction = np.concatenate([solutions[..., 0], code_changes], 1)
         tangent = np.concatenate([solutions[..., 1], 0.0 * code_changes], 1)
         return NewtonStep(correction, tangent, jnp.asarray(return_jacobian))
-
-    def section_state(self, z: Unknowns) -> SectionVector:
-        return z[: self.n_coordinates]
-
-    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
-        return interpolate_states(left, right, fraction, self.n_coordinates)
-
-    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
-        """Whether the codes of both are the same."""
-        return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
-
-    def read_state(
-        self, wheel: BranchWheel, z: Unknowns, p: Scalar
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        return z, {}
 
     def measure_points(
         self,
