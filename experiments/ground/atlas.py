@@ -154,6 +154,40 @@ def draw() -> None:
     plots.save(figure, FIGURES, "ground_atlas")
 
 
+def draw_branches() -> None:
+    """Draw the branches that turn in a fold, stable gaits solid, and save the figure."""
+    quantities = {
+        "dls_fraction": "DLS fraction",
+        "period": "period [s]",
+        "slip": "slip per step [m]",
+    }
+    rows, (c_fold, mu_fold) = read_table(BRANCHES), folds()
+    figure, axes = plt.subplots(1, 3, figsize=(plots.PAGE_WIDTH_INCHES, 2.8), sharex=True)
+    colors = plt.get_cmap("viridis")(np.linspace(0.0, 0.85, len(c_fold)))
+    for damping, friction_of_fold, color in zip(c_fold, mu_fold, colors, strict=True):
+        gaits = [row for row in rows if row["kind"] == "gait" and float(row["damping"]) == damping]
+        friction, spectral_radius = (
+            read_column(gaits, name) for name in ("friction", "spectral_radius")
+        )
+        turn = int(np.argmin(np.abs(friction - friction_of_fold)))
+        for axis, name in zip(axes, quantities, strict=True):
+            values = read_column(gaits, name)
+            stable_values = np.where(spectral_radius < 1.0, values, np.nan)
+            axis.plot(friction, values, color=color, ls=":", lw=1.2)
+            axis.plot(friction, stable_values, color=color, lw=2.0, label=f"c = {damping:g} N·s/m")
+            axis.plot(friction[turn], values[turn], **FOLD)
+    for axis, label in zip(axes, quantities.values(), strict=True):
+        axis.set(xlabel="friction coefficient $\\mu$", ylabel=label)
+    lines = [
+        *axes[0].get_legend_handles_labels()[0],
+        Line2D([], [], color="black", lw=2.0, label="stable"),
+        Line2D([], [], color="black", ls=":", lw=1.2, label="unstable"),
+        Line2D([], [], **{**FOLD, "linewidth": 0.0}, label="fold"),
+    ]
+    figure.legend(handles=lines, loc="outside lower center", ncols=4)
+    plots.save(figure, FIGURES, "ground_branches")
+
+
 def compute_cell_edges(values: np.ndarray) -> np.ndarray:
     """Of cells around them."""
     middle = 0.5 * (values[1:] + values[:-1])
@@ -167,6 +201,7 @@ def main() -> None:
         compute()
     with plots.figure_style():
         draw()
+        draw_branches()
 
 
 if __name__ == "__main__":

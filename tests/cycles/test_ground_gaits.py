@@ -197,8 +197,8 @@ def test_a_unilateral_branch_turns_at_its_fold_and_returns_unstable():
     )  # fmt: skip
     assert float(branch.dataset.closure.max()) < 1e-8
     (fold,) = (border.value for border in branch.special_points if border.kind == "fold")
-    # By lanes and central differences, which went past it in large steps: a quartic through the
-    # seven gaits next to it, as experiments/ground/branches.py prints it.
+    # Continuation by batched steps and central differences in large steps gives this value: a
+    # quartic through the seven gaits next to the fold.
     assert fold == pytest.approx(0.98186, abs=1e-4)
     turn = int(np.argmin(branch.values))
     assert 0 < turn < branch.values.size - 1
