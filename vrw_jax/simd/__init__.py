@@ -1,4 +1,6 @@
-"""Compilation of JAX traces to machine code with LLVM, for a few lanes per vector."""
+"""Compilation of JAX traces to machine code for CPUs with LLVM. The code computes a group of a few
+lanes (elements of a batch) at a time, in vector registers.
+"""
 
 from vrw_jax.simd import code_cache, ffi_primitive, kernel, machine, program
 from vrw_jax.simd.array_emitter import DEFAULT_LIMITS, RegisterLimits

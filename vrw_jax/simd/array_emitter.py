@@ -1,12 +1,14 @@
 """Arrays of LLVM values: entries in registers, and lazy arrays whose entries are computed on
 access.
 
-An array whose last axis are lanes is, without that axis, an array of LLVM vectors; any other is one
-of scalars. Small arrays are divided into their entries, which live in registers: moving axes,
-slicing and stacking cost nothing. Large arrays are lazy: each entry is computed or loaded on
-access, in a loop over the index. They are stored in memory only where a loop carries them, where a
-long sum ends and where the trace has an `optimization_barrier`. Code therefore stays short and
-compiles fast. No operation may combine lanes, except to test whether any or all of them continue.
+A lane is one element of the batch. An array of the trace whose last axis is that of the lanes
+becomes an array of LLVM vectors without that axis. Any other array becomes one of scalars.
+
+Small arrays are divided into their entries, which live in registers: moving axes, slicing and
+stacking cost nothing. Large arrays are lazy: each entry is computed or loaded on access, in a loop
+over the index. They are stored in memory only if a loop carries them, if a long sum ends, or at an
+`optimization_barrier` of the trace. The code therefore stays short and compiles fast. No operation
+may combine lanes, except the test whether any or all of them continue.
 """
 
 import math
@@ -29,99 +31,114 @@ from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.value_emitter import I64, NUMBER_TYPES, Value, ValueEmitter
 
 LANE_AXIS_SENTINEL = 1021
-"""Length of the lane axis in the trace, by which the axis is recognized; machine code has any
-number of lanes."""
+"""Length of the lane axis in the trace, by which the axis is recognized. The machine code accepts
+any number of lanes.
+"""
 
 
 @dataclass(frozen=True)
 class RegisterLimits:
-    """Sizes up to which arrays are divided into entries in registers.
+    """Largest sizes of arrays whose entries are kept in registers.
 
-    Larger sizes give longer code, which takes longer to compile.
+    Larger limits give longer code, which takes longer to compile.
     """
 
     max_unrolled: int = 8
-    """Most entries of a lazy array that are computed individually."""
+    """Largest number of entries of a lazy array that are computed individually."""
     max_unrolled_terms: int = 8
-    """Most terms of a sum or a reduction that are written one after the other, without a loop."""
+    """Largest number of terms of a sum or a reduction that are emitted one after the other, without
+    a loop.
+    """
     max_registers: int = 32
-    """Most entries of an array that a loop carries in registers, and of a constant without a
-    table."""
+    """Largest number of entries of an array that a loop carries in registers, and of a constant
+    without a table in memory.
+    """
     max_registers_inner: int = 64
-    """Most entries that a loop carries in registers if it contains no loop."""
+    """Largest number of entries that an innermost loop carries in registers."""
 
 
 DEFAULT_LIMITS = RegisterLimits()
 
 
 class PrimitiveCall(NamedTuple):
-    """An equation of a trace with one result."""
+    """An equation of a trace with one result: a primitive, its parameters, and shapes and types."""
 
     name: str
     params: dict[str, Any]
-    in_avals: Sequence[Any]  # of the operands: shape and type
-    out_aval: Any  # of the result
+    in_avals: Sequence[Any]  # shapes and types of the operands
+    out_aval: Any  # shape and type of the result
 
 
 class ArrayEmitter:
-    """Emitter of operations on arrays, into the function of its value emitter."""
+    """Emitter of array operations, which adds LLVM instructions to the function of its value
+    emitter.
+    """
 
     def __init__(
-        self, emitter: ValueEmitter, limits: RegisterLimits, is_unrolled: bool = False
+        self, emitter: ValueEmitter, limits: RegisterLimits, is_in_innermost_loop: bool = False
     ) -> None:
         self.emitter, self.builder, self.limits = emitter, emitter.builder, limits
-        self.kept_alive: list[Any] = []  # objects identified by `id`
-        self.is_unrolled = is_unrolled  # within a loop without inner loops: constants need no table
+        self.objects_kept_alive: list[Any] = []  # objects that are identified by `id`
+        # whether the code is in an innermost loop, where constants need no table
+        self.is_in_innermost_loop = is_in_innermost_loop
 
     def entry_type_of(self, aval: Any) -> ir.Type:
-        """Return the type of the entries of an array of the trace."""
+        """Return the LLVM type of the entries of an array: a vector if the array has lanes, else a
+        scalar.
+        """
         return self.emitter.vector_type(number_type(aval)) if has_lanes(aval) else number_type(aval)
 
-    def emit_constants(self, value: np.ndarray, aval: Any) -> ArrayValue:
-        """Return the numbers of a constant as an array."""
+    def emit_constant_array(self, value: np.ndarray, aval: Any) -> ArrayValue:
+        """Return an array of LLVM constants with the entries of `value`."""
         if LANE_AXIS_SENTINEL in aval.shape:
             raise lane_axis_error("A constant", aval)
-        number = number_type(aval)
-        entries = make_array(value.shape, [self.emitter.constant(number, x) for x in value.ravel()])
-        fits_registers = self.is_unrolled or value.size <= self.limits.max_registers
+        number_type_of_entries = number_type(aval)
+        entries = make_array(
+            value.shape, [self.emitter.constant(number_type_of_entries, x) for x in value.ravel()]
+        )
+        fits_registers = self.is_in_innermost_loop or value.size <= self.limits.max_registers
         return entries if fits_registers else self.make_table(entries)
 
     def get_entries(self, array: ArrayValue) -> np.ndarray:
-        """Return all entries, one by one."""
+        """Return all entries of an array as an array of LLVM values, in its shape."""
         if isinstance(array, np.ndarray):
             return array
         return make_array(array.shape, [self.get_entry(array, i) for i in np.ndindex(array.shape)])
 
     def get_entry(self, array: ArrayValue, index: EntryIndex) -> Value:
-        """Return an entry, which is computed once for each index."""
-        self.kept_alive.append(array)
+        """Return the entry at an index; its instructions are emitted once for each index."""
+        self.objects_kept_alive.append(array)
         if isinstance(array, LazyArray):
             key = ("entry", id(array), *(i if isinstance(i, int) else ("at", id(i)) for i in index))
             return self.emitter.emit_once(key, lambda: array.entry_at(index))
-        # An array with stride 0 along an axis is the same at all its indices.
-        axes = zip(index, array.strides, array.shape, strict=True)
-        index = tuple(0 if step == 0 or length == 1 else i for i, step, length in axes)
-        varying = tuple(i for i in index if not isinstance(i, int))
-        if not varying:
+        # An array with stride 0 along an axis has the same entry at all indices of the axis.
+        index_strides_lengths = zip(index, array.strides, array.shape, strict=True)
+        index = tuple(
+            0 if stride == 0 or length == 1 else i for i, stride, length in index_strides_lengths
+        )
+        varying_index = tuple(i for i in index if not isinstance(i, int))
+        if not varying_index:
             return array[index]
         fixed_index = tuple(i if isinstance(i, int) else slice(None) for i in index)
         table = self.emitter.emit_once(
             ("table", id(array), str(fixed_index)), lambda: self.make_table(array[fixed_index])
         )
-        return self.get_entry(table, varying)
+        return self.get_entry(table, varying_index)
 
     def flatten_entries(self, arrays: Sequence[ArrayValue], avals: Sequence[Any]) -> list[Value]:
-        """Return all entries in a row, with vectors for those that have lanes."""
-        flat: list[Value] = []
+        """Return the entries of all arrays in one list, as vectors if the array has lanes."""
+        flat_values: list[Value] = []
         for array, aval in zip(arrays, avals, strict=True):
             broadcast_entries = np.broadcast_to(
                 self.get_entries(array), shape_without_lanes(aval)
             ).ravel()
-            flat += [self.emitter.splat(x) if has_lanes(aval) else x for x in broadcast_entries]
-        return flat
+            flat_values += [
+                self.emitter.splat(x) if has_lanes(aval) else x for x in broadcast_entries
+            ]
+        return flat_values
 
     def linear_index(self, index: EntryIndex, shape: Sequence[int]) -> Value:
-        """Return the offset of an entry among all, row after row."""
+        """Return the offset of an entry in memory, in entries; the last axis varies fastest."""
         stride, constant_offset = math.prod(shape), 0
         offset: Value = None
         for i, length in zip(index, shape, strict=True):
@@ -142,29 +159,34 @@ class ArrayEmitter:
     def loop_over_indices(
         self,
         shape: Sequence[int],
-        body: Callable[[EntryIndex, list[Value]], Sequence[Value]],
+        emit_body: Callable[[EntryIndex, list[Value]], Sequence[Value]],
         carry: Sequence[Value] = (),
     ) -> list[Value]:
-        """Emit loops over all indices of `shape`: `carry = body(index, carry)`."""
+        """Emit nested loops over all indices of `shape`, and return the last `carry`.
 
-        def nest(index: EntryIndex, carry: Sequence[Value]) -> Sequence[Value]:
+        Each iteration is `carry = emit_body(index, carry)`.
+        """
+
+        def emit_nested_loops(index: EntryIndex, carry: Sequence[Value]) -> Sequence[Value]:
             if len(index) == len(shape):
-                return body(index, list(carry))
+                return emit_body(index, list(carry))
             if shape[len(index)] == 1:
-                return nest((*index, 0), carry)
-            run_nested = lambda i, carry: nest((*index, i), carry)
-            return self.loop_n_times(shape[len(index)], run_nested, carry)
+                return emit_nested_loops((*index, 0), carry)
+            emit_inner_loop = lambda i, carry: emit_nested_loops((*index, i), carry)
+            return self.loop_n_times(shape[len(index)], emit_inner_loop, carry)
 
-        return list(nest((), carry))
+        return list(emit_nested_loops((), carry))
 
     def loop_n_times(
         self,
         length: int,
-        body: Callable[[Value, list[Value]], Sequence[Value]],
+        emit_body: Callable[[Value, list[Value]], Sequence[Value]],
         carry: Sequence[Value],
     ) -> list[Value]:
-        """Emit `for i in range(length): carry = body(i, carry)`."""
-        return self.loop_over_range(ir.Constant(I64, 0), ir.Constant(I64, length), body, carry)
+        """Emit `for i in range(length): carry = emit_body(i, carry)`, and return the last
+        `carry`.
+        """
+        return self.loop_over_range(ir.Constant(I64, 0), ir.Constant(I64, length), emit_body, carry)
 
     def loop_over_range(
         self,
@@ -173,23 +195,31 @@ class ArrayEmitter:
         emit_body: Callable[[Value, list[Value]], Sequence[Value]],
         carry: Sequence[Value] = (),
     ) -> list[Value]:
-        """Emit `for i in range(begin, end): carry = emit_body(i, carry)`."""
+        """Emit `for i in range(begin, end): carry = emit_body(i, carry)`, and return the last
+        `carry`.
+        """
 
-        def body(state: list[Value]) -> list[Value]:
-            next_carry = emit_body(state[0], state[1:])
-            return [self.builder.add(state[0], ir.Constant(I64, 1)), *next_carry]
+        def body(loop_values: list[Value]) -> list[Value]:
+            next_carry = emit_body(loop_values[0], loop_values[1:])
+            return [self.builder.add(loop_values[0], ir.Constant(I64, 1)), *next_carry]
 
-        condition = lambda state: self.builder.icmp_signed("<", state[0], end)
-        return self.emitter.emit_loop([begin, *carry], condition, body)[1:]
+        emit_condition = lambda loop_values: self.builder.icmp_signed("<", loop_values[0], end)
+        return self.emitter.emit_loop([begin, *carry], emit_condition, body)[1:]
 
-    def allocate(self, shape: Sequence[int], kind: ir.Type) -> MemoryArray:
-        """Return memory that is allocated once, at the start of the function."""
+    def allocate(self, shape: Sequence[int], entry_type: ir.Type) -> MemoryArray:
+        """Return an array of this shape in memory, which is allocated once, at the start of the
+        function.
+        """
         with self.builder.goto_entry_block():
-            base = self.builder.alloca(kind, ir.Constant(I64, max(1, math.prod(shape))))
-        return MemoryArray(self, shape, kind, base)
+            base_pointer = self.builder.alloca(
+                entry_type, ir.Constant(I64, max(1, math.prod(shape)))
+            )
+        return MemoryArray(self, shape, entry_type, base_pointer)
 
     def fill_memory(self, memory: MemoryArray, array: ArrayValue) -> None:
-        """Store all initialized entries."""
+        """Emit stores of all initialized entries of `array` into `memory`, which has the same
+        shape.
+        """
         if isinstance(array, Uninitialized):
             return
         if isinstance(array, PendingUpdate):
@@ -208,36 +238,45 @@ class ArrayEmitter:
         self.loop_over_indices(memory.shape, store_entry)
 
     def materialize(self, array: ArrayValue) -> MemoryArray:
-        """Return the array with all entries computed and stored, so that an LLVM index can access
-        them.
+        """Return the array with all entries computed and stored in memory, where an LLVM value can
+        index them.
         """
         if isinstance(array, MemoryArray):
             return array
         if isinstance(array, LazyArray):
             entry_type = array.entry_type
-        else:  # a vector if any entry is one
-            types = [x.type for x in array.ravel()]
-            entry_type = next((t for t in types if isinstance(t, ir.VectorType)), types[0])
+        else:  # The type is a vector if any entry is one.
+            entry_types = [x.type for x in array.ravel()]
+            entry_type = next(
+                (
+                    candidate_type
+                    for candidate_type in entry_types
+                    if isinstance(candidate_type, ir.VectorType)
+                ),
+                entry_types[0],
+            )
         memory = self.allocate(array.shape, entry_type)
         self.fill_memory(memory, array)
         return memory
 
     def make_table(self, array: np.ndarray) -> MemoryArray:
-        """Return entries in memory, so that an LLVM index can access them; constants are stored in
-        the program.
+        """Return the array in memory, where an LLVM value can index its entries; constants are
+        stored in the program.
         """
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
             return self.materialize(array)
-        number = array.ravel()[0].type
-        kind = ir.ArrayType(number, array.size)
+        element_type = array.ravel()[0].type
+        table_type = ir.ArrayType(element_type, array.size)
         module = self.builder.module
-        table = ir.GlobalVariable(module, kind, module.get_unique_name("table"))
-        table.initializer = ir.Constant(kind, list(array.ravel()))
+        table = ir.GlobalVariable(module, table_type, module.get_unique_name("table"))
+        table.initializer = ir.Constant(table_type, list(array.ravel()))
         table.global_constant, table.linkage = True, "internal"
-        return MemoryArray(self, array.shape, number, table)
+        return MemoryArray(self, array.shape, element_type, table)
 
     def emit_elementwise(self, call: PrimitiveCall, values: Sequence[ArrayValue]) -> ArrayValue:
-        """Emit an elementwise primitive."""
+        """Emit an elementwise primitive for arrays of values, and return the array of its
+        results.
+        """
         name, params, in_avals, out_aval = call
         shape, in_dtype = shape_without_lanes(out_aval), in_avals[0].dtype
         if not shape and all(isinstance(x, np.ndarray) and not x.shape for x in values):
@@ -261,21 +300,25 @@ class ArrayEmitter:
         # Along an axis on which no operand varies, the entry is computed once and repeated.
         is_varying_axes = (any(x.strides[axis] for x in values) for axis in range(len(shape)))  # type: ignore[union-attr]
         varying_part = (*(slice(None if is_varying else 1) for is_varying in is_varying_axes), ...)
-        parts = [x[varying_part] for x in values]  # type: ignore[index]
-        entries = zip(*(x.ravel() for x in parts), strict=True)
-        results = make_array(parts[0].shape, [emit_entry(operands) for operands in entries])
+        varying_operands = [x[varying_part] for x in values]  # type: ignore[index]
+        entries = zip(*(x.ravel() for x in varying_operands), strict=True)
+        results = make_array(
+            varying_operands[0].shape, [emit_entry(operands) for operands in entries]
+        )
         return np.broadcast_to(results, shape)
 
     def reshape_if_needed(
         self, array: ArrayValue, shape: tuple[int, ...], is_needed: bool
     ) -> ArrayValue:
-        """Return the array in another shape if `is_needed`, else the array itself."""
+        """Return the array reshaped to `shape` if `is_needed`, else the array itself."""
         return self.reshape_array(array, shape) if is_needed else array
 
     def broadcast_array(
         self, array: ArrayValue, shape: tuple[int, ...], axes: Sequence[int]
     ) -> ArrayValue:
-        """Return the array with its axes at these positions of `shape`."""
+        """Return the array broadcast to `shape`; `axes` are the positions of its axes in that
+        shape.
+        """
         lengths = array.shape
         if lengths == shape and tuple(axes) == tuple(range(len(shape))):
             return array
@@ -292,13 +335,15 @@ class ArrayEmitter:
         return LazyArray(shape, array.entry_type, entry_at)
 
     def reshape_array(self, array: ArrayValue, shape: tuple[int, ...]) -> ArrayValue:
-        """Return an array with the same entries in the same order."""
+        """Return the array reshaped to `shape`, with the same entries in the same order."""
         if array.shape == shape:
             return array
         if isinstance(array, np.ndarray):
             return array.reshape(shape)
         if isinstance(array, MemoryArray):
-            return MemoryArray(self, shape, array.entry_type, array.base, array.is_overwritable)
+            return MemoryArray(
+                self, shape, array.entry_type, array.base_pointer, array.is_overwritable
+            )
         old_shape = array.shape
 
         def entry_at(index: EntryIndex) -> Value:
@@ -310,16 +355,16 @@ class ArrayEmitter:
                 )
             old_index: list[Any] = []
             for length in old_shape[:0:-1]:
-                size = ir.Constant(I64, length)
-                old_index.append(0 if length == 1 else self.builder.urem(offset, size))
-                offset = offset if length == 1 else self.builder.udiv(offset, size)
+                axis_length = ir.Constant(I64, length)
+                old_index.append(0 if length == 1 else self.builder.urem(offset, axis_length))
+                offset = offset if length == 1 else self.builder.udiv(offset, axis_length)
             return self.get_entry(array, (0 if old_shape[0] == 1 else offset, *old_index[::-1]))
 
         old_axes = [i for i, length in enumerate(old_shape) if length > 1]
         new_axes = [i for i, length in enumerate(shape) if length > 1]
         if [old_shape[i] for i in old_axes] == [
             shape[i] for i in new_axes
-        ]:  # only axes of length 1 differ
+        ]:  # The shapes differ only by axes of length 1.
 
             def entry_at(index: EntryIndex) -> Value:
                 index_by_axis = dict(zip(old_axes, (index[i] for i in new_axes), strict=True))
@@ -330,34 +375,34 @@ class ArrayEmitter:
         return LazyArray(shape, array.entry_type, entry_at)
 
     def shift_index(self, i: Any, start: int, step: int = 1) -> Any:
-        """Return start + step * i."""
+        """Return the index start + step * i."""
         if isinstance(i, int):
             return start + step * i
         i = i if step == 1 else self.builder.mul(i, ir.Constant(I64, step))
         return i if start == 0 else self.builder.add(i, ir.Constant(I64, start))
 
-    def clamp_index(self, i: Value, last: int) -> Value:
-        """Return the nearest index from 0 to `last`."""
-        build, zero, end = self.builder, ir.Constant(I64, 0), ir.Constant(I64, last)
-        i = build.select(build.icmp_signed("<", i, zero), zero, i)
-        return build.select(build.icmp_signed(">", i, end), end, i)
+    def clamp_index(self, i: Value, last_index: int) -> Value:
+        """Emit the index from 0 to `last_index` that is nearest to `i`, and return it."""
+        builder, zero, end = self.builder, ir.Constant(I64, 0), ir.Constant(I64, last_index)
+        i = builder.select(builder.icmp_signed("<", i, zero), zero, i)
+        return builder.select(builder.icmp_signed(">", i, end), end, i)
 
-    def add_indices(self, index: EntryIndex, begin: EntryIndex) -> EntryIndex:
-        """Return the sum of two indices."""
+    def add_indices(self, index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
+        """Return the sum of two indices, axis by axis."""
 
         def add_index(i: Any, j: Any) -> Any:
             if isinstance(j, int):
                 return self.shift_index(i, j)
             return self.shift_index(j, i) if isinstance(i, int) else self.builder.add(i, j)
 
-        return tuple(add_index(i, j) for i, j in zip(index, begin, strict=True))
+        return tuple(add_index(i, j) for i, j in zip(index, offset_index, strict=True))
 
     def make_zero(self, entry_type: ir.Type) -> Value:
-        """Return a zero as the start of a sum, which is not simplified like a known
-        constant zero.
+        """Return the zero from which a sum starts; unlike a known constant zero, it is not
+        simplified away.
         """
-        number = entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
-        value = ir.Constant(number, 0.0 if isinstance(number, _FLOAT_TYPES) else 0)
+        element_type = entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
+        value = ir.Constant(element_type, 0.0 if isinstance(element_type, _FLOAT_TYPES) else 0)
         if not isinstance(entry_type, ir.VectorType):
             return value
         return ir.Constant(entry_type, [value] * entry_type.count)
@@ -367,17 +412,17 @@ _FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
 def has_lanes(aval: Any) -> bool:
-    """Return whether an array of the trace has the axis of lanes."""
+    """Return whether the last axis of an array of the trace is that of the lanes."""
     return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
 
 
 def shape_without_lanes(aval: Any) -> tuple[int, ...]:
-    """Return the shape without the axis of lanes."""
+    """Return the shape of an array of the trace without the lane axis."""
     return aval.shape[:-1] if has_lanes(aval) else aval.shape
 
 
 def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
-    """Return the error for an axis with the length of the lane axis that is not the lane axis."""
+    """Return the error for an axis that has the length of the lane axis but is not the last one."""
     return NotImplementedError(
         f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
         "the lanes', which come from arguments and stay the last; keep them there, and give other "
@@ -386,7 +431,9 @@ def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
 
 
 def lane_mixing_error(name: str) -> NotImplementedError:
-    """Return the error for a primitive that combines or moves lanes."""
+    """Return the error for the primitive `name`, which would combine lanes or move the lane
+    axis.
+    """
     return NotImplementedError(
         f"{name} moves, joins or selects lanes: do the same to each lane; only `any` and `all` "
         "may combine them."
@@ -394,7 +441,7 @@ def lane_mixing_error(name: str) -> NotImplementedError:
 
 
 def number_type(aval: Any) -> ir.Type:
-    """Return the type of an entry for one lane."""
+    """Return the LLVM type of one entry of an array of the trace, for one lane."""
     if aval.dtype not in _TYPE_BY_DTYPE:
         raise NotImplementedError(
             f"{aval.str_short()} has numbers that machine code does not support: convert them to "
@@ -405,23 +452,23 @@ def number_type(aval: Any) -> ir.Type:
 
 _TYPE_BY_DTYPE = {
     np.dtype(name): kind for name, kind in NUMBER_TYPES.items()
-}  # dtype names are slow to compute
+}  # The names of dtypes are slow to compute.
 
 
 def make_array(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
-    """Return an array of LLVM values."""
+    """Return a NumPy array of this shape whose entries are the given LLVM values."""
     array = np.empty(len(entries), object)
     array[:] = entries
     return array.reshape(shape)
 
 
-def split_arrays(flat: Sequence[Value], avals: Sequence[Any]) -> list[ArrayValue]:
-    """Return the arrays whose entries `ArrayEmitter.flatten_entries` returned."""
+def split_arrays(flat_values: Sequence[Value], avals: Sequence[Any]) -> list[ArrayValue]:
+    """Return the arrays whose entries `ArrayEmitter.flatten_entries` put into one list."""
     arrays: list[ArrayValue] = []
     begin = 0
     for aval in avals:
         shape = shape_without_lanes(aval)
         end = begin + math.prod(shape)
-        arrays.append(make_array(shape, flat[begin:end]))
+        arrays.append(make_array(shape, flat_values[begin:end]))
         begin = end
     return arrays

@@ -1,4 +1,6 @@
-"""Primitives that move entries: indexing, slicing, concatenation and reshaping."""
+"""Rules of primitives that move entries: indexing, slicing, concatenation and reshaping. Each
+returns an array of LLVM values.
+"""
 
 import math
 from collections.abc import Sequence
@@ -31,12 +33,13 @@ from vrw_jax.simd.value_emitter import I64, Value
 def emit_broadcast(
     emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, *_: Any
 ) -> ArrayValue:
-    """Repeat an array along new axes, including the lanes'."""
+    """Return the array repeated along new axes, of which the last may be the lane axis."""
     shape = shape_without_lanes(call.out_aval)
     axes = tuple(map(int, call.params["broadcast_dimensions"]))
     array = emitter.reshape_if_needed(array, array.shape[:-1], len(array.shape) > len(shape))
     if has_lanes(call.out_aval) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
-        array = emitter.reshape_array(array, array.shape[:-1])  # one number has the axis of lanes
+        # The array is one number for each lane.
+        array = emitter.reshape_array(array, array.shape[:-1])
     has_same_type = isinstance(array, MemoryArray) and array.entry_type == emitter.entry_type_of(
         call.out_aval
     )
@@ -49,24 +52,24 @@ def emit_broadcast(
 
 
 def emit_reshape(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
-    """Return the entries in the same order, in another shape."""
+    """Return the array in another shape, with the same entries in the same order."""
     return emitter.reshape_array(array, shape_without_lanes(call.out_aval))
 
 
 def emit_transpose(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
-    """Return the array with its axes in another order."""
-    order = call.params["permutation"]
-    order = order[: len(array.shape)]
+    """Return the array with its axes in the order of the parameter `permutation`."""
+    axis_order = call.params["permutation"]
+    axis_order = axis_order[: len(array.shape)]
     if isinstance(array, np.ndarray):
-        return array.transpose(order)
-    inverse_order = np.argsort(order)
-    entry_at = lambda index: emitter.get_entry(array, tuple(index[i] for i in inverse_order))
+        return array.transpose(axis_order)
+    inverse_axis_order = np.argsort(axis_order)
+    entry_at = lambda index: emitter.get_entry(array, tuple(index[i] for i in inverse_axis_order))
     array_class = TransposedView if isinstance(array, MemoryArray | TransposedView) else LazyArray
     return array_class(shape_without_lanes(call.out_aval), array.entry_type, entry_at)
 
 
 def emit_slice(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
-    """Return the entries from one index to another, with strides."""
+    """Return the entries between two indices of each axis, with strides."""
     strides = call.params["strides"] or (1,) * len(call.params["start_indices"])
     ranges = zip(call.params["start_indices"], call.params["limit_indices"], strides, strict=True)
     slices = [slice(*bounds) for bounds in ranges][: len(array.shape)]
@@ -74,31 +77,32 @@ def emit_slice(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) ->
         return array[tuple(slices)]
 
     def entry_at(index: EntryIndex) -> Value:
-        pairs = zip(index, slices, strict=True)
+        index_strides = zip(index, slices, strict=True)
         return emitter.get_entry(
-            array, tuple(emitter.shift_index(i, s.start, s.step) for i, s in pairs)
+            array,
+            tuple(emitter.shift_index(i, stride.start, stride.step) for i, stride in index_strides),
         )
 
     return LazyArray(shape_without_lanes(call.out_aval), array.entry_type, entry_at)
 
 
 def emit_concatenate(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
-    """Concatenate arrays along an axis."""
+    """Return arrays joined along an existing axis."""
     return _concatenate_along(emitter, call, call.params["dimension"], values)
 
 
 def emit_stack(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
-    """Stack arrays of one shape along a new axis."""
+    """Return arrays of one shape stacked along a new axis."""
     axis = call.params["axis"]
     longer = [emitter.reshape_array(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
     return _concatenate_along(emitter, call, axis, longer)
 
 
 def emit_unstack(
-    traces: JaxprLowering, equation: Any, values: list[ArrayValue]
+    lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
-    """Split an array along an axis into arrays of one shape."""
-    (array,), axis, emitter = values, equation.params["axis"], traces.emitter
+    """Return the arrays, all of one shape, into which an array is split along an axis."""
+    (array,), axis, emitter = values, equation.params["axis"], lowering.emitter
     if axis == len(array.shape):
         raise lane_mixing_error("unstack")
 
@@ -115,24 +119,24 @@ def emit_unstack(
 def _concatenate_along(
     emitter: ArrayEmitter, call: PrimitiveCall, axis: int, values: Sequence[ArrayValue]
 ) -> ArrayValue:
-    """Return arrays joined along an existing axis."""
+    """Return arrays joined along the existing axis `axis`."""
     shape = shape_without_lanes(call.out_aval)
     if axis == len(shape):
         raise lane_mixing_error(call.name)
     if all(isinstance(x, np.ndarray) for x in values):
         return np.concatenate(values, axis)  # type: ignore[arg-type]
-    parts = [x for x in values if x.shape[axis]]
-    starts = np.cumsum([0, *(x.shape[axis] for x in parts)]).tolist()
+    part_offsets = [x for x in values if x.shape[axis]]
+    starts = np.cumsum([0, *(x.shape[axis] for x in part_offsets)]).tolist()
 
     def entry_at(index: EntryIndex) -> Value:
         i, selected_value = index[axis], None
-        for part, start in zip(parts, starts, strict=False):
+        for part, start in zip(part_offsets, starts, strict=False):
             local_index, last_index = emitter.shift_index(i, -start), part.shape[axis] - 1
             if isinstance(i, int):
                 if 0 <= local_index <= last_index:
                     return emitter.get_entry(part, (*index[:axis], local_index, *index[axis + 1 :]))
                 continue
-            # Beyond the part's end any entry is valid, because the select below discards it.
+            # Beyond the end of a part any entry is valid, because the select below discards it.
             local_index = 0 if last_index == 0 else emitter.clamp_index(local_index, last_index)
             value = emitter.get_entry(part, (*index[:axis], local_index, *index[axis + 1 :]))
             is_inside = emitter.builder.icmp_signed(">=", i, ir.Constant(I64, start))
@@ -149,31 +153,34 @@ def _concatenate_along(
 def emit_pad(
     emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, value: ArrayValue
 ) -> ArrayValue:
-    """Add entries around an array, none within."""
+    """Return the array with entries `value` added before and after it along each axis."""
     padding = call.params["padding_config"]
-    if any(low < 0 or high < 0 or interior for low, high, interior in padding):
+    if any(n_before < 0 or n_after < 0 or n_between for n_before, n_after, n_between in padding):
         raise NotImplementedError("pad takes entries away or puts some between: slice and stack.")
-    padded = np.broadcast_to(
+    result_array = np.broadcast_to(
         emitter.get_entries(value).reshape(()), shape_without_lanes(call.out_aval)
     ).copy()
     interior_slices = tuple(
-        slice(low, low + n) for (low, _, _), n in zip(padding, array.shape, strict=False)
+        slice(n_before, n_before + n)
+        for (n_before, _, _), n in zip(padding, array.shape, strict=False)
     )
-    padded[interior_slices] = emitter.get_entries(array)
-    return padded
+    result_array[interior_slices] = emitter.get_entries(array)
+    return result_array
 
 
 def emit_empty(emitter: ArrayEmitter, call: PrimitiveCall) -> ArrayValue:
-    """Return uninitialized entries, which read as zeros except in memory that loops carry."""
-    kind = emitter.entry_type_of(call.out_aval)
+    """Return an uninitialized array, whose entries read as zeros except in memory that loops
+    carry.
+    """
+    entry_type = emitter.entry_type_of(call.out_aval)
     return Uninitialized(
-        shape_without_lanes(call.out_aval), kind, lambda _: emitter.make_zero(kind)
+        shape_without_lanes(call.out_aval), entry_type, lambda _: emitter.make_zero(entry_type)
     )
 
 
 def emit_iota(emitter: ArrayEmitter, call: PrimitiveCall) -> ArrayValue:
-    """Return the indices along an axis."""
-    return emitter.emit_constants(
+    """Return an array of indices along one axis, as `jax.lax.broadcasted_iota`."""
+    return emitter.emit_constant_array(
         np.indices(call.out_aval.shape)[call.params["dimension"]], call.out_aval
     )
 
@@ -181,7 +188,9 @@ def emit_iota(emitter: ArrayEmitter, call: PrimitiveCall) -> ArrayValue:
 def emit_dynamic_slice(
     emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, *starts: ArrayValue
 ) -> ArrayValue:
-    """Return a part whose start is given by numbers, the same for all lanes."""
+    """Return the part of an array that begins at computed indices, which are the same for all
+    lanes.
+    """
     start_index = _clamp_starts(
         emitter, call.in_avals, array.shape, shape_without_lanes(call.out_aval), starts
     )
@@ -198,12 +207,14 @@ def emit_dynamic_update(
     update: ArrayValue,
     *starts: ArrayValue,
 ) -> ArrayValue:
-    """Replace a part whose start is given by numbers, the same for all lanes."""
+    """Return the array with one part replaced; the part begins at computed indices, the same for
+    all lanes.
+    """
     if has_lanes(call.out_aval) and not has_lanes(call.in_avals[1]):
         raise lane_mixing_error(call.name)
     start_index = _clamp_starts(emitter, call.in_avals[1:], array.shape, update.shape, starts)
-    is_uniform = isinstance(array, np.ndarray) and not any(array.strides)
-    needs_no_copy = is_uniform or isinstance(array, Uninitialized)
+    has_same_type = isinstance(array, np.ndarray) and not any(array.strides)
+    needs_no_copy = has_same_type or isinstance(array, Uninitialized)
     return PendingUpdate(
         emitter, array if needs_no_copy else emitter.materialize(array), update, start_index
     )
@@ -216,7 +227,7 @@ def _clamp_starts(
     part_shape: EntryIndex,
     starts: Sequence[ArrayValue],
 ) -> tuple[Any, ...]:
-    """Return the start of a part, clamped so that the part is inside."""
+    """Return the start index of a part, clamped so that the part lies inside the array."""
     start_index: list[Any] = []
     for aval, n, m, start in zip(in_avals[1:], array_shape, part_shape, starts, strict=False):
         start_value = emitter.get_entries(start).item()

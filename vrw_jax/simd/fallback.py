@@ -1,14 +1,16 @@
-"""The fallback to XLA on releases of JAX with which machine code was not tested."""
+"""Fallback to XLA on releases of JAX with which machine code was not tested."""
 
 import warnings
 
 import jax
 
 LATEST_TESTED_JAX = (0, 12)
-"""Latest release of JAX (major, minor) with which all tests of machine code have passed."""
+"""Latest release of JAX (major, minor) with which all tests of machine code pass."""
 
-_failures: list[str] = []
-"""Reasons why this process uses XLA instead of machine code."""
+_failure_reasons: list[str] = []
+"""Reasons why this process uses XLA instead of machine code; the list is empty as long as machine
+code works.
+"""
 
 
 def is_tested_release() -> bool:
@@ -17,14 +19,16 @@ def is_tested_release() -> bool:
 
 
 def is_disabled() -> bool:
-    """Return whether machine code has failed on an untested release of JAX."""
-    return bool(_failures)
+    """Return whether machine code has failed in this process on an untested release of JAX."""
+    return bool(_failure_reasons)
 
 
 def disable(reason: object) -> None:
-    """Use XLA from now on, and warn once."""
-    _failures.append(str(reason))
-    if len(_failures) == 1:
+    """Use XLA instead of machine code from now on, and issue a warning the first time; `reason` is
+    the failure.
+    """
+    _failure_reasons.append(str(reason))
+    if len(_failure_reasons) == 1:
         latest = ".".join(map(str, LATEST_TESTED_JAX))
         warnings.warn(
             f"machine code does not work with JAX {jax.__version__} ({reason}); XLA computes "

@@ -1,4 +1,4 @@
-"""The machine-code function that XLA calls through its foreign function interface (FFI)."""
+"""The LLVM function that XLA calls through its foreign function interface (FFI)."""
 
 import functools
 import re
@@ -13,14 +13,16 @@ from vrw_jax.simd.value_emitter import I8, I32, I64
 HANDLER_NAME = "handler"
 
 METADATA_EXTENSION_TYPE = 1
-"""Type of the extension by which XLA requests the metadata of a handler, from the same header."""
+"""Type of the extension by which XLA requests the metadata of a handler, from XLA's
+xla/ffi/api/c_api.h.
+"""
 
 
 @functools.cache
 def read_api_version() -> tuple[int, int]:
-    """Return the version of the call interface in the installed header of XLA.
+    """Return the version (major, minor) of the call interface in the installed header of XLA.
 
-    It is (0, 0), which XLA refuses, if the header is missing or has another form.
+    It is (0, 0), which XLA rejects, if the header is missing or has another form.
     """
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     try:
@@ -34,65 +36,72 @@ def read_api_version() -> tuple[int, int]:
 def add_handler(
     module: ir.Module,
     kernel: ir.Function,
-    n_in: int,
-    n_out: int,
-    width: int,
+    n_inputs: int,
+    n_outputs: int,
+    group_width: int,
     api_version: tuple[int, int],
 ) -> None:
-    """Add `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`, which calls the kernel, to the module.
+    """Add the function `XLA_FFI_Error *handler(XLA_FFI_CallFrame *)`, which calls `kernel`, to the
+    module.
 
+    The function reads pointers to `n_inputs` arguments and `n_outputs` results from the call frame.
     Offsets are in bytes, from XLA's xla/ffi/api/c_api.h, whose structs only grow at their ends. If
     XLA requests the metadata, the handler reports `api_version`, for which it is compiled.
     """
-    pointer = ir.PointerType()
-    handler = ir.Function(module, ir.FunctionType(pointer, [pointer]), HANDLER_NAME)
+    pointer_type = ir.PointerType()
+    handler = ir.Function(module, ir.FunctionType(pointer_type, [pointer_type]), HANDLER_NAME)
     handler.attributes.add("nounwind")
-    build = ir.IRBuilder(handler.append_basic_block("entry"))
+    builder = ir.IRBuilder(handler.append_basic_block("entry"))
     extension_block, metadata_block, execute_block = (
         handler.append_basic_block(name) for name in ("extension", "metadata", "execute")
     )
-    frame, null = handler.args[0], ir.Constant(pointer, None)
+    call_frame, null_pointer = handler.args[0], ir.Constant(pointer_type, None)
 
-    def field_address(base: Any, offset: int) -> Any:
-        return build.gep(base, [ir.Constant(I64, offset)], source_etype=I8)
+    def field_address(base_pointer: Any, offset: int) -> Any:
+        return builder.gep(base_pointer, [ir.Constant(I64, offset)], source_etype=I8)
 
-    def load_field(base: Any, offset: int, kind: ir.Type = pointer) -> Any:
-        return build.load(field_address(base, offset), typ=kind)
+    def load_field(base_pointer: Any, offset: int, field_type: ir.Type = pointer_type) -> Any:
+        return builder.load(field_address(base_pointer, offset), typ=field_type)
 
-    extension = load_field(frame, 8)
-    has_extension = build.icmp_unsigned("!=", extension, null)
-    build.cbranch(has_extension, extension_block, execute_block)
-    build.position_at_end(extension_block)
-    is_metadata = build.icmp_unsigned(
-        "==", load_field(extension, 8, I32), ir.Constant(I32, METADATA_EXTENSION_TYPE)
+    extension_pointer = load_field(call_frame, 8)
+    has_extension = builder.icmp_unsigned("!=", extension_pointer, null_pointer)
+    builder.cbranch(has_extension, extension_block, execute_block)
+    builder.position_at_end(extension_block)
+    is_metadata = builder.icmp_unsigned(
+        "==", load_field(extension_pointer, 8, I32), ir.Constant(I32, METADATA_EXTENSION_TYPE)
     )
-    build.cbranch(is_metadata, metadata_block, execute_block)
-    build.position_at_end(metadata_block)
-    metadata = load_field(extension, 24)
-    for field, number in zip((24, 28), api_version, strict=True):
-        build.store(ir.Constant(I32, number), field_address(metadata, field))
-    build.ret(null)
-    build.position_at_end(execute_block)
+    builder.cbranch(is_metadata, metadata_block, execute_block)
+    builder.position_at_end(metadata_block)
+    metadata_pointer = load_field(extension_pointer, 24)
+    for field_offset, version_number in zip((24, 28), api_version, strict=True):
+        builder.store(
+            ir.Constant(I32, version_number), field_address(metadata_pointer, field_offset)
+        )
+    builder.ret(null_pointer)
+    builder.position_at_end(execute_block)
 
-    def buffers(offset: int, count: int) -> tuple[Any, Any]:
-        """Return pointers to the data of a list of buffers, and the last buffer."""
-        buffer_list, buffer = load_field(frame, offset), None
-        pointers = build.alloca(pointer, ir.Constant(I64, count))
-        for i in range(count):
+    def load_buffer_pointers(offset: int, n_buffers: int) -> tuple[Any, Any]:
+        """Return a table of pointers to the data of `n_buffers` buffers, and the last buffer.
+
+        `offset` is that of the list of buffers in the call frame, in bytes.
+        """
+        buffer_list, buffer = load_field(call_frame, offset), None
+        data_pointers = builder.alloca(pointer_type, ir.Constant(I64, n_buffers))
+        for i in range(n_buffers):
             buffer = load_field(buffer_list, 8 * i)
-            build.store(
+            builder.store(
                 load_field(buffer, 24),
-                build.gep(pointers, [ir.Constant(I64, i)], source_etype=pointer),
+                builder.gep(data_pointers, [ir.Constant(I64, i)], source_etype=pointer_type),
             )
-        return pointers, buffer
+        return data_pointers, buffer
 
-    input_table, _ = buffers(72, n_in)
-    output_table, last_output = buffers(112, n_out)
+    input_table, _ = load_buffer_pointers(72, n_inputs)
+    output_table, last_output = load_buffer_pointers(112, n_outputs)
     rank = load_field(last_output, 32, I64)
-    last_axis = build.sub(rank, ir.Constant(I64, 1))
-    n_lanes = build.load(
-        build.gep(load_field(last_output, 40), [last_axis], source_etype=I64), typ=I64
+    last_axis = builder.sub(rank, ir.Constant(I64, 1))
+    n_lanes = builder.load(
+        builder.gep(load_field(last_output, 40), [last_axis], source_etype=I64), typ=I64
     )
-    groups = build.sdiv(n_lanes, ir.Constant(I64, width))
-    build.call(kernel, [input_table, output_table, n_lanes, ir.Constant(I64, 0), groups])
-    build.ret(null)
+    n_groups = builder.sdiv(n_lanes, ir.Constant(I64, group_width))
+    builder.call(kernel, [input_table, output_table, n_lanes, ir.Constant(I64, 0), n_groups])
+    builder.ret(null_pointer)

@@ -1,4 +1,4 @@
-"""Machine code as a JAX primitive, which JAX programs call by the name of the code."""
+"""The JAX primitive that calls machine code by its name from JAX programs."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,12 +14,12 @@ from vrw_jax.simd.ffi_handler import HANDLER_NAME
 from vrw_jax.simd.machine import LoadedCode
 
 LOADED_BY_NAME: dict[str, LoadedCode] = {}
-"""Machine code by the name under which JAX programs can call it; XLA never releases it."""
+"""Loaded machine code by the name under which JAX programs call it. XLA never releases it."""
 _registry_lock = Lock()
 
 
 def register_code(code: MachineCode) -> None:
-    """Make this code callable by its name in JAX programs."""
+    """Load machine code, and make it callable by its name in JAX programs."""
     object_code = code.wait_for_code()
     with _registry_lock:
         if code.name not in LOADED_BY_NAME:
@@ -31,8 +31,9 @@ def register_code(code: MachineCode) -> None:
 
 
 MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
-"""A call of machine code by JAX programs, which require the code only when they are compiled: LLVM
-can compile it in the meantime."""
+"""Primitive that calls machine code from JAX programs. The code is required only when the program
+is compiled, so LLVM can compile it in the meantime.
+"""
 MACHINE_CODE_PRIMITIVE.multiple_results = True
 
 
@@ -40,7 +41,7 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 def _abstract_results(
     *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
-    """Return shapes and types of the results of a call."""
+    """Return the abstract values (shapes and dtypes) of the results of a call."""
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 
@@ -49,7 +50,7 @@ def _call_in_program(
     *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
     """Return the results of a call outside of `jax.jit`."""
-    with jax.disable_jit(False):  # only a compiled program can call machine code
+    with jax.disable_jit(False):  # Only a compiled program can call machine code.
         return _make_program(code, tuple(result_shapes))(*arguments)
 
 
@@ -57,7 +58,7 @@ def _call_in_program(
 def _make_program(
     code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
 ) -> Callable[..., Any]:
-    """Return a program that calls the code and nothing else."""
+    """Return a compiled JAX program that only calls the machine code."""
     return jax.jit(
         functools.partial(MACHINE_CODE_PRIMITIVE.bind, code=code, result_shapes=result_shapes)
     )
@@ -66,13 +67,13 @@ def _make_program(
 def _lower_call(
     context: Any, *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
-    """Register the code and lower its call for XLA."""
+    """Register the machine code, and return XLA's lowering of its call."""
     register_code(code)
     return jax.ffi.ffi_lowering(code.name)(context, *arguments)
 
 
 def _refuse_transform(*_: Any, **__: Any) -> Any:
-    """Raise an error for a transform that machine code does not support."""
+    """Raise a NotImplementedError for a transform that machine code does not support."""
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
         "all lanes at once, on the last axis, and for derivatives the function that returns them."

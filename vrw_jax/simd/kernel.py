@@ -1,4 +1,4 @@
-"""An LLVM module for a trace: a loop over groups of lanes with its inputs and outputs."""
+"""The LLVM module of a trace: a loop over groups of lanes with its inputs and outputs."""
 
 import math
 from typing import Any
@@ -24,60 +24,71 @@ KERNEL_NAME = "lanes"
 
 
 def write_module(
-    closed_jaxpr: ClosedJaxpr, width: int, limits: RegisterLimits = DEFAULT_LIMITS
+    closed_jaxpr: ClosedJaxpr, group_width: int, limits: RegisterLimits = DEFAULT_LIMITS
 ) -> str:
-    """Return the LLVM text of the kernel, which computes a range of groups of lanes.
+    """Return the LLVM text of a function that computes a range of groups of lanes.
 
     Its signature is `void lanes(const void **inputs, void **outputs, int64 lanes, int64 begin,
-    int64 end)`. The function loops over groups of `width` lanes. A single lane is computed twice,
-    as a vector, because LLVM's code for scalars differs in the last digits.
+    int64 end)`. The function loops over the groups from `begin` to `end`, each of `group_width`
+    lanes. A single lane is computed twice, as a vector, because LLVM's code for scalars differs in
+    the last digits.
     """
     _check_lane_axes(closed_jaxpr)
     module = ir.Module(KERNEL_NAME)
-    pointer = ir.PointerType()
+    pointer_type = ir.PointerType()
     kernel = ir.Function(
-        module, ir.FunctionType(ir.VoidType(), [pointer, pointer, I64, I64, I64]), KERNEL_NAME
+        module,
+        ir.FunctionType(ir.VoidType(), [pointer_type, pointer_type, I64, I64, I64]),
+        KERNEL_NAME,
     )
     kernel.attributes.add("nounwind")
-    build = ir.IRBuilder(kernel.append_basic_block("entry"))
-    arrays = ArrayEmitter(ValueEmitter(build, max(width, 2)), limits)
-    input_table, output_table, n_lanes, begin, end = kernel.args
-    inputs, outputs = closed_jaxpr.in_avals, closed_jaxpr.out_avals
+    builder = ir.IRBuilder(kernel.append_basic_block("entry"))
+    emitter = ArrayEmitter(ValueEmitter(builder, max(group_width, 2)), limits)
+    input_table, output_table, n_lanes, first_group, end_group = kernel.args
+    input_avals, output_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
-    def load_pointer(base: Value, index: int) -> Value:
-        slot = build.gep(base, [ir.Constant(I64, index)], source_etype=pointer)
-        return build.load(slot, typ=pointer)
+    def load_pointer(table: Value, index: int) -> Value:
+        entry_pointer = builder.gep(table, [ir.Constant(I64, index)], source_etype=pointer_type)
+        return builder.load(entry_pointer, typ=pointer_type)
 
-    sources = [load_pointer(input_table, i) for i in range(len(inputs))]
-    targets = [load_pointer(output_table, i) for i in range(len(outputs))]
+    input_pointers = [load_pointer(input_table, i) for i in range(len(input_avals))]
+    output_pointers = [load_pointer(output_table, i) for i in range(len(output_avals))]
 
     def emit_group(group_index: Value, _: Any) -> list[Value]:
-        row_access = _RowAccess(
-            arrays, width == 1, n_lanes, build.mul(group_index, ir.Constant(I64, width))
+        row_access = _LaneRowAccess(
+            emitter,
+            group_width == 1,
+            n_lanes,
+            builder.mul(group_index, ir.Constant(I64, group_width)),
         )
-        values = [row_access.read_argument(*pair) for pair in zip(sources, inputs, strict=True)]
-        results = JaxprLowering(arrays, PRIMITIVE_RULES).lower_jaxpr(closed_jaxpr, values)
-        for target, aval, value in zip(targets, outputs, results, strict=True):
-            row_access.write_result(target, aval, value)
+        values = [
+            row_access.read_argument(*pair)
+            for pair in zip(input_pointers, input_avals, strict=True)
+        ]
+        results = JaxprLowering(emitter, PRIMITIVE_RULES).lower_jaxpr(closed_jaxpr, values)
+        for output_pointer, aval, value in zip(output_pointers, output_avals, results, strict=True):
+            row_access.write_result(output_pointer, aval, value)
         return []
 
-    arrays.loop_over_range(begin, end, emit_group)
-    build.ret_void()
-    add_handler(module, kernel, len(inputs), len(outputs), width, read_api_version())
+    emitter.loop_over_range(first_group, end_group, emit_group)
+    builder.ret_void()
+    add_handler(
+        module, kernel, len(input_avals), len(output_avals), group_width, read_api_version()
+    )
     return str(module)
 
 
 def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
-    """Raise an error unless the lanes are the last axis of every argument and result, and
-    no other.
+    """Raise an error unless the lane axis is the last axis of every argument and result, and no
+    other axis.
     """
-    for description, avals in (
+    for array_description, avals in (
         ("An argument", closed_jaxpr.in_avals),
         ("A result", closed_jaxpr.out_avals),
     ):
         for aval in avals:
             if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-                raise lane_axis_error(description, aval)
+                raise lane_axis_error(array_description, aval)
     for aval in closed_jaxpr.out_avals:
         if not has_lanes(aval):
             raise NotImplementedError(
@@ -86,55 +97,65 @@ def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
             )
 
 
-class _RowAccess:
-    """Access to arrays outside for a group of lanes: they are stored row after row, lanes last."""
+class _LaneRowAccess:
+    """Access of one group of lanes to the arrays of the caller, whose last axis are the lanes."""
 
     def __init__(
-        self, emitter: ArrayEmitter, is_single_lane: bool, n_lanes: Value, lane: Value
+        self, emitter: ArrayEmitter, is_single_lane: bool, n_lanes: Value, first_lane: Value
     ) -> None:
         self.emitter, self.is_single_lane = emitter, is_single_lane
-        self.n_lanes, self.lane = n_lanes, lane
+        self.n_lanes, self.first_lane = n_lanes, first_lane
 
-    def read_argument(self, base: Value, aval: Any) -> ArrayValue:
-        """Return an argument; a number without axes is the same for all lanes."""
-        build = self.emitter.builder
+    def read_argument(self, base_pointer: Value, aval: Any) -> ArrayValue:
+        """Return an argument as an array of LLVM values; a number without axes is the same for all
+        lanes.
+        """
+        builder = self.emitter.builder
 
         def load_entry(index: EntryIndex) -> Value:
-            address, kind = self.row_address(base, aval, index)
-            value = build.load(address, typ=kind, align=aval.dtype.itemsize)
+            address, stored_type = self.row_address(base_pointer, aval, index)
+            value = builder.load(address, typ=stored_type, align=aval.dtype.itemsize)
             if aval.dtype.kind == "b":
-                value = build.icmp_signed("!=", value, self.emitter.emitter.constant(kind, 0))
+                value = builder.icmp_signed(
+                    "!=", value, self.emitter.emitter.constant(stored_type, 0)
+                )
             return (
                 self.emitter.emitter.splat(value) if self.is_single_lane and aval.shape else value
             )
 
-        field = LazyArray(aval.shape[:-1], self.emitter.entry_type_of(aval), load_entry)
-        fits_registers = math.prod(field.shape) <= self.emitter.limits.max_registers
-        return self.emitter.get_entries(field) if fits_registers else field
+        argument_array = LazyArray(aval.shape[:-1], self.emitter.entry_type_of(aval), load_entry)
+        fits_registers = math.prod(argument_array.shape) <= self.emitter.limits.max_registers
+        return self.emitter.get_entries(argument_array) if fits_registers else argument_array
 
-    def write_result(self, base: Value, aval: Any, value: ArrayValue) -> None:
-        """Store a result of the group in the memory that begins at `base`."""
-        build = self.emitter.builder
+    def write_result(self, base_pointer: Value, aval: Any, value: ArrayValue) -> None:
+        """Emit stores of a result of the group into the memory that begins at `base_pointer`."""
+        builder = self.emitter.builder
 
         def store_row(index: EntryIndex, _: Any) -> list[Value]:
-            address, kind = self.row_address(base, aval, index)
+            address, stored_type = self.row_address(base_pointer, aval, index)
             stored_value = self.emitter.emitter.splat(self.emitter.get_entry(value, index))
             if self.is_single_lane:
-                stored_value = build.extract_element(stored_value, ir.Constant(I64, 0))
+                stored_value = builder.extract_element(stored_value, ir.Constant(I64, 0))
             if aval.dtype.kind == "b":
-                stored_value = build.zext(stored_value, kind)
-            build.store(stored_value, address, align=aval.dtype.itemsize)
+                stored_value = builder.zext(stored_value, stored_type)
+            builder.store(stored_value, address, align=aval.dtype.itemsize)
             return []
 
         self.emitter.loop_over_indices(aval.shape[:-1], store_row)
 
-    def row_address(self, base: Value, aval: Any, index: EntryIndex) -> tuple[Value, ir.Type]:
-        """Return the address of a row's lanes, and the type in which they are stored."""
-        build, number = self.emitter.builder, NUMBER_TYPES[aval.dtype.name]
-        number = I8 if number == I1 else number
+    def row_address(
+        self, base_pointer: Value, aval: Any, index: EntryIndex
+    ) -> tuple[Value, ir.Type]:
+        """Return the address of the group's lanes of one entry, and the LLVM type in which they are
+        stored.
+        """
+        builder, element_type = self.emitter.builder, NUMBER_TYPES[aval.dtype.name]
+        element_type = I8 if element_type == I1 else element_type
         if aval.shape == ():
-            return base, number
-        row = self.emitter.linear_index(index, aval.shape[:-1])
-        offset = build.add(build.mul(row, self.n_lanes), self.lane)
-        kind = number if self.is_single_lane else self.emitter.emitter.vector_type(number)
-        return build.gep(base, [offset], source_etype=number), kind
+            return base_pointer, element_type
+        row_index = self.emitter.linear_index(index, aval.shape[:-1])
+        offset = builder.add(builder.mul(row_index, self.n_lanes), self.first_lane)
+        stored_type = (
+            element_type if self.is_single_lane else self.emitter.emitter.vector_type(element_type)
+        )
+        return builder.gep(base_pointer, [offset], source_etype=element_type), stored_type

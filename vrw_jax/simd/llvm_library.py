@@ -1,4 +1,6 @@
-"""llvmlite, or stand-ins if it is not installed: programs of XLA then compute instead."""
+"""The modules of llvmlite, or stand-ins if it is not installed. Without llvmlite, XLA computes
+everything.
+"""
 
 from typing import Any
 
@@ -12,20 +14,20 @@ except ImportError:
 
 
 class _MissingType:
-    """Stand-in for a type of llvmlite, which the emitters name and extend."""
+    """Stand-in for a type of llvmlite that the emitters name and extend."""
 
     def __init__(self, *_: Any) -> None: ...
 
 
 class _MissingTypes:
-    """Stand-in for `llvmlite.ir`: any name is a type."""
+    """Stand-in for the module `llvmlite.ir`, in which any name is a type."""
 
     def __getattr__(self, name: str) -> Any:
         return type(name, (_MissingType,), {})
 
 
 class _MissingCompiler:
-    """Stand-in for `llvmlite.binding`: any use raises an error."""
+    """Stand-in for the module `llvmlite.binding`, whose use raises an ImportError."""
 
     def __getattr__(self, name: str) -> Any:
         raise ImportError("machine code needs llvmlite, which is not installed: pip install it.")

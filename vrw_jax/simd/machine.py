@@ -1,4 +1,4 @@
-"""LLVM's part: the target processor, object code for it, and code loaded into memory."""
+"""Interface to LLVM: the target processor, object code for it, and code loaded into memory."""
 
 import ctypes
 import functools
@@ -11,7 +11,7 @@ from typing import Any
 from vrw_jax.simd.llvm_library import has_llvm, llvm
 
 OPTIMIZATION_LEVEL = 2
-"""LLVM's optimization level for register allocation and instruction scheduling."""
+"""LLVM's optimization level (0 to 3) for register allocation and instruction scheduling."""
 LLVM_PASSES = (
     "global_dead_code_eliminate",
     "instruction_combine",
@@ -21,30 +21,30 @@ LLVM_PASSES = (
 )
 """LLVM passes that simplify the module.
 
-They are chosen because the emitter writes nothing twice and already uses vectors. LLVM's usual list
-takes as long as all the rest, for code that is at most a twentieth faster.
+They are chosen because the emitter repeats no computation and already uses vectors. LLVM's usual
+list would take as long as the whole remaining compilation, for code at most a twentieth faster.
 """
 
 ELF_64_BIT_LITTLE_ENDIAN = b"\x7fELF\x02\x01"
-"""First bytes of the object files that LLVM writes on Linux."""
+"""First bytes of the object files that LLVM writes on 64-bit Linux."""
 ELF_HEADER = struct.Struct("<16sHHIQQQIHHHHHH")
-"""Layout of the header of such a file."""
+"""Layout of the header of an ELF file, as a format of `struct`."""
 ELF_SECTION = struct.Struct("<IIQQQQIIQQ")
-"""Layout of an entry of its table of sections."""
+"""Layout of an entry of the section table of an ELF file, as a format of `struct`."""
 
 
 class ElfSectionKind(IntEnum):
-    """Kinds of sections that the check of a file distinguishes."""
+    """Types of ELF sections that the check of an object file distinguishes."""
 
     STRING_TABLE = 3
-    WITHOUT_DATA = 8  # memory for which the file contains no bytes
+    SECTION_WITHOUT_DATA = 8  # memory for which the file contains no bytes
 
 
 @functools.cache
 def describe_processor() -> tuple[str, str, str]:
-    """Return the target of machine code: target triple, processor, and its features.
+    """Return the target of machine code: target triple, processor, and the list of its features.
 
-    Without llvmlite it is the kind of machine alone.
+    Without llvmlite only the kind of machine is known.
     """
     if not has_llvm:
         return platform.machine(), "", ""
@@ -53,31 +53,31 @@ def describe_processor() -> tuple[str, str, str]:
 
 
 def compilation_key() -> str:
-    """Return everything that object code depends on besides LLVM's text."""
+    """Return a text of everything, except LLVM's input, on which object code depends."""
     return repr((llvm.llvm_version_info, describe_processor(), OPTIMIZATION_LEVEL, LLVM_PASSES))
 
 
 def has_512_bit_vectors() -> bool:
-    """Return whether vectors have 512 bits."""
+    """Return whether the processor has vector registers of 512 bits."""
     return "+avx512f" in describe_processor()[2]
 
 
-def compile_native(text: str) -> bytes:
-    """Return object code for this processor."""
-    return _emit_object(llvm.parse_assembly(text), _make_target_machine())
+def compile_native(llvm_text: str) -> bytes:
+    """Return object code for this processor from LLVM text."""
+    return _emit_object(llvm.parse_assembly(llvm_text), _make_target_machine())
 
 
-def compile_wasm(text: str, entry_point: str, name: str) -> bytes:
-    """Return object code for WebAssembly, a 32-bit machine with vectors of 128 bits.
+def compile_wasm(llvm_text: str, entry_point: str, exported_name: str) -> bytes:
+    """Return object code for WebAssembly from LLVM text, for vectors of 128 bits.
 
-    The object is to be linked with others. Its one exported function is `entry_point`, renamed to
-    `name`.
+    The object is to be linked with others. Its one exported function is `entry_point`, which is
+    renamed to `exported_name`.
     """
-    module = llvm.parse_assembly(text)
+    module = llvm.parse_assembly(llvm_text)
     for symbol in (*module.functions, *module.global_variables):
         if not symbol.is_declaration and symbol.name != entry_point:
             symbol.linkage = "internal"
-    module.get_function(entry_point).name = name
+    module.get_function(entry_point).name = exported_name
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple("wasm32-unknown-unknown")
@@ -102,10 +102,10 @@ def _emit_object(module: "llvm.ModuleRef", machine: "llvm.TargetMachine") -> byt
 
 
 def require_object(code: bytes, name: str) -> None:
-    """Raise a ValueError unless the code is a complete object file with a function of that name.
+    """Raise a ValueError unless `code` is a complete object file with a function called `name`.
 
     LLVM ends the process if a file is damaged, so its tables are checked here. Only files in the
-    ELF format are checked completely; in other formats only the name is looked for.
+    ELF format are checked completely. In other formats the check only looks for the name.
     """
     if f"\0{name}\0".encode() not in code and f"\0_{name}\0".encode() not in code:
         raise ValueError(f"it has no function {name}")
@@ -113,19 +113,27 @@ def require_object(code: bytes, name: str) -> None:
         return
     if len(code) < ELF_HEADER.size or not code.startswith(ELF_64_BIT_LITTLE_ENDIAN):
         raise ValueError("it is no object file")
-    *_, begin, _, _, _, _, size, count, names = ELF_HEADER.unpack_from(code)
-    if size != ELF_SECTION.size or begin + count * size > len(code) or names >= count:
+    *_, table_offset, _, _, _, _, entry_size, n_sections, name_table_index = ELF_HEADER.unpack_from(
+        code
+    )
+    if (
+        entry_size != ELF_SECTION.size
+        or table_offset + n_sections * entry_size > len(code)
+        or name_table_index >= n_sections
+    ):
         raise ValueError("its table of sections is cut off")
-    sections = [ELF_SECTION.unpack_from(code, begin + i * size) for i in range(count)]
-    for _, kind, _, _, offset, length, *_ in sections:
-        if kind != ElfSectionKind.WITHOUT_DATA and offset + length > len(code):
+    sections = [
+        ELF_SECTION.unpack_from(code, table_offset + i * entry_size) for i in range(n_sections)
+    ]
+    for _, section_type, _, _, offset, length, *_ in sections:
+        if section_type != ElfSectionKind.SECTION_WITHOUT_DATA and offset + length > len(code):
             raise ValueError("a section is cut off")
-    if sections[names][1] != ElfSectionKind.STRING_TABLE:
+    if sections[name_table_index][1] != ElfSectionKind.STRING_TABLE:
         raise ValueError("it has no table of names")
 
 
 class LoadedCode:
-    """Machine code loaded into memory."""
+    """Machine code loaded into the memory of this process."""
 
     def __init__(self, code: bytes) -> None:
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _make_target_machine())
@@ -133,19 +141,19 @@ class LoadedCode:
         self._engine.finalize_object()
 
     def address(self, name: str) -> int:
-        """Return the address of a function."""
+        """Return the address of a function in memory."""
         return self._engine.get_function_address(name)
 
     def capsule(self, name: str) -> Any:
-        """Return a function as a PyCapsule, for callers with its signature."""
-        make = ctypes.pythonapi.PyCapsule_New
-        make.restype = ctypes.py_object
-        make.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-        return make(self.address(name), None, None)
+        """Return a function as a PyCapsule, by which XLA can call it."""
+        make_capsule = ctypes.pythonapi.PyCapsule_New
+        make_capsule.restype = ctypes.py_object
+        make_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+        return make_capsule(self.address(name), None, None)
 
 
 def _make_target_machine() -> "llvm.TargetMachine":
-    """Return the target machine of this processor."""
+    """Return LLVM's target machine for this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     triple, name, features = describe_processor()

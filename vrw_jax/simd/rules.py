@@ -1,4 +1,6 @@
-"""The table PRIMITIVE_RULES, which lowers traces; a new primitive is one more row."""
+"""The table `PRIMITIVE_RULES`, which contains the lowering rule of each JAX primitive. A new
+primitive needs one more entry.
+"""
 
 import math
 from collections.abc import Callable
@@ -20,7 +22,9 @@ from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering, PrimitiveRule
 
 
 def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
-    """Return a rule with one result: `emit(emitter, call, *values)`."""
+    """Return a rule of a primitive with one result from a function `emit(emitter, call,
+    *values)`.
+    """
 
     def emit_result(
         lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
@@ -32,7 +36,7 @@ def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
             raise lane_mixing_error(name)
         if result_has_lanes and not operand_has_lanes and name not in ("broadcast_in_dim", "empty"):
             raise lane_axis_error(f"The result of {name}", out_aval)
-        number_type(out_aval)  # raises an error for unsupported number types
+        number_type(out_aval)  # This call raises an error for unsupported number types.
         result = emit(
             lowering.emitter, PrimitiveCall(name, equation.params, in_avals, out_aval), *values
         )
@@ -48,14 +52,16 @@ def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
 
 
 def _emit_elementwise_call(emitter: Any, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
-    """Apply the primitive to each number separately."""
+    """Return the primitive applied to each entry."""
     return emitter.emit_elementwise(call, values)
 
 
 def _emit_barrier(
     lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
-    """Compute large arrays here, into memory."""
+    """Return the arrays, of which large lazy ones are computed and stored in memory at this
+    point.
+    """
     return [lowering.emitter.materialize(x) if isinstance(x, LazyArray) else x for x in values]
 
 
@@ -90,5 +96,8 @@ PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
 
 
 def list_primitives() -> dict[str, str]:
-    """Return the JAX primitives that have machine code, and descriptions of their rules."""
-    return {name: rule.__doc__ or "" for name, rule in PRIMITIVE_RULES.items()}
+    """Return, for each JAX primitive that has machine code, the first paragraph of its rule's
+    docstring.
+    """
+    first_paragraph = lambda text: " ".join(text.partition("\n\n")[0].split())
+    return {name: first_paragraph(rule.__doc__ or "") for name, rule in PRIMITIVE_RULES.items()}
