@@ -83,7 +83,7 @@ def find_by_newton(result: ReturnMap) -> Gait:
     says = walk_result.says if solution.converged else "Newton did not converge"
     walk_result = walk_result._replace(
         says=says, admits=bool(~solution.converged) or walk_result.admits, seconds=seconds,
-        work=int(solution.iterations), options=f"{walk_result.options}; Newton 1e-11",
+        work=int(solution.n_iterations), options=f"{walk_result.options}; Newton 1e-11",
     )  # fmt: skip
     jacobian, around_values = np.asarray(solution.jacobian), float(jax.jit(product)(solution.x))
     return Gait(walk_result, x, jacobian, around_values, _duration(walk_result, result))

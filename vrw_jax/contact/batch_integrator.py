@@ -29,7 +29,12 @@ from vrw_jax.contact.contact_state import (
 )
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, prevent_fusion
 from vrw_jax.hybrid import GUARD_ROUNDOFF_EPS
-from vrw_jax.integrator import ButcherTableau, find_dip, fit_guard_parabola, step_size_factor
+from vrw_jax.integrator import (
+    ButcherTableau,
+    find_guard_minimum,
+    fit_guard_parabola,
+    step_size_factor,
+)
 from vrw_jax.numerics import StepOptions, tree_where
 from vrw_jax.wheel import Outcome, Symbols, compute_own_units
 
@@ -586,9 +591,9 @@ def _earliest_dip_fraction(tableau: ButcherTableau, values: list[Array], is_own:
     """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
     none.
 
-    See `integrator.find_dip`. A guard that starts at its own event is not considered.
+    See `integrator.find_guard_minimum`. A guard that starts at its own event is not considered.
     """
-    has_dip, fraction = find_dip(tableau, values)
+    has_dip, fraction = find_guard_minimum(tableau, values)
     return jnp.min(jnp.where(has_dip & (values[0] > 0.0) & ~is_own, fraction, 1.0), axis=0)
 
 

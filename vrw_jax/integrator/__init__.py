@@ -1,4 +1,6 @@
-"""A batched Runge-Kutta integrator with event location, dense minima and tangents."""
+"""A batched Runge-Kutta integrator that locates events and minima of margins, and propagates
+tangents.
+"""
 
 from vrw_jax.integrator import tableaus
 from vrw_jax.integrator.integrate import (
@@ -12,7 +14,7 @@ from vrw_jax.integrator.tableaus import (
     ButcherTableau,
     StageAcceleration,
     StageState,
-    find_dip,
+    find_guard_minimum,
     fit_guard_parabola,
     load_explicit_tableau,
     real_stability_limit,

@@ -1,7 +1,7 @@
 """Integration of one phase for a batch, each element with its own step size, to the earliest event.
 
-The elements are integrated together until each has ended or holds a step that crosses a guard. Then
-they locate their events together: that step is repeated with its length corrected by Newton's
+The elements are integrated together until each has ended or has a step that crosses a guard. Then
+all events are located together: the crossing step is repeated with its length corrected by Newton's
 method. The result of an element never depends on the other elements, because an element that has
 ended does not change.
 """
@@ -21,11 +21,11 @@ from vrw_jax.integrator.minima import (
     MarginFunctions,
     MinimaResult,
     MinimaState,
+    evaluate_with_rates,
     init_minima,
     minima_jvp,
     refine_minima,
     update_minima,
-    values_and_rates,
 )
 from vrw_jax.integrator.tableaus import (
     AccelerationFn,
@@ -33,7 +33,7 @@ from vrw_jax.integrator.tableaus import (
     RKStep,
     StageState,
     StepFn,
-    earliest_dip_fraction,
+    earliest_guard_minimum_fraction,
     rk_step,
     step_size_factor,
 )
@@ -49,52 +49,58 @@ from vrw_jax.simd import noinline
 
 
 class BatchPhase(NamedTuple):
-    """A phase as data, whose functions are elementwise over the batch.
+    """A phase as functions that are elementwise over the batch.
 
-    `guards` are positive inside the phase, and an event is a zero from above. The earliest event
-    counts; of two at the same time, the first in the list.
+    `evaluate` returns the accelerations of a state. The `guards` are positive inside the phase, and
+    an event is a zero crossed from above. The earliest event ends the phase; of two at the same
+    time, the first in the list.
     """
 
     evaluate: AccelerationFn
     guards: Callable[[StageState], Vector]
-    margins: MarginFunctions | None = None  # margins whose minima are searched
-    implicit_dynamics: ImplicitDynamics | None = None  # for derivatives
+    margins: MarginFunctions | None = None  # margins whose minima are computed
+    # equations of motion in implicit form, for derivatives
+    implicit_dynamics: ImplicitDynamics | None = None
     is_noinline: bool = False
-    """Whether machine code calls the phase's functions instead of inlining them at each use; it
-    then compiles in half of the time and runs a sixth slower."""
+    """Whether machine code calls the phase's functions instead of inlining them at each use. The
+    code then compiles in half of the time and runs a sixth slower.
+    """
     state_units: Vector | None = None
-    """Units of q and of v in which the absolute tolerance holds; those of SI by default."""
+    """Units of q and of v for the absolute tolerance; the default is SI."""
 
 
 class BatchPhaseEnd(NamedTuple):
-    """End of a phase for each batch element."""
+    """End of a phase, for each batch element."""
 
     state: StageState
     duration: Array  # s
-    guard: Array  # index of the guard that ended it; -1 if none did
+    guard: Array  # index of the guard that ended the phase; -1 if none did
     timed_out: Array
-    is_unfinished: Array  # cut off as a straggler, see `integrate_batch_phase`
-    n_tried_steps: Array  # steps, accepted or not
-    next_dt: Array  # next length of the controller, s
-    minima: Array | None  # of the margins, (margins, batch)
+    # whether the element was cut off as a straggler, see `integrate_batch_phase`
+    is_unfinished: Array
+    n_tried_steps: Array  # number of solver steps, accepted or not
+    next_dt: Array  # next step length of the controller, s
+    minima: Array | None  # minima of the margins, (margins, batch)
 
 
 class _IntegratorState(NamedTuple):
-    """State of the integrator."""
+    """State of the integration loop, for each batch element."""
 
     state: StageState
     guard_values: Vector  # guards at the state
     dt: Array
     time: Array
-    status: Array  # after the last tried step
-    crossing_bits: Array  # bits of the guards that crossed in that step
-    middle_values: Vector  # guards within the crossing step
+    status: Array  # an IntegrationStatus, after the last tried step
+    crossing_bits: Array  # bit i is set if guard i crosses in that step
+    middle_values: Vector  # guards at the middle stage of the crossing step
     end_values: Vector
     n_tried_steps: Array
-    half_iterations: Array  # iterations after which half of the batch had finished
-    iterations: Array
+    iterations_until_half_ended: (
+        Array  # number of iterations after which half of the batch had ended
+    )
+    n_iterations: Array
     minima: MinimaState | None
-    tangents: Array | None  # of the state, (directions, ., batch), see `tangents`
+    tangents: Array | None  # tangents of the state, (directions, components, batch), see `tangents`
 
 
 class IntegrationStatus(IntEnum):
@@ -103,48 +109,50 @@ class IntegrationStatus(IntEnum):
     RUNNING = 0
     TIMED_OUT = 1
     FAILED = 2
-    CROSSED = 3  # the last tried step crosses a guard
-    IDLE = 4  # not active, or its start is already an event
+    CROSSED = 3  # The last tried step crosses a guard.
+    IDLE = 4  # The element is inactive, or its start is already an event.
 
 
 STRAGGLER_FACTOR = 2
-"""Ratio of the iterations after which stragglers are cut off to the iterations after which half of
-the batch had finished. It is chosen because a ratio near 1 would cut off regular elements."""
+"""Ratio of the iterations after which stragglers are cut off to the iterations after which half
+of the batch had ended. It is chosen because a ratio near 1 would cut off regular elements.
+"""
 
 
 BatchPhaseFn = Callable[[Any, Vector], BatchPhase]
-"""A function that returns a phase for its constants, see `tangents.ImplicitDynamicsFn`."""
+"""A function of constants that returns a phase, see `tangents.ImplicitDynamicsFn`."""
 
 
 def integrate_batch_phase(
-    phase_of: BatchPhaseFn,
+    make_phase: BatchPhaseFn,
     constants: Any,
     held_constants: Vector,
     tableau: ButcherTableau,
     q: Vector,
     v: Vector,
-    active: Array,
+    is_active: Array,
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None = None,
 ) -> BatchPhaseEnd:
-    """Return the end of a phase: every active element integrated to its earliest event.
+    """Integrate a phase from (q, v), and return its end for each batch element.
 
-    Errors are those of `hybrid.integrate_phase`. In a large batch, as on a GPU, the last
-    `straggler_count` elements are cut off if they take `STRAGGLER_FACTOR` times as long as half of
-    the batch. They are marked unfinished, and the caller runs them again together with other
-    stragglers. The result is differentiable with respect to `constants`, `held_constants`, `q` and
-    `v`, see `tangents`.
+    Each active element is integrated to its earliest event. Errors are those of
+    `hybrid.integrate_phase`. In a large batch, as on a GPU, the last `straggler_count` elements are
+    cut off if they take `STRAGGLER_FACTOR` times as many iterations as half of the batch. They are
+    marked unfinished, and the caller integrates them again together with other stragglers. The
+    result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
+    `tangents`.
     """
     integrate = jax.custom_jvp(
-        lambda *arguments: _integrate_to_event(phase_of, tableau, None, *arguments).phase_end
+        lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
     )
 
     @integrate.defjvp
     @with_default_settings
     def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
-        def implicit_dynamics_of(*constants: Any) -> ImplicitDynamics:
-            implicit_dynamics = phase_of(*constants).implicit_dynamics
+        def make_implicit_dynamics(*constants: Any) -> ImplicitDynamics:
+            implicit_dynamics = make_phase(*constants).implicit_dynamics
             assert implicit_dynamics is not None
             return implicit_dynamics
 
@@ -154,10 +162,12 @@ def integrate_batch_phase(
             constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
-                implicit_dynamics_of, primals[0], primals[1], constants_tangents, start_tangents
+                make_implicit_dynamics, primals[0], primals[1], constants_tangents, start_tangents
             )
-            phase_run = _integrate_to_event(phase_of, tableau, phase_tangents, *primals)
-            return phase_run.phase_end, _phase_end_jvp(phase_of, tableau, phase_tangents, phase_run)
+            phase_run = _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
+            return phase_run.phase_end, _phase_end_jvp(
+                make_phase, tableau, phase_tangents, phase_run
+            )
 
         end, (q, v, event_time_tangent, minima) = batched_jvp_rule(
             evaluate_with_tangents, primals, tangents[:4]
@@ -168,11 +178,13 @@ def integrate_batch_phase(
             state=state_tangent, duration=event_time_tangent, minima=minima
         )
 
-    return integrate(constants, held_constants, q, v, active, initial_dt, options, straggler_count)
+    return integrate(
+        constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
+    )
 
 
 class _PhaseRun(NamedTuple):
-    """Steps and end of a phase, and the intermediate results."""
+    """End of a phase with the intermediate results that its tangents require."""
 
     step_function: StepFn
     start: StageState
@@ -183,14 +195,14 @@ class _PhaseRun(NamedTuple):
 
 
 def _phase_end_jvp(
-    phase_of: BatchPhaseFn,
+    make_phase: BatchPhaseFn,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
     phase_run: _PhaseRun,
 ) -> tuple[Vector, Vector, Array, Array | None]:
     """Return the tangents of a phase's end for tangents of its start and constants.
 
-    They are those of the positions, the rates, the duration, and the minima of the margins.
+    They are the tangents of positions, rates, duration and minima of the margins, directions first.
     """
     step_function, start, phase_end, integrator_state, minima, minima_result = phase_run
     n, has_crossed = len(start.q), integrator_state.status == IntegrationStatus.CROSSED
@@ -203,7 +215,7 @@ def _phase_end_jvp(
 
     end_state, tangent_rows = rk_step.end, tuple(jnp.moveaxis(tangents, 1, 0))
     event_time_tangent = _event_time_jvp(
-        phase_of, phase_tangents, end_state, tangents, integrator_state, phase_end.guard
+        make_phase, phase_tangents, end_state, tangents, integrator_state, phase_end.guard
     )
     motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
     state_tangents = tuple(
@@ -212,15 +224,15 @@ def _phase_end_jvp(
     minima_tangents = None
     if minima is not None and minima_result is not None:
 
-        def margins_of(*constants: Any) -> tuple[MarginFunctions, AccelerationFn]:
-            phase = phase_of(*constants)
+        def make_margins(*constants: Any) -> tuple[MarginFunctions, AccelerationFn]:
+            phase = make_phase(*constants)
             assert phase.margins is not None
             return phase.margins, phase.evaluate
 
         phase_ends = start, phase_end.state
         end_tangents = jnp.stack([*state_tangents, *tangent_rows[2 * n :]], 1)
         minima_tangents = minima_jvp(
-            margins_of,
+            make_margins,
             step_function,
             tableau,
             phase_tangents,
@@ -233,26 +245,28 @@ def _phase_end_jvp(
 
 
 def _event_time_jvp(
-    phase_of: BatchPhaseFn,
+    make_phase: BatchPhaseFn,
     phase_tangents: PhaseTangents,
     end_state: StageState,
     tangents: Array,
     integrator_state: _IntegratorState,
-    guard: Array,
+    event_guard: Array,
 ) -> Array:
-    """Return the tangent of the event's time, s: the guard vanishes along the perturbed motion."""
+    """Return the tangent of the event's time, s, from the condition that the guard vanishes
+    along the perturbed motion.
+    """
 
     def evaluate_guards(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Vector:
-        phase = phase_of(constants, held_constants)
+        phase = make_phase(constants, held_constants)
         return phase.guards(StageState(q, v, phase.evaluate(q, v)))
 
-    phase = phase_of(phase_tangents.constants, phase_tangents.held_constants)
-    _, rates = values_and_rates(phase.guards, phase.evaluate, end_state)
-    guard_tangents = phase_tangents.value_tangents(evaluate_guards, end_state, tangents)
+    phase = make_phase(phase_tangents.constants, phase_tangents.held_constants)
+    _, rates = evaluate_with_rates(phase.guards, phase.evaluate, end_state)
+    guard_tangents = phase_tangents.evaluate_tangents(evaluate_guards, end_state, tangents)
     has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     time_tangent = jnp.zeros_like(integrator_state.dt)
     for index, (rate, guard_tangent) in enumerate(zip(rates, guard_tangents, strict=True)):
-        is_event_guard = has_crossed & (guard == index) & (rate < 0.0)
+        is_event_guard = has_crossed & (event_guard == index) & (rate < 0.0)
         time_tangent = jnp.where(
             is_event_guard, -guard_tangent / jnp.where(is_event_guard, rate, -1.0), time_tangent
         )
@@ -260,33 +274,33 @@ def _event_time_jvp(
 
 
 def _integrate_to_event(
-    phase_of: BatchPhaseFn,
+    make_phase: BatchPhaseFn,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents | None,
     constants: Any,
     held_constants: Vector,
     q: Vector,
     v: Vector,
-    active: Array,
+    is_active: Array,
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None,
 ) -> _PhaseRun:
-    """Integrate a phase and locate its event and the minima of its margins."""
-    phase = phase_of(constants, held_constants)
+    """Integrate a phase, locate its event and the minima of its margins, and return all results."""
+    phase = make_phase(constants, held_constants)
     phase = _wrap_phase_functions(phase, noinline if phase.is_noinline else jax.jit)
     step_function = _make_step_function(phase, tableau)
     start = StageState(q, v, phase.evaluate(q, v))
-    values, rates = values_and_rates(phase.guards, phase.evaluate, start)
-    is_past = tuple(
+    values, rates = evaluate_with_rates(phase.guards, phase.evaluate, start)
+    is_met_at_start = tuple(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(values, rates, strict=True)
     )
-    # Index of the first guard whose event is the start itself; -1 if there is none.
-    immediate_guard = jnp.full(is_past[0].shape, -1, jnp.int32)
-    for index in range(len(is_past) - 1, -1, -1):
-        immediate_guard = jnp.where(is_past[index], index, immediate_guard)
-    is_started = active & (immediate_guard < 0)
+    # The index is that of the first guard whose event is the start itself; -1 if there is none.
+    start_guard = jnp.full(is_met_at_start[0].shape, -1, jnp.int32)
+    for guard_index in range(len(is_met_at_start) - 1, -1, -1):
+        start_guard = jnp.where(is_met_at_start[guard_index], guard_index, start_guard)
+    is_started = is_active & (start_guard < 0)
 
     integrator_state = _integrate_until_crossing(
         phase,
@@ -302,7 +316,7 @@ def _integrate_to_event(
     )
     has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     if phase.margins is not None or phase_tangents is not None:
-        # The program is long, and the search for minima makes it longer.
+        # The functions are called, not inlined, because the program is already long.
         phase = _wrap_phase_functions(phase, noinline)
         step_function = _make_step_function(phase, tableau)
     crossing_step = CrossingStep(
@@ -316,7 +330,7 @@ def _integrate_to_event(
     search = locate_event(
         phase.guards, phase.evaluate, step_function, tableau, crossing_step, options
     )
-    is_lost = has_crossed & search.is_unresolved
+    is_event_unresolved = has_crossed & search.is_unresolved
     duration = integrator_state.time + jnp.where(has_crossed, search.length, 0.0)
     end_state = tree_where(has_crossed, search.end, integrator_state.state)
     minima, minima_result = integrator_state.minima, None
@@ -330,15 +344,17 @@ def _integrate_to_event(
         minima_result = refine_minima(
             phase.margins, step_function, phase.evaluate, minima, start_margins, options
         )
-    is_late = has_crossed & ~search.is_unresolved & (duration > options.max_phase_time)
-    guard = jnp.where(
-        active & (immediate_guard >= 0), immediate_guard, jnp.where(has_crossed, search.guard, -1)
+    is_straggler = has_crossed & ~search.is_unresolved & (duration > options.max_phase_time)
+    event_guard = jnp.where(
+        is_active & (start_guard >= 0),
+        start_guard,
+        jnp.where(has_crossed, search.guard, -1),
     )
     phase_end = BatchPhaseEnd(
         state=end_state,
         duration=duration,
-        guard=jnp.where(is_lost | is_late, -1, guard),
-        timed_out=(integrator_state.status == IntegrationStatus.TIMED_OUT) | is_late,
+        guard=jnp.where(is_event_unresolved | is_straggler, -1, event_guard),
+        timed_out=(integrator_state.status == IntegrationStatus.TIMED_OUT) | is_straggler,
         is_unfinished=integrator_state.status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_crossed, search.n_tried_steps, 0),
@@ -349,12 +365,16 @@ def _integrate_to_event(
 
 
 def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> StepFn:
-    """Return the phase's step function, which is traced once for all its calls."""
+    """Return the phase's Runge-Kutta step as a function of state and length, traced once for all
+    its calls.
+    """
     return jax.jit(lambda state, h: rk_step(tableau, phase.evaluate, state, h))
 
 
 def _wrap_phase_functions(phase: BatchPhase, wrap: Callable) -> BatchPhase:
-    """Return the phase with wrapped functions, each of which is traced once for all its calls."""
+    """Return the phase with its functions wrapped by `wrap`, so that each is traced once for all
+    its calls.
+    """
     margins = phase.margins
     if margins is not None:
         margins = margins._replace(evaluate_margins=wrap(margins.evaluate_margins))
@@ -373,8 +393,8 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> _IntegratorState:
-    """Return the state after adaptive steps until each element has crossed a guard, run out of time
-    or failed.
+    """Take adaptive steps until each element has crossed a guard, reached the time limit or
+    failed, and return the state.
     """
 
     def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
@@ -384,15 +404,15 @@ def _integrate_until_crossing(
         squared_error = _mean_squared_error(
             rk_step, integrator_state.state, end_values, options, phase.state_units
         )
-        dip_fraction = earliest_dip_fraction(
+        guard_minimum_fraction = earliest_guard_minimum_fraction(
             tableau, [integrator_state.guard_values, *stage_values, end_values]
         )
-        is_precise = squared_error <= 1.0
-        # A step in which a guard may dip is repeated up to the dip.
-        may_dip = is_precise & (dip_fraction < 1.0)
-        is_rejected = may_dip | ~is_precise
-        controller_factor = step_size_factor(tableau, squared_error, dip_fraction.dtype)
-        length_factor = jnp.where(may_dip, dip_fraction, controller_factor)
+        is_within_tolerance = squared_error <= 1.0
+        # A step inside which a guard may be negative is repeated up to the guard's minimum.
+        may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
+        is_rejected = may_cross_inside | ~is_within_tolerance
+        controller_factor = step_size_factor(tableau, squared_error, guard_minimum_fraction.dtype)
+        length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
         status, crossing_bits, is_accepted, time, length = _classify_step(
             options, integrator_state, length_factor, is_rejected, end_values
         )
@@ -413,7 +433,7 @@ def _integrate_until_crossing(
             (integrator_state.middle_values, integrator_state.end_values),
         )
         minima, tangents = integrator_state.minima, integrator_state.tangents
-        half_iterations = integrator_state.half_iterations
+        iterations_until_half_ended = integrator_state.iterations_until_half_ended
         if phase.margins is not None and minima is not None:
             margin_arguments = phase.margins, phase.evaluate
             accepted_step = AcceptedStep(
@@ -430,8 +450,10 @@ def _integrate_until_crossing(
             )
         if straggler_count is not None:
             n_running = jnp.sum(status == IntegrationStatus.RUNNING, dtype=jnp.int32)
-            half_iterations = jnp.where(
-                2 * n_running > status.size, integrator_state.iterations + 1, half_iterations
+            iterations_until_half_ended = jnp.where(
+                2 * n_running > status.size,
+                integrator_state.n_iterations + 1,
+                iterations_until_half_ended,
             )
         return _IntegratorState(
             state=state,
@@ -443,8 +465,8 @@ def _integrate_until_crossing(
             middle_values=new_middle_values,
             end_values=new_end_values,
             n_tried_steps=integrator_state.n_tried_steps + was_running,
-            half_iterations=half_iterations,
-            iterations=integrator_state.iterations + 1,
+            iterations_until_half_ended=iterations_until_half_ended,
+            n_iterations=integrator_state.n_iterations + 1,
             minima=minima,
             tangents=tangents,
         )
@@ -455,9 +477,9 @@ def _integrate_until_crossing(
         if straggler_count is None:
             return jnp.any(is_running)
         n_running = jnp.sum(is_running, dtype=jnp.int32)
-        max_iterations = STRAGGLER_FACTOR * integrator_state.half_iterations + 8
-        is_late = integrator_state.iterations > max_iterations
-        return (n_running > 0) & ~((n_running <= straggler_count) & is_late)
+        max_iterations = STRAGGLER_FACTOR * integrator_state.iterations_until_half_ended + 8
+        exceeds_iteration_limit = integrator_state.n_iterations > max_iterations
+        return (n_running > 0) & ~((n_running <= straggler_count) & exceeds_iteration_limit)
 
     initial_minima = phase.margins and init_minima(
         phase.margins, phase.evaluate, start, phase_tangents
@@ -475,8 +497,8 @@ def _integrate_until_crossing(
         middle_values=guard_values,
         end_values=guard_values,
         n_tried_steps=zero_counts,
-        half_iterations=zero_count,
-        iterations=zero_count,
+        iterations_until_half_ended=zero_count,
+        n_iterations=zero_count,
         minima=initial_minima,
         tangents=None if phase_tangents is None else phase_tangents.start_tangents,
     )
@@ -490,23 +512,24 @@ def _classify_step(
     is_rejected: Array,
     end_values: Vector,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return status, crossing guards, acceptance, time and next length of each element.
+    """Return status, bits of crossing guards, acceptance, time and next step length of each
+    element.
 
-    A dip that would not advance the time does not delay the element. The last step ends at the time
-    limit.
+    A guard's minimum so close to the start that the time would not advance does not delay the
+    element. The last step ends at the time limit.
     """
     is_running = integrator_state.status == IntegrationStatus.RUNNING
-    is_kept = is_running & ~is_rejected
+    is_valid_step = is_running & ~is_rejected
     crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
     for index, value in enumerate(end_values):
         crossing_bits = crossing_bits | jnp.where(value <= 0.0, 1 << index, 0)
-    has_crossed = is_kept & (crossing_bits > 0)
-    is_accepted = is_kept & ~has_crossed
-    dt, time, limit = integrator_state.dt, integrator_state.time, options.max_phase_time
-    end_time = jnp.where(dt == limit - time, limit, time + dt)
+    has_crossed = is_valid_step & (crossing_bits > 0)
+    is_accepted = is_valid_step & ~has_crossed
+    dt, time, time_limit = integrator_state.dt, integrator_state.time, options.max_phase_time
+    end_time = jnp.where(dt == time_limit - time, time_limit, time + dt)
     time = jnp.where(is_accepted, end_time, time)
-    next_length = jnp.minimum(dt * length_factor, limit - time)
-    has_timed_out = is_accepted & (time >= limit)
+    next_length = jnp.minimum(dt * length_factor, time_limit - time)
+    has_timed_out = is_accepted & (time >= time_limit)
     is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
         time + next_length == time
     )
@@ -532,21 +555,26 @@ def _mean_squared_error(
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
-    """Return the mean square of the error over its tolerance; infinite if the step is not finite.
+    """Return the mean square of the step's error over its tolerance; infinity if the step is not
+    finite.
 
-    An error estimate needs no more than the precision of float32.
+    It is computed in float32, because an error estimate needs no more precision.
     """
     start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
     to_float32 = lambda x: x.astype(jnp.float32)
-    total: Any = 0.0
-    units: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
-    for error, a, b, unit in zip(rk_step.error, start_numbers, end_numbers, units, strict=True):
-        tolerance = options.atol * unit + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+    sum_of_squares: Any = 0.0
+    units_of_state: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
+    for error, start_value, end_value, state_unit in zip(
+        rk_step.error, start_numbers, end_numbers, units_of_state, strict=True
+    ):
+        tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
+            jnp.abs(start_value), jnp.abs(end_value)
+        )
         ratio = to_float32(error) / to_float32(tolerance)
-        total = total + ratio * ratio
+        sum_of_squares = sum_of_squares + ratio * ratio
     for value in guards:
-        total = total + to_float32(0.0 * value)
-    return jnp.where(jnp.isfinite(total), total / len(start_numbers), jnp.inf)
+        sum_of_squares = sum_of_squares + to_float32(0.0 * value)
+    return jnp.where(jnp.isfinite(sum_of_squares), sum_of_squares / len(start_numbers), jnp.inf)
 
 
 def sample_batch_phase(
@@ -558,31 +586,32 @@ def sample_batch_phase(
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return positions, then rates, at equal times of a phase, ends included: (samples,
-    ., batch).
+    """Return positions, then rates, at `n_samples` equal times of a phase, ends included, as an
+    array (samples, 2 coordinates, batch).
     """
 
     def step_function(state: StageState, length: Array) -> tuple[StageState, Array]:
-        advanced = rk_step(tableau, phase.evaluate, state, length)
-        return advanced.end, _mean_squared_error(advanced, state, (), options, phase.state_units)
+        step = rk_step(tableau, phase.evaluate, state, length)
+        return step.end, _mean_squared_error(step, state, (), options, phase.state_units)
 
-    pack_state = lambda state: jnp.stack([*state.q, *state.v])
+    pack_sample = lambda state: jnp.stack([*state.q, *state.v])
     start = StageState(q, v, phase.evaluate(q, v))
     return sample_at_equal_times(
-        step_function, pack_state, start, tableau, duration, n_samples, options
+        step_function, pack_sample, start, tableau, duration, n_samples, options
     )
 
 
 def sample_at_equal_times(
     step_function: Callable[[Any, Array], tuple[Any, Array]],
-    sample_of: Callable[[Any], Array],
+    pack_sample: Callable[[Any], Array],
     start: Any,
     tableau: ButcherTableau,
     duration: Array,
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return `sample_of` the states at equal times, ends included, samples first.
+    """Return `pack_sample` of the states at `n_samples` equal times, ends included, on the first
+    axis.
 
     `step_function(state, length)` returns the end of a step of the tableau, and the square of its
     error over its tolerance.
@@ -594,17 +623,19 @@ def sample_at_equal_times(
         length = jnp.minimum(h, time_left)
         end, squared_error = step_function(state, length)
         length_factor = step_size_factor(tableau, squared_error, length.dtype)
-        is_kept = squared_error <= 1.0
-        # A step shortened to end at a sample is no reason to reduce the previous length.
+        is_within_tolerance = squared_error <= 1.0
+        # A step that was shortened to end at a sample does not reduce the next step's length.
         h = jnp.where(
-            is_kept & (length < h), jnp.maximum(h, length * length_factor), length * length_factor
+            is_within_tolerance & (length < h),
+            jnp.maximum(h, length * length_factor),
+            length * length_factor,
         )
         is_running = time_left > 0.0
         return (
-            tree_where(is_running & is_kept, end, state),
+            tree_where(is_running & is_within_tolerance, end, state),
             jnp.where(is_running, h, carry[1]),
             jnp.where(
-                is_running & is_kept,
+                is_running & is_within_tolerance,
                 jnp.where(length == time_left, 0.0, time_left - length),
                 time_left,
             ),
@@ -615,8 +646,8 @@ def sample_at_equal_times(
         needs_step = lambda carry: jnp.any(carry[2] > 0.0) & (carry[3] < options.max_solver_steps)
         initial_carry = (*carry, duration / (n_samples - 1), zero_count)
         state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_carry)
-        return (state, h), sample_of(state)
+        return (state, h), pack_sample(state)
 
     initial_carry = start, options.dt0 + jnp.zeros_like(duration)
     later_samples = lax.scan(integrate_to_next, initial_carry, None, length=n_samples - 1)[1]
-    return jnp.concatenate([sample_of(start)[None], later_samples])
+    return jnp.concatenate([pack_sample(start)[None], later_samples])

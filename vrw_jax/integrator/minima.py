@@ -1,8 +1,8 @@
-"""Minima of margins along a phase, for a batch, at the integrator's accuracy.
+"""Minima of margins along a phase, for a batch, as accurate as the integration.
 
-The method is that of `hybrid/minima` for one wheel. During the integration, the step that holds
+The method is that of `hybrid/minima` for one wheel. During the integration, the step that contains
 the lowest minimum of each margin is stored. Afterwards, secant steps on the margin's rate locate
-it, one margin after the other.
+the minimum, one margin after the other.
 """
 
 import functools
@@ -27,30 +27,34 @@ from vrw_jax.numerics import (
 
 
 class MarginFunctions(NamedTuple):
-    """Margins whose minima are searched."""
+    """Margins whose minima are computed, as a function of the state."""
 
     evaluate_margins: Callable[[StageState], Vector]
-    includes_start: tuple[bool, ...]  # whether the start counts, see `hybrid.MonitoredFunctions`
+    # whether the margin at the phase's start counts, see `hybrid.MonitoredFunctions`
+    includes_start: tuple[bool, ...]
 
 
 class MinimaState(NamedTuple):
-    """Margins at the present state, and the step that holds the lowest minimum of each so far."""
+    """Margins at the present state, and the step that contains the lowest minimum of each so
+    far.
+    """
 
-    values: Array  # (margins, batch)
+    values: Array  # margins at the present state, (margins, batch)
     rates: Array
-    lowest_values: Array  # lowest interior minimum, (margins, batch); infinite if there is none
-    start_q: Array  # start of that step, (margins, coordinates, batch)
+    lowest_values: Array  # lowest interior minimum, (margins, batch); infinity if there is none
+    start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
     start_v: Array
-    step_length: Array  # of that step, (margins, batch), s
-    minimum_offset: Array  # of the minimum from the step's start, s
-    start_rates: Array  # at the step's start
-    start_tangents: Array | None = None  # of that start, (margins, directions, ., batch)
+    step_length: Array  # length of that step, (margins, batch), s
+    minimum_offset: Array  # time from the step's start to the minimum, s
+    start_rates: Array  # rates of the margins at the step's start
+    # tangents of that start, (margins, directions, components, batch)
+    start_tangents: Array | None = None
 
 
-def values_and_rates(
+def evaluate_with_rates(
     function: Callable[[StageState], Vector], evaluate: AccelerationFn, state: StageState
 ) -> tuple[Vector, Vector]:
-    """Return a function of the state and its time derivatives along the motion."""
+    """Return the values of `function` at a state, and their time derivatives along the motion."""
     n = len(state.q)
 
     def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
@@ -67,14 +71,14 @@ def init_minima(
     state: StageState,
     phase_tangents: PhaseTangents | None,
 ) -> MinimaState:
-    """Return the minima before the first step.
+    """Return the state of the search for minima before the first step.
 
-    A margin that is zero at the start by construction has no negative rate there except for
-    round-off, which counts as zero.
+    A margin that is zero at the start by construction has no negative rate there except round-off,
+    so a negative rate counts as zero.
     """
-    values, rates = map(jnp.stack, values_and_rates(margins.evaluate_margins, evaluate, state))
+    values, rates = map(jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate, state))
     includes_start = jnp.asarray(margins.includes_start)[:, None]
-    zeros = jnp.zeros_like(values)
+    infinite_minima = jnp.zeros_like(values)
     zero_starts = jnp.zeros((len(values), len(state.q), values.shape[-1]), values.dtype)
     rates = jnp.where(includes_start, rates, jnp.maximum(rates, 0.0))
     zero_tangents = (
@@ -83,18 +87,26 @@ def init_minima(
         else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(values))
     )
     return MinimaState(
-        values, rates, zeros + jnp.inf, zero_starts, zero_starts, zeros, zeros, zeros, zero_tangents
+        values,
+        rates,
+        infinite_minima + jnp.inf,
+        zero_starts,
+        zero_starts,
+        infinite_minima,
+        infinite_minima,
+        infinite_minima,
+        zero_tangents,
     )
 
 
 class AcceptedStep(NamedTuple):
-    """A solver step of the batch elements that accepted it."""
+    """A solver step, and which batch elements accepted it."""
 
     start: StageState
     end: StageState
     length: Array
     is_accepted: Array
-    start_tangents: Array | None  # of the step's start
+    start_tangents: Array | None  # tangents of the step's start
 
 
 def update_minima(
@@ -103,10 +115,12 @@ def update_minima(
     minima: MinimaState,
     accepted_step: AcceptedStep,
 ) -> MinimaState:
-    """Return the minima, updated with the interior minima of an accepted step."""
+    """Return the minima, updated with those inside an accepted step."""
     start, end, length, is_accepted, _ = accepted_step
-    values, rates = map(jnp.stack, values_and_rates(margins.evaluate_margins, evaluate, end))
-    x, value = find_cubic_minimum(minima.values, minima.rates * length, values, rates * length)
+    values, rates = map(jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate, end))
+    location, value = find_cubic_minimum(
+        minima.values, minima.rates * length, values, rates * length
+    )
     value = jnp.where(jnp.isfinite(value), value, jnp.minimum(minima.values, values))
     has_minimum = (minima.rates < 0.0) & (rates >= 0.0)
     is_lower = is_accepted & has_minimum & (value < minima.lowest_values)
@@ -126,25 +140,25 @@ def update_minima(
         start_q=replace_start_if_lower(start.q, minima.start_q),
         start_v=replace_start_if_lower(start.v, minima.start_v),
         step_length=replace_if_lower(length, minima.step_length),
-        minimum_offset=replace_if_lower(x * length, minima.minimum_offset),
+        minimum_offset=replace_if_lower(location * length, minima.minimum_offset),
         start_rates=replace_if_lower(minima.rates, minima.start_rates),
         start_tangents=start_tangents,
     )
 
 
 class MinimaResult(NamedTuple):
-    """Minima of margins over a phase, each of shape (margins, batch)."""
+    """Minima of margins over a phase, each an array (margins, batch)."""
 
-    phase_minima: Array  # ends included
-    interior_minima: Array  # infinite if there is none
-    length_to_minimum: Array  # of the step to the interior minimum, from the stored start
+    phase_minima: Array  # minima over the phase, ends included
+    interior_minima: Array  # interior minima; infinity if there is none
+    length_to_minimum: Array  # length of the step from the stored start to the interior minimum, s
 
 
 class _MinimumSearch(NamedTuple):
-    """State of the secant steps to the minimum of one margin."""
+    """State of the secant iteration for the minimum of one margin, for each batch element."""
 
-    length: Array  # of the next try
-    best_length: Array  # length with the smallest rate so far
+    length: Array  # length of the next try, s
+    best_length: Array  # length with the smallest rate so far, s
     best_rate: Array
     value: Array
     is_unresolved: Array
@@ -159,13 +173,13 @@ def refine_minima(
     start_values: Array,
     options: StepOptions,
 ) -> MinimaResult:
-    """Return the minima over the phase; `start_values` are the margins at its start.
+    """Return the minima of the margins over the phase; `start_values` are the margins at its start.
 
-    Each minimum takes at most `max_margin_search_iterations` secant steps, all from the start of
-    the step that holds it.
+    Each minimum takes at most `max_margin_search_iterations` secant steps. All of them begin at the
+    start of the step that contains the minimum.
     """
 
-    def refine_one(_: None, inputs: tuple) -> tuple[None, tuple[Array, Array]]:
+    def refine_margin(_: None, inputs: tuple) -> tuple[None, tuple[Array, Array]]:
         index, margin_state = inputs
         q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
         start = StageState(q, v, evaluate(q, v))
@@ -178,7 +192,7 @@ def refine_minima(
 
         def improve(search: _MinimumSearch) -> _MinimumSearch:
             end = step_function(start, search.length).end
-            (value,), (rate,) = values_and_rates(
+            (value,), (rate,) = evaluate_with_rates(
                 lambda state: (selected_margin(state),), evaluate, end
             )
             length_change = search.length - search.best_length
@@ -206,13 +220,13 @@ def refine_minima(
             )
 
         has_minimum = jnp.isfinite(margin_state.lowest_values)
-        zero = jnp.zeros_like(margin_state.step_length)
+        zero_length = jnp.zeros_like(margin_state.step_length)
         n_iterations = jnp.zeros((), jnp.int32)
         search = _MinimumSearch(
             margin_state.minimum_offset,
-            zero,
+            zero_length,
             margin_state.start_rates,
-            zero + jnp.inf,
+            zero_length + jnp.inf,
             has_minimum,
             n_iterations,
         )
@@ -225,15 +239,15 @@ def refine_minima(
 
     includes_start = np.asarray(margins.includes_start)[:, None]
     end_minima = jnp.minimum(jnp.where(includes_start, start_values, jnp.inf), minima.values)
-    indices = jnp.arange(len(includes_start), dtype=jnp.int32)
+    margin_indices = jnp.arange(len(includes_start), dtype=jnp.int32)
     interior_minima, length = lax.scan(
-        refine_one, None, (indices, minima._replace(start_tangents=None))
+        refine_margin, None, (margin_indices, minima._replace(start_tangents=None))
     )[1]
     return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, length)
 
 
 def minima_jvp(
-    margins_of: Callable[..., tuple[MarginFunctions, AccelerationFn]],
+    make_margins: Callable[..., tuple[MarginFunctions, AccelerationFn]],
     step_function: StepFn,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
@@ -242,21 +256,21 @@ def minima_jvp(
     phase_ends: tuple[StageState, StageState],
     end_tangents: Array,
 ) -> Array:
-    """Return the tangents of the minima, directions first.
+    """Return the tangents of the minima, an array (directions, margins, batch).
 
-    They are tangents along the motion at each minimum, because its location has no first-order
-    effect. `phase_ends`: the start and the end of the phase; `end_tangents`: tangents of the end
-    state.
+    They are tangents of the margins at fixed times of the minima, because the shift of a minimum
+    has no first-order effect. `phase_ends` are the start and the end of the phase, and
+    `end_tangents` the tangents of the end state.
     """
-    margins, evaluate = margins_of(phase_tangents.constants, phase_tangents.held_constants)
+    margins, evaluate = make_margins(phase_tangents.constants, phase_tangents.held_constants)
 
     def evaluate_margins(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Array:
-        margin_functions, acceleration_of = margins_of(constants, held_constants)
+        margin_functions, acceleration_of = make_margins(constants, held_constants)
         return jnp.stack(margin_functions.evaluate_margins(StageState(q, v, acceleration_of(q, v))))
 
-    tangents_of_margins = functools.partial(phase_tangents.value_tangents, evaluate_margins)
+    tangents_of_margins = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
-    def tangent_of_one(_: None, inputs: tuple) -> tuple[None, Array]:
+    def tangent_of_margin(_: None, inputs: tuple) -> tuple[None, Array]:
         index, margin_state, length = inputs
         q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
         start = StageState(q, v, evaluate(q, v))
@@ -269,14 +283,16 @@ def minima_jvp(
             jnp.where(is_selected[:, None], tangents_of_margins(rk_step.end, tangents), 0.0), 1
         )
 
-    indices = jnp.arange(len(result.phase_minima), dtype=jnp.int32)
+    margin_indices = jnp.arange(len(result.phase_minima), dtype=jnp.int32)
     interior_tangents = jnp.moveaxis(
-        lax.scan(tangent_of_one, None, (indices, minima, result.length_to_minimum))[1], 0, 1
+        lax.scan(tangent_of_margin, None, (margin_indices, minima, result.length_to_minimum))[1],
+        0,
+        1,
     )
-    first_tangents = tangents_of_margins(phase_ends[0], phase_tangents.start_tangents)
-    last_tangents = tangents_of_margins(phase_ends[1], end_tangents)
+    start_tangents = tangents_of_margins(phase_ends[0], phase_tangents.start_tangents)
+    end_margin_tangents = tangents_of_margins(phase_ends[1], end_tangents)
     end_minima_tangents = jnp.where(
-        minima.values <= result.phase_minima, last_tangents, first_tangents
+        minima.values <= result.phase_minima, end_margin_tangents, start_tangents
     )
     return jnp.where(
         result.interior_minima <= result.phase_minima, interior_tangents, end_minima_tangents

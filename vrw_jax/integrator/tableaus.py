@@ -1,8 +1,8 @@
-"""One explicit Runge-Kutta step for a batch, with separate arrays per component.
+"""One explicit Runge-Kutta step for a batch, with a separate array for each component.
 
 The equations of motion are of second order, q'' = f(q, q'), so a step stores only the accelerations
-of its stages. Positions use the square of the tableau's matrix, rates the matrix. The method is the
-same, with half of the stored derivatives. The tableaus are those of diffrax.
+of its stages. Rates follow from them by the tableau's matrix, positions by its square. The method
+is the same with half of the stored derivatives. The tableaus are those of diffrax.
 """
 
 import functools
@@ -25,12 +25,12 @@ from vrw_jax.numerics import Vector, run_if_any
 
 
 class ButcherTableau(NamedTuple):
-    """An explicit method whose last stage is the step's end and the first stage of the
-    next step.
+    """An explicit Runge-Kutta method whose last stage is the step's end and the first stage of
+    the next step.
     """
 
     order: int
-    nodes: np.ndarray  # Butcher's c: of the stages, in step lengths
+    nodes: np.ndarray  # Butcher's c: times of the stages, in step lengths
     matrix: np.ndarray  # Butcher's A: from accelerations to rates
     matrix_squared: np.ndarray  # A squared: from accelerations to positions
     b_error: np.ndarray
@@ -38,15 +38,17 @@ class ButcherTableau(NamedTuple):
     middle_stage: int
     """Index of a stage well inside the step, at which the parabolas through guards are fitted."""
     guard_stages: tuple[int, ...]
-    """Stages separated from each other and from both ends, at which guards are sampled to find
-    dips."""
+    """Indices of the stages at which guards are sampled to find minima inside a step. They are
+    separated from each other and from both ends.
+    """
     bernstein_matrix: np.ndarray
-    """Matrix from guard values to the inner Bernstein coefficients of the polynomial through them,
-    which does not fall below its least coefficient. The values are those at the start, at
-    `guard_stages` and at the end."""
+    """Matrix from guard values to the inner Bernstein coefficients of the polynomial through
+    them. The polynomial does not fall below its least coefficient. The values are those at the
+    start, at `guard_stages` and at the end.
+    """
 
     def __eq__(self, other: object) -> bool:
-        return self is other  # `load_explicit_tableau` creates each tableau once
+        return self is other  # `load_explicit_tableau` creates each tableau once.
 
     def __hash__(self) -> int:
         return id(self)
@@ -54,7 +56,8 @@ class ButcherTableau(NamedTuple):
 
 @functools.cache
 def load_explicit_tableau(name: str) -> ButcherTableau | None:
-    """Return diffrax's tableau of that name; None if the method is not explicit Runge-Kutta.
+    """Return diffrax's tableau of that name; None if the method is not an explicit Runge-Kutta
+    method.
 
     The numbers are stored beside this file, because loading diffrax takes a fifth of a cached
     start.
@@ -87,16 +90,17 @@ def load_explicit_tableau(name: str) -> ButcherTableau | None:
 
 
 GUARD_STAGE_NODES = (0.15, 0.47, 0.92)
-"""Approximate nodes at which guards are sampled inside a step.
+"""Nodes, in step lengths, near which guards are sampled inside a step.
 
-They are chosen nearer to the ends than equally spaced nodes, because a dip just after the start or
-before the end is the hardest to detect.
+They are chosen nearer to the ends than equally spaced nodes, because a minimum just after the start
+or before the end is the hardest to detect.
 """
 
 
 def _choose_guard_stages(nodes: np.ndarray) -> tuple[int, ...]:
-    """Return the stages nearest to GUARD_STAGE_NODES; of several at one node the last, most
-    accurate.
+    """Return the indices of the stages nearest to GUARD_STAGE_NODES.
+
+    Of several stages at one node the last one is returned, because it is the most accurate.
     """
     last_stage = {round(float(node), 3): i for i, node in enumerate(nodes) if 0.05 < node < 0.95}
     nearest_nodes = {
@@ -108,16 +112,19 @@ def _choose_guard_stages(nodes: np.ndarray) -> tuple[int, ...]:
 
 
 def _make_bernstein_matrix(nodes: np.ndarray) -> np.ndarray:
-    """Return the matrix of inner Bernstein coefficients for values at nodes of [0, 1]."""
+    """Return the matrix from a polynomial's values at `nodes` in [0, 1] to its inner Bernstein
+    coefficients.
+    """
     n = len(nodes) - 1
-    basis = [math.comb(n, i) * nodes**i * (1.0 - nodes) ** (n - i) for i in range(n + 1)]
-    return np.linalg.inv(np.stack(basis, 1))[1:-1]
+    bernstein_basis = [math.comb(n, i) * nodes**i * (1.0 - nodes) ** (n - i) for i in range(n + 1)]
+    return np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1]
 
 
 def fit_guard_parabola(
     tableau: ButcherTableau, start_value: Array, middle_value: Array, end_value: Array
 ) -> tuple[Array, Array]:
-    """Return curvature and rate, in step lengths, of the parabola through a guard's values.
+    """Return curvature and rate at the start, in step lengths, of the parabola through a guard's
+    values.
 
     `middle_value` is the guard at the stage `middle_stage`.
     """
@@ -129,76 +136,83 @@ def fit_guard_parabola(
 
 
 def _bernstein_coefficients(tableau: ButcherTableau, values: list[Array]) -> list[Array]:
-    """Return a guard's Bernstein coefficients except the last; the guard is positive if all are.
+    """Return a guard's Bernstein coefficients except the last; the guard is positive if all of them
+    are.
 
-    `values` are those at the start, at the `guard_stages`, and at the end.
+    `values` are the guard's values at the start, at the `guard_stages`, and at the end.
     """
     return [values[0], *(_weighted_sum(row, values) for row in tableau.bernstein_matrix)]
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
-def _may_dip(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
+@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
+def _may_cross_inside(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
     """Return whether a guard may fall below zero inside a step and be positive again at its end."""
     coefficients = _bernstein_coefficients(tableau, guard_values)
     return (functools.reduce(jnp.minimum, coefficients) <= 0.0) & (guard_values[-1] > 0.0)
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once, for whichever guard
-def find_dip(tableau: ButcherTableau, values: list[Array]) -> tuple[Array, Array]:
-    """Return whether a guard may dip and rises somewhere, and the fraction of the step to try
-    first.
+@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
+def find_guard_minimum(tableau: ButcherTableau, values: list[Array]) -> tuple[Array, Array]:
+    """Return whether a guard may have a negative minimum inside a step, and the fraction of the
+    step to that minimum.
 
-    A guard that only decays is no dip, however steep. The fraction is the node of the lowest
-    Bernstein coefficient. `values`: at the start, at the `guard_stages`, at the end.
+    The fraction is the node of the lowest Bernstein coefficient. A guard that only decreases has no
+    minimum. `values` are the guard's values at the start, at the `guard_stages`, and at the end.
     """
     min_coefficient, *inner_coefficients = _bernstein_coefficients(tableau, values)
-    dip_fraction = jnp.zeros_like(min_coefficient)
+    minimum_fraction = jnp.zeros_like(min_coefficient)
     for i, coefficient in enumerate(inner_coefficients):
-        dip_fraction = jnp.where(
-            coefficient < min_coefficient, (i + 1) / len(values[1:]), dip_fraction
+        minimum_fraction = jnp.where(
+            coefficient < min_coefficient, (i + 1) / len(values[1:]), minimum_fraction
         )
         min_coefficient = jnp.minimum(coefficient, min_coefficient)
     is_rising = inner_coefficients[-1] < values[-1]
-    for previous_value, next_value in itertools.pairwise(values):
-        is_rising = is_rising | (previous_value < next_value)
-    has_dip = (min_coefficient <= 0.0) & (dip_fraction > 0.0) & is_rising & (values[-1] > 0.0)
-    return has_dip, dip_fraction
+    for preceding_coefficient, following_coefficient in itertools.pairwise(values):
+        is_rising = is_rising | (preceding_coefficient < following_coefficient)
+    has_guard_minimum = (
+        (min_coefficient <= 0.0) & (minimum_fraction > 0.0) & is_rising & (values[-1] > 0.0)
+    )
+    return has_guard_minimum, minimum_fraction
 
 
-def earliest_dip_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -> Array:
-    """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
-    none.
+def earliest_guard_minimum_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -> Array:
+    """Return the fraction of the step to the earliest minimum at which some guard may be negative;
+    1 if there is none.
 
-    `guard_values`: at the start, at the `guard_stages` and at the end. The dip is located only if
-    some batch element of the group may have one.
+    `guard_values` are the guards at the start, at the `guard_stages` and at the end. The minimum is
+    located only if some batch element of the group may have one.
     """
     values_by_guard = [list(values) for values in zip(*guard_values, strict=True)]
-    may_dip = functools.reduce(
-        operator.or_, (_may_dip(tableau, values) for values in values_by_guard)
+    may_cross_inside = functools.reduce(
+        operator.or_, (_may_cross_inside(tableau, values) for values in values_by_guard)
     )
 
-    def find_first_dip(fraction: Array) -> Array:
+    def find_first_minimum(fraction: Array) -> Array:
         for values in values_by_guard:
-            has_dip, dip_fraction = find_dip(tableau, values)
-            fraction = jnp.where(has_dip, jnp.minimum(fraction, dip_fraction), fraction)
+            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, values)
+            fraction = jnp.where(
+                has_guard_minimum, jnp.minimum(fraction, minimum_fraction), fraction
+            )
         return fraction
 
     whole_step = jnp.ones_like(guard_values[0][0])
-    return run_if_any(jnp.any(may_dip), find_first_dip, whole_step)
+    return run_if_any(jnp.any(may_cross_inside), find_first_minimum, whole_step)
 
 
 @dataclass(frozen=True)
 class StepSizeController:
-    """Parameters of the step-size controller, chosen because they are usual for explicit methods
-    (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, Section II.4).
+    """Parameters of the step-size controller.
+
+    They are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner, Solving
+    Ordinary Differential Equations I, Section II.4).
     """
 
     safety_factor: float = 0.9
-    """Factor on the length that would meet the tolerance exactly."""
+    """Factor on the step length that would meet the tolerance exactly."""
     min_factor: float = 0.2
-    """Least ratio of successive lengths."""
+    """Least ratio of successive step lengths."""
     max_factor: float = 5.0
-    """Largest ratio of successive lengths; after a rejected step it is 1."""
+    """Largest ratio of successive step lengths; after a rejected step the ratio is at most 1."""
 
 
 STEP_SIZE_CONTROLLER = StepSizeController()
@@ -210,7 +224,10 @@ def step_size_factor(
     dtype: Any,
     controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
-    """Return the next step's length over this one's, from its squared error over tolerance."""
+    """Return the ratio of the next step's length to this one's.
+
+    `squared_error` is the mean square of the step's error over its tolerance.
+    """
     error_power = jnp.exp(
         jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.order)
     ).astype(dtype)
@@ -222,29 +239,32 @@ def step_size_factor(
 
 
 def _zero_roundoff(x: np.ndarray) -> np.ndarray:
-    """Return the products of a tableau with entries that are only round-off set to zero."""
+    """Return the matrix with entries that are only round-off set to zero."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
 class StageAcceleration(NamedTuple):
     """Accelerations at one state, with the sine and cosine of theta."""
 
-    sin: Array  # of theta
+    sin: Array  # sine of theta
     cos: Array
-    acceleration: Vector  # of all three coordinates, those of the phase first
+    acceleration: Vector  # accelerations of all three coordinates, those of the phase first
 
 
 def real_stability_limit(tableau: ButcherTableau) -> float:
-    """Return the largest z with |R(-z)| <= 1: a mode of decay rate r allows steps up to z / r."""
+    """Return the largest z with |R(-z)| <= 1, where R is the method's stability function.
+
+    A mode that decays at the rate r allows steps up to z / r.
+    """
     z, stages, amplification = np.linspace(0.01, 20.0, 2000), np.ones(len(tableau.nodes)), 1.0
-    for power in range(1, len(stages) + 1):  # R is the polynomial 1 - z w (1 - z A + ...)
-        amplification = amplification + (-z) ** power * (tableau.matrix[-1] @ stages)
+    for matrix_power in range(1, len(stages) + 1):  # R is the polynomial 1 - z w (1 - z A + ...).
+        amplification = amplification + (-z) ** matrix_power * (tableau.matrix[-1] @ stages)
         stages = tableau.matrix @ stages
     return float(z[np.argmax(np.abs(amplification) > 1.0 + 1e-12)])
 
 
 class StageState(NamedTuple):
-    """Positions, rates and accelerations of one stage."""
+    """Positions, rates and accelerations of one stage, each a tuple of arrays (batch,)."""
 
     q: Vector
     v: Vector
@@ -255,7 +275,7 @@ class RKStep(NamedTuple):
     """A Runge-Kutta step: its end, the error estimate, and its stages."""
 
     end: StageState
-    error: Vector  # of positions, then rates
+    error: Vector  # error estimates of the positions, then of the rates
     stage_states: list[StageState]  # the start first, the end last
 
 
@@ -270,7 +290,9 @@ def rk_step(
     h: Array,
     with_error: bool = True,
 ) -> RKStep:
-    """Take one Runge-Kutta step of length `h` from `start`, elementwise over the batch."""
+    """Take one Runge-Kutta step of length `h`, s, from `start`, and return its end, error and
+    stages.
+    """
     n = len(start.q)
     stage_states, stage_accelerations = [start], [start.acceleration.acceleration[:n]]
     for i in range(1, len(tableau.nodes)):
@@ -282,7 +304,8 @@ def rk_step(
     error: Vector = ()
     if with_error:
         accelerations_by_coordinate = [
-            [stage_acceleration[d] for stage_acceleration in stage_accelerations] for d in range(n)
+            [stage_acceleration[coordinate] for stage_acceleration in stage_accelerations]
+            for coordinate in range(n)
         ]
         position_errors = [
             h * h * _weighted_sum(tableau.b_error_position, accelerations)
@@ -296,7 +319,7 @@ def rk_step(
     return RKStep(stage_states[-1], error, stage_states)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))  # traced once for all steps
+@functools.partial(jax.jit, static_argnums=(0, 1))  # The function is traced once for all steps.
 def evaluate_stage(
     tableau: ButcherTableau,
     stage_index: int,
@@ -305,26 +328,30 @@ def evaluate_stage(
     stage_accelerations: list[Vector],
     h: Array,
 ) -> tuple[Vector, Vector]:
-    """Return positions and rates of one stage, from the accelerations of those before."""
+    """Return positions and rates of the stage `stage_index` from the accelerations of the
+    earlier stages.
+    """
     position, rate = [], []
-    for d in range(len(q0)):
+    for coordinate in range(len(q0)):
         coordinate_accelerations = [
-            stage_acceleration[d] for stage_acceleration in stage_accelerations
+            stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
         ]
         double_sum = _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations)
         single_sum = _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations)
-        drift = float(tableau.nodes[stage_index]) * v0[d]
-        position.append(q0[d] + h * (drift if double_sum is None else drift + h * double_sum))
-        rate.append(v0[d] + h * single_sum)
+        drift = float(tableau.nodes[stage_index]) * v0[coordinate]
+        position.append(
+            q0[coordinate] + h * (drift if double_sum is None else drift + h * double_sum)
+        )
+        rate.append(v0[coordinate] + h * single_sum)
     return tuple(position), tuple(rate)
 
 
 def _weighted_sum(weights: np.ndarray, terms: list[Array]) -> Any:
-    """Return a weighted sum, None if all weights vanish.
+    """Return the sum of `weights` times `terms`; None if all weights vanish.
 
-    It uses functions of `lax`, because half of a step's operations are such sums, and Python's
-    operators take three times as long to trace.
+    The sum is formed by functions of `lax`, which are traced in a third of the time of Python's
+    operators. Half of a step's operations are such sums.
     """
     pairs = zip(weights, terms, strict=False)
-    parts = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]
-    return functools.reduce(lax.add, parts) if parts else None
+    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]
+    return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -1,14 +1,14 @@
-"""Tangents of a phase's end with respect to its start and the constants of its equations, per
-batch.
+"""Tangents of a phase's end with respect to its start and the constants of its equations, for each
+batch element.
 
 Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
-part shared by all directions, the Jacobians at the stages, is computed once, and each direction
-then costs some hundred products. Step sizes and the iterations of an event search are not
-differentiated. The derivative is that of the discrete flow at the lengths that were taken, and of
-the time at which its guard vanishes.
+Jacobians at the stages are the same for all directions and computed once; each direction then costs
+some hundred products. Step sizes and the iterations of an event search are not differentiated. The
+derivative is that of the discrete flow with the step lengths that were taken, and of the time at
+which the guard vanishes.
 
-`jax.vmap` around a derivative supplies its directions. Here they are the first axis of arrays
-instead: loops are traced once, not again for the vmap.
+`jax.vmap` around a derivative supplies its directions. Here they become the first axis of arrays,
+so that loops are traced once, not again for the vmap.
 """
 
 import functools
@@ -38,14 +38,19 @@ class ImplicitDynamics(NamedTuple):
     """The equations of motion near a state whose accelerations are known."""
 
     residual: Callable[[StageState], Vector]
-    """Left side of the equations at the state's accelerations minus their right side."""
+    """Function that returns the left side of the equations at the state's accelerations minus
+    their right side.
+    """
     solve: Callable[[StageState, Vector], Vector]
-    """Accelerations for which the left side equals the given rows."""
+    """Function that returns the accelerations for which the left side equals the given values."""
 
 
 ImplicitDynamicsFn = Callable[[Any, Vector], ImplicitDynamics]
-"""A function of the constants of the equations: a tree of arrays with few tangent directions, and
-numbers with any tangent, like the start of a phase."""
+"""Function of the constants of the equations that returns an `ImplicitDynamics`.
+
+The constants are a tree of arrays with few tangent directions, and numbers with any tangent, such
+as the start of a phase.
+"""
 
 
 def batched_jvp_rule(
@@ -54,92 +59,111 @@ def batched_jvp_rule(
     """Return (values, tangents) of a JVP rule from a `function` that takes all directions together.
 
     `primals` and `tangents` are the arguments of the rule. `function` takes tangents with the axis
-    of directions first, of length 1 where all directions agree, and returns tangents in the same
-    form.
+    of directions first; its length is 1 if all directions agree. It returns the values, and
+    tangents in the same form.
     """
     leaves, structure = jax.tree.flatten((primals, tangents))
-    n_primals, size = len(jax.tree.leaves(primals)), len(_vmap_size(tangents))
-    if size == 0:
+    n_primal_leaves, n_directions = (
+        len(jax.tree.leaves(primals)),
+        len(_count_vmapped_directions(tangents)),
+    )
+    if n_directions == 0:
         values, output_tangents = function(primals, jax.tree.map(lambda x: x[None], tangents))
         return values, jax.tree.map(lambda x: x[0], output_tangents)
     output_structure: Any = None
 
     def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
         nonlocal output_structure
-        if any(axis is not None for axis in axes[:n_primals]):
+        if any(axis is not None for axis in axes[:n_primal_leaves]):
             raise NotImplementedError(
                 "jax.vmap around a derivative of lanes maps its directions only: put batches of "
                 "values on the lanes' axis, the last one."
             )
-        pairs = zip(leaves[n_primals:], axes[n_primals:], strict=True)
+        leaves_and_axes = zip(leaves[n_primal_leaves:], axes[n_primal_leaves:], strict=True)
         direction_leaves = [
-            x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in pairs
+            x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in leaves_and_axes
         ]
         values, output_tangents = function(
-            *jax.tree.unflatten(structure, [*leaves[:n_primals], *direction_leaves])
+            *jax.tree.unflatten(structure, [*leaves[:n_primal_leaves], *direction_leaves])
         )
         output_tangents = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (size, *x.shape[1:])), output_tangents
+            lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
         )
         results, output_structure = jax.tree.flatten((values, output_tangents))
-        n = len(jax.tree.leaves(values))
-        return results, [None] * n + [0] * (len(results) - n)
+        n_values = len(jax.tree.leaves(values))
+        return results, [None] * n_values + [0] * (len(results) - n_values)
 
     results = _HOIST_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
     return jax.tree.unflatten(output_structure, results)
 
 
 @custom_vmap
-def _vmap_size(_: Any) -> Array:
-    """Return as many zeros as an enclosing `jax.vmap` has directions, none without one."""
+def _count_vmapped_directions(_: Any) -> Array:
+    """Return an array of zeros whose length is the number of directions of an enclosing
+    `jax.vmap`; without one it is 0.
+    """
     return jnp.zeros(0)
 
 
-@_vmap_size.def_vmap
+@_count_vmapped_directions.def_vmap
 @with_default_settings
-def _vmap_size_rule(size: int, _: list, _tangent: Any) -> tuple[Array, bool]:
-    return jnp.zeros(size), False
+def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) -> tuple[Array, bool]:
+    return jnp.zeros(n_directions), False
 
 
 _HOIST_PRIMITIVE = Primitive("beyond")
 _HOIST_PRIMITIVE.multiple_results = True
 batching.primitive_batchers[_HOIST_PRIMITIVE] = lambda values, axes, mapped: mapped(values, axes)
 """Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
-loops again."""
+loops again.
+"""
 
 
 def _map_sequentially(function: Callable[[Any], Any], directions: Any) -> Any:
-    """Return `function` of each direction, in a loop, so that each direction stays in registers."""
+    """Return `function` of each direction, computed in a loop so that each direction stays in
+    registers.
+    """
     leaves, structure = jax.tree.flatten(directions)
-    has_many = [len(x) > 1 for x in leaves]
+    has_several_directions = [len(x) > 1 for x in leaves]
 
     def evaluate_one(varying_leaves: list[Array]) -> Any:
         remaining_leaves = iter(varying_leaves)
-        pairs = zip(leaves, has_many, strict=True)
+        leaves_and_flags = zip(leaves, has_several_directions, strict=True)
         return function(
-            jax.tree.unflatten(structure, [next(remaining_leaves) if n else x[0] for x, n in pairs])
+            jax.tree.unflatten(
+                structure,
+                [
+                    next(remaining_leaves) if has_several else x[0]
+                    for x, has_several in leaves_and_flags
+                ],
+            )
         )
 
-    if not any(has_many):
+    if not any(has_several_directions):
         return jax.tree.map(lambda x: x[None], evaluate_one([]))
-    return lax.map(evaluate_one, [x for x, n in zip(leaves, has_many, strict=True) if n])
+    return lax.map(
+        evaluate_one, [x for x, n in zip(leaves, has_several_directions, strict=True) if n]
+    )
 
 
 def stack_directions(directions: Vector) -> Array:
-    """Return tangents of several numbers stacked as (directions, numbers, batch)."""
+    """Return tangents of several numbers stacked as an array (directions, numbers, batch)."""
     return jnp.stack(jnp.broadcast_arrays(*directions), 1)
 
 
 class StageJacobians(NamedTuple):
     """Jacobians of the accelerations at the stages of a step."""
 
-    state_jacobian: Array  # (stages, n, ., batch): by positions, rates, then held constants
-    constants_tangents: Array  # (stages, directions, n, batch)
+    # (stages, coordinates, components, batch): with respect to positions, rates, then held
+    # constants
+    state_jacobian: Array
+    # tangents due to the constants, (stages, directions, coordinates, batch)
+    constants_tangents: Array
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _stage_jacobians(
-    dynamics_of: ImplicitDynamicsFn,
+    make_dynamics: ImplicitDynamicsFn,
     constants: Any,
     constants_directions: Any,
     held_constants: Vector,
@@ -147,30 +171,30 @@ def _stage_jacobians(
 ) -> StageJacobians:
     """Return the Jacobians of the accelerations at all stages of a step except the last."""
 
-    def linearize_stage(row: Array) -> tuple[Array, Array]:
-        state, dynamics = _unpack_state(row), dynamics_of(constants, held_constants)
+    def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
+        state, dynamics = _unpack_state(packed_state), make_dynamics(constants, held_constants)
         dynamics = ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
         n = len(state.q)
-        residual = lambda constants, held_constants: dynamics_of(
+        residual = lambda constants, held_constants: make_dynamics(
             constants, held_constants
         ).residual(state)
         acceleration_along = lambda *tangent: _solve_acceleration(
             dynamics, state, jax.jvp(residual, *tangent)[1]
         )
         zero_constants = jax.tree.map(jnp.zeros_like, constants)
-        state_columns = [
-            jnp.stack(_acceleration_tangent(dynamics, state, unit[:n], unit[n:]))
-            for unit in _unit_rows((*state.q, *state.v))
+        jacobian_columns = [
+            jnp.stack(_acceleration_tangent(dynamics, state, unit_vector[:n], unit_vector[n:]))
+            for unit_vector in _unit_vectors((*state.q, *state.v))
         ]
-        state_columns += [
-            acceleration_along((constants, held_constants), (zero_constants, unit))
-            for unit in _unit_rows(held_constants)
+        jacobian_columns += [
+            acceleration_along((constants, held_constants), (zero_constants, unit_vector))
+            for unit_vector in _unit_vectors(held_constants)
         ]
         zero_held = tuple(jnp.zeros_like(x) for x in held_constants)
         acceleration_by_constants = lambda constants_direction: acceleration_along(
             (constants, held_constants), (constants_direction, zero_held)
         )
-        return jnp.stack(state_columns, 1), _map_unrolled(
+        return jnp.stack(jacobian_columns, 1), _map_unrolled(
             acceleration_by_constants, constants_directions
         )
 
@@ -180,7 +204,9 @@ def _stage_jacobians(
 
 
 def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
-    """Return `function` of each direction without a loop, so that known zeros are dropped."""
+    """Return `function` of each direction without a loop, so that the compiler removes known
+    zeros.
+    """
     leaves, structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
         return function(jax.tree.unflatten(structure, [x[0] for x in leaves]))[None]
@@ -190,22 +216,24 @@ def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
 
 
 def _pack_state(state: StageState) -> Array:
-    """Return a state as one array."""
+    """Return a state as one array (components, batch)."""
     n = len(state.q)
     sin, cos, acceleration = state.acceleration
     return jnp.stack([*state.q, *state.v, sin, cos, *acceleration[:n]])
 
 
-def _unpack_state(row: Array) -> StageState:
-    """Return the state that `_pack_state` packed."""
-    n = (len(row) - 2) // 3
-    numbers = tuple(row)
-    acceleration = StageAcceleration(numbers[2 * n], numbers[2 * n + 1], numbers[2 * n + 2 :])
-    return StageState(numbers[:n], numbers[n : 2 * n], acceleration)
+def _unpack_state(packed_state: Array) -> StageState:
+    """Return the state from its array, the inverse of `_pack_state`."""
+    n = (len(packed_state) - 2) // 3
+    components = tuple(packed_state)
+    acceleration = StageAcceleration(
+        components[2 * n], components[2 * n + 1], components[2 * n + 2 :]
+    )
+    return StageState(components[:n], components[n : 2 * n], acceleration)
 
 
-def _unit_rows(template: Vector) -> list[Vector]:
-    """Return the unit vectors over the components of a vector."""
+def _unit_vectors(template: Vector) -> list[Vector]:
+    """Return the unit vectors of the space of `template`, each with the same component arrays."""
     n = len(template)
     return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
 
@@ -213,7 +241,7 @@ def _unit_rows(template: Vector) -> list[Vector]:
 def _acceleration_tangent(
     dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
 ) -> Vector:
-    """Return the tangent of the accelerations along a direction of positions and rates."""
+    """Return the tangent of the accelerations along a direction (dq, dv) of positions and rates."""
     sin, cos, acceleration = state.acceleration
     zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
     state_tangent = StageState(
@@ -223,16 +251,22 @@ def _acceleration_tangent(
     return tuple(_solve_acceleration(dynamics, state, residual_tangent))
 
 
-def _solve_acceleration(dynamics: ImplicitDynamics, state: StageState, rows: Vector) -> Array:
-    """Return the tangent of the accelerations for a tangent of the residual."""
-    return -jnp.stack(dynamics.solve(state, rows))
+def _solve_acceleration(
+    dynamics: ImplicitDynamics, state: StageState, residual_tangent: Vector
+) -> Array:
+    """Return the tangent of the accelerations for a tangent of the residual, by the implicit
+    function theorem.
+    """
+    return -jnp.stack(dynamics.solve(state, residual_tangent))
 
 
-@functools.partial(jax.jit, static_argnums=0)  # traced once, wherever it is called
+@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all its calls.
 def _propagate_tangents(
     tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
 ) -> Array:
-    """Propagate tangents (positions, rates, held constants) from a step's start to its end."""
+    """Return tangents (positions, rates, held constants) propagated from a step's start to its
+    end.
+    """
     state_jacobian, n = stage_jacobians.state_jacobian, stage_jacobians.state_jacobian.shape[1]
 
     def propagate_one(direction: tuple[Array, Array]) -> Array:
@@ -242,11 +276,16 @@ def _propagate_tangents(
         for i in range(len(tableau.nodes) - 1):
             q, v = evaluate_stage(tableau, i, q0, v0, stage_tangents, h) if i else (q0, v0)
             state_tangents = (*q, *v, *held_tangents)
-            rows = [
-                [constants_tangent[i, d], *map(lax.mul, state_jacobian[i, d], state_tangents)]
-                for d in range(n)
+            acceleration_terms = [
+                [
+                    constants_tangent[i, coordinate],
+                    *map(lax.mul, state_jacobian[i, coordinate], state_tangents),
+                ]
+                for coordinate in range(n)
             ]
-            stage_tangents.append(tuple(functools.reduce(lax.add, row) for row in rows))
+            stage_tangents.append(
+                tuple(functools.reduce(lax.add, terms) for terms in acceleration_terms)
+            )
         q, v = evaluate_stage(tableau, len(tableau.nodes) - 1, q0, v0, stage_tangents, h)
         return jnp.stack([*q, *v, *held_tangents])
 
@@ -258,13 +297,15 @@ def _propagate_tangents(
 def jvp_each(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
     """Return `jax.jvp` along each of the directions, without the value.
 
-    The code is as short as for one direction.
+    The program is as short as for one direction.
     """
     return _map_sequentially(lambda direction: jax.jvp(function, primals, direction)[1], directions)
 
 
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` of trees, whose derivative with respect to their floats is `jvp_each`."""
+    """Return `function` of trees, whose derivatives with respect to their floats are computed by
+    `jvp_each`.
+    """
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
         floats, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
@@ -290,22 +331,23 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class PhaseTangents(NamedTuple):
-    """Tangent directions of a phase: of its constants, its start and the constants held
-    since then.
+    """Tangent directions of a phase: those of its constants, of its start and of the constants
+    held since then.
     """
 
-    dynamics_of: ImplicitDynamicsFn
+    make_dynamics: ImplicitDynamicsFn
     constants: Any
     held_constants: Vector
-    constants_tangents: Any  # structure of the constants, directions first
-    start_tangents: Array  # of positions, rates, held constants, (directions, ., batch)
+    constants_tangents: Any  # tree of the constants, directions first
+    # tangents of positions, rates, held constants, (directions, components, batch)
+    start_tangents: Array
 
     def propagate(
         self, tableau: ButcherTableau, stages: list[StageState], start_tangents: Array, h: Array
     ) -> Array:
         """Return the tangents at a step's start, propagated to its end."""
         stage_jacobians = _stage_jacobians(
-            self.dynamics_of, self.constants, self.constants_tangents, self.held_constants, stages
+            self.make_dynamics, self.constants, self.constants_tangents, self.held_constants, stages
         )
         return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
 
@@ -317,7 +359,8 @@ class PhaseTangents(NamedTuple):
         h: Array,
         is_accepted: Array,
     ) -> Array:
-        """Return the tangents propagated where the step is accepted; otherwise they are unchanged.
+        """Return the tangents, propagated over the step in batch elements that accepted it and
+        unchanged in others.
 
         A group without accepted steps skips the computation.
         """
@@ -329,21 +372,21 @@ class PhaseTangents(NamedTuple):
 
         return run_if_any(jnp.any(is_accepted), propagate_accepted, start_tangents)
 
-    def value_tangents(
+    def evaluate_tangents(
         self, evaluate: Callable[..., Any], state: StageState, directions: Array
     ) -> Any:
-        """Return the tangents of `evaluate(constants, held_constants, q, v)` for the directions at
-        a state.
+        """Return the tangents of `evaluate(constants, held_constants, q, v)` at a state, for all
+        directions.
         """
-        n, direction_rows = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
+        n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
         primals = self.constants, self.held_constants, state.q, state.v
         return jvp_each(
             evaluate,
             primals,
             (
                 self.constants_tangents,
-                direction_rows[2 * n :],
-                direction_rows[:n],
-                direction_rows[n : 2 * n],
+                direction_components[2 * n :],
+                direction_components[:n],
+                direction_components[n : 2 * n],
             ),
         )

@@ -142,7 +142,7 @@ def torus_points() -> Iterator[Row]:
         yield Row(
             name, "ours", solution, truth, compute_error(solution, truth), "",
             not bool(first.converged),
-            int(first.iterations), took, options, version("vrw-jax"), digits=digits,
+            int(first.n_iterations), took, options, version("vrw-jax"), digits=digits,
         )  # fmt: skip
 
 

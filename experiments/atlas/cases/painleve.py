@@ -89,7 +89,7 @@ def rows() -> Iterator[Row]:
     yield Row(
         "least friction", "ours", friction, 4.0 / 3.0, compute_error(friction, 4.0 / 3.0),
         "" if solution.converged else "not "
-            "converged", not solution.converged, int(solution.iterations),
+            "converged", not solution.converged, int(solution.n_iterations),
         seconds, "Newton", version("vrw-jax"),
     )  # fmt: skip
     (other, info, _, _), seconds = time_second_call(
