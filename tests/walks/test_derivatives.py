@@ -92,7 +92,7 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         first, second, third = flows(distance)
         with_distance = first._replace(
             vector_field=lambda y: jnp.append(flows(y[2])[0].vector_field(y[:2]), 0.0),
-            guards=first.guards._replace(values=lambda y: flows(y[2])[0].guards.values(y[:2])),
+            guards=first.guards._replace(evaluate=lambda y: flows(y[2])[0].guards.evaluate(y[:2])),
         )
 
         def lifted(y):

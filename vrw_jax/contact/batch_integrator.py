@@ -28,7 +28,7 @@ from vrw_jax.contact.contact_state import (
     guard_scales,
 )
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, prevent_fusion
-from vrw_jax.hybrid import GUARD_ROUNDOFF_EPS
+from vrw_jax.hybrid import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.integrator import (
     ButcherTableau,
     find_guard_minimum,
@@ -240,7 +240,7 @@ def init_interval(
     values, rates = guards_at_point(dynamics, point), guard_rates(dynamics, point)
     # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
     # rises from below has no event before it falls; events without duration leave several such.
-    roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_EPS * jnp.finfo(values.dtype).eps)
+    roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_IN_EPS * jnp.finfo(values.dtype).eps)
     time_unit = compute_own_units(dynamics.s).time
     min_rate = -roundoff / (interval_options.max_roundoff_fall * time_unit)
     is_own = is_own | ((values <= roundoff) & (rates > min_rate))
@@ -545,7 +545,7 @@ def _search_event(
     lowest_guard, lowest = _lowest_guard(attempt.guard_values / scales, is_crossing)
     # A guard at its own event is within twice its rounding; without another event, it is the event.
     roundoff = (
-        GUARD_ROUNDOFF_EPS
+        GUARD_ROUNDOFF_IN_EPS
         * jnp.where(search.n_iterations < interval_options.n_before_own_guard, 1.0, 3.0)
         * jnp.finfo(h.dtype).eps
     )

@@ -1,8 +1,8 @@
-"""Hybrid systems of any kind: modes, guards and resets, integrated by diffrax."""
+"""Hybrid dynamical systems of any kind: modes, guards and resets, integrated by diffrax."""
 
 from vrw_jax.hybrid.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.hybrid.minima import (
-    GUARD_ROUNDOFF_EPS,
+    GUARD_ROUNDOFF_IN_EPS,
     MonitoredFunctions,
     StateVector,
 )

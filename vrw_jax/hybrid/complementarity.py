@@ -1,4 +1,6 @@
-"""Unilateral contacts: all solutions of a linear complementarity problem (LCP), by enumeration."""
+"""All solutions of a linear complementarity problem (LCP) of unilateral contacts, by
+enumeration.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -14,11 +16,13 @@ from vrw_jax.numerics import StatusCode
 from vrw_jax.validation import is_traced
 
 MAX_LCP_CONTACTS = 10
-"""Most contacts of an LCP, chosen because two to the power of it combinations are solved."""
+"""Largest number of contacts of an LCP, chosen because the enumeration solves two to that power
+linear systems.
+"""
 
 
 class LCPStatus(StatusCode):
-    """Number of solutions of an LCP."""
+    """Number of solutions of an LCP: none, one or several."""
 
     NO_SOLUTION = 0, "No force fits: a rigid body would have to jump at once."
     UNIQUE_SOLUTION = 1, "One answer."
@@ -26,9 +30,12 @@ class LCPStatus(StatusCode):
 
 
 class LCPSolutions(NamedTuple):
-    """Forces z >= 0 and gaps w = matrix z + free_gap >= 0, with z w = 0 in each contact."""
+    """Solutions of an LCP: forces z >= 0 and gaps w = matrix z + free_gap >= 0 with z w = 0 in
+    each contact.
+    """
 
-    force: Float[Array, " n"]  # of the solution with most closed contacts; NaN if there is none
+    # forces of the solution with most closed contacts; NaN if there is none
+    force: Float[Array, " n"]
     gap: Float[Array, " n"]
     status: Int[Array, ""]  # an LCPStatus
     is_solution: Bool[Array, " combinations"]  # which combinations of closed contacts are solutions
@@ -38,10 +45,11 @@ class LCPSolutions(NamedTuple):
 def enumerate_lcp_solutions(
     matrix: ArrayLike | Sequence, free_gap: ArrayLike | Sequence, tolerance: float = 1e-12
 ) -> LCPSolutions:
-    """Return all solutions of an LCP with any matrix, symmetric or not.
+    """Return all solutions of an LCP with a square matrix, symmetric or not.
 
-    Signs hold to `tolerance` of the largest entry. Combinations that differ only by contacts
-    without force count once. The result is differentiable where one solution persists.
+    `matrix` has the shape (n, n) and `free_gap` the shape (n,). Signs hold to `tolerance` times the
+    largest entry. Combinations that differ only by contacts without force count once. The result is
+    differentiable as long as the same solution exists.
     """
     free_gap = jnp.asarray(free_gap, float)
     matrix = jnp.asarray(matrix, free_gap.dtype)
@@ -57,23 +65,24 @@ def enumerate_lcp_solutions(
     max_entry = jnp.max(jnp.abs(matrix))
     scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
     free_gap, matrix = free_gap / scale, matrix / scale
-    is_closed = np.array(list(itertools.product((True, False), repeat=n)))  # most closed first
+    # Combinations with more closed contacts come first.
+    is_closed = np.array(list(itertools.product((True, False), repeat=n)))
     is_closed = is_closed[np.argsort(-is_closed.sum(1), kind="stable")]
 
     def solve_combination(is_closed: Array) -> tuple[Array, Array]:
         closed_pair = is_closed[:, None] & is_closed[None]
-        system = jnp.where(closed_pair, matrix, jnp.eye(n, dtype=free_gap.dtype))
-        singular = jnp.abs(jnp.linalg.det(system)) <= tolerance
-        system = jnp.where(singular, jnp.eye(n, dtype=free_gap.dtype), system)
+        linear_system = jnp.where(closed_pair, matrix, jnp.eye(n, dtype=free_gap.dtype))
+        is_singular = jnp.abs(jnp.linalg.det(linear_system)) <= tolerance
+        linear_system = jnp.where(is_singular, jnp.eye(n, dtype=free_gap.dtype), linear_system)
         force = jnp.where(
-            is_closed, jnp.linalg.solve(system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
+            is_closed, jnp.linalg.solve(linear_system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
         )
         gap = jnp.where(is_closed, 0.0, matrix @ force + free_gap)
-        pushes_everywhere = jnp.all(force >= -tolerance * jnp.max(jnp.abs(force)))
-        opens_everywhere = jnp.all(
+        has_valid_forces = jnp.all(force >= -tolerance * jnp.max(jnp.abs(force)))
+        has_valid_gaps = jnp.all(
             gap >= -tolerance * (jnp.max(jnp.abs(gap)) + jnp.max(jnp.abs(free_gap)))
         )
-        return force, pushes_everywhere & opens_everywhere & ~singular
+        return force, has_valid_forces & has_valid_gaps & ~is_singular
 
     candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
     match_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))

@@ -2,9 +2,9 @@
 
 diffrax's solvers and step-size controller are called step by step, so that an event's state has the
 accuracy of the integrator and not of an interpolant. An accepted step that brackets an event is
-repeated with a length that Newton's method shortens until it ends on the event. These last steps
-are differentiated, so first and second derivatives of the event's state and time are accurate as
-well.
+repeated with a length that Newton's method corrects until the step ends on the event. These last
+steps are differentiated, so first and second derivatives of the event's state and time are accurate
+as well.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from vrw_jax.hybrid.minima import (
     MonitoredFunctions,
     StateVector,
     empty_minimum,
-    guards_met_at_start,
-    is_at_roundoff,
+    find_guards_met_at_start,
+    is_guard_at_roundoff,
     refine_minimum,
-    select_row,
+    select_entry,
     update_minimum,
 )
 from vrw_jax.numerics import (
@@ -49,59 +49,62 @@ else:
     diffrax = lazy_import("diffrax")
 
 VectorField = Callable[[StateVector], StateVector]
-"""Autonomous vector field of a phase."""
+"""Autonomous vector field of a phase: the time derivative of the state."""
 
 
 class PhaseEnd(NamedTuple):
-    """End of a phase: state, duration, the guard that ended it and failure flags."""
+    """End of a phase: state, duration, the guard that ended the phase, and failure flags."""
 
     state: StateVector
-    duration: Scalar  # s
-    guard: Int[Array, ""]  # index of the guard that ended it; -1 if none did
+    duration: Scalar  # duration of the phase, s
+    guard: Int[Array, ""]  # index of the guard that ended the phase; -1 if none did
     timed_out: Bool[Array, ""]
     gave_up: Bool[Array, ""]
-    solver_steps: Int[Array, ""]  # tried, accepted or not
-    minima: Float[Array, " n_monitors"]  # of the margins, empty if there are none
+    solver_steps: Int[Array, ""]  # number of tried solver steps, accepted or not
+    minima: Float[Array, " n_monitors"]  # minima of the margins, empty if there are none
 
 
 class StepPurpose(IntEnum):
     """Purpose of the next solver step."""
 
-    START = 0  # to evaluate the start, by a step of length zero
+    START = 0  # A step of length zero evaluates the start.
     INTEGRATION = 1
-    EVENT_SEARCH = 2  # to locate a bracketed event
-    REFINEMENT = 3  # to find the minimum of a margin
-    DONE = 4  # no further step
+    EVENT_SEARCH = 2  # The step locates a bracketed event.
+    REFINEMENT = 3  # The step refines the minimum of a margin.
+    DONE = 4  # No further step is taken.
 
 
 @dataclass(frozen=True)
 class EventSearchOptions:
-    """Search for an event within a solver step, and the growth of steps that precede it."""
+    """Options of the search for an event within a solver step, and of the growth of the steps
+    that precede it.
+    """
 
     max_step_growth: float = 2.0
-    """Largest ratio of successive solver steps.
+    """Largest ratio of the lengths of successive solver steps.
 
-    It is chosen because the error estimate of a step far shorter than needed is round-off, and so
-    would be a length grown from it without bound. A batch element would then differ from the same
+    It is chosen because the error estimate of a step far shorter than needed is round-off, so a
+    length derived from it would grow without bound. A batch element would then differ from the same
     element alone by 1e-12, more than a hundred times its round-off.
     """
     n_confirmations: int = 3
-    """Number of tries at the located event before it counts.
+    """Number of tries at the located event that must confirm its time.
 
     It is chosen because the first try makes the event's time accurate to first order in its
     derivatives and the second to third order. The last try evaluates the state there.
     """
-    max_settled_change: float = 1e-4
-    """Largest change of the event's time by a try that counts, over the duration of the phase.
+    max_confirmed_change: float = 1e-4
+    """Largest change of the event's time by a try that confirms it, as a fraction of the phase's
+    duration.
 
-    It is chosen because Newton's method squares the change in each of the next two tries: 1e-16 at
-    the last.
+    It is chosen because Newton's method squares the change in each of the next two tries, to 1e-16
+    in the last.
     """
     min_stalled_ratio: float = 0.9
-    """Ratio of successive changes of the event's time from which on the change is round-off.
+    """Ratio of successive changes of the event's time above which the change is round-off.
 
-    It is chosen because Newton's method at least halves changes, and takes two thirds at a triple
-    root.
+    It is chosen because Newton's method at least halves changes, and reduces them to two thirds at
+    a triple root.
     """
 
 
@@ -114,18 +117,18 @@ class _EventSearch(NamedTuple):
     is_crossing: Bool[Array, " n_guards"]
     lower_bound: Scalar  # bracket of the event, s from the step's start
     upper_bound: Scalar
-    time_tolerance: Scalar  # of the event's time, s
+    time_tolerance: Scalar  # tolerance of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirmed: Int[Array, ""]  # tries that no longer moved the event
-    change: Scalar  # of the event's time by the last try, s
+    n_confirmed: Int[Array, ""]  # number of tries that confirmed the event's time
+    change: Scalar  # change of the event's time by the last try, s
 
 
 class _PhaseState(NamedTuple):
-    """State of the integration of a phase."""
+    """State of the loop that integrates a phase."""
 
     purpose: Int[Array, ""]  # a StepPurpose
     accepted_step: AcceptedPhaseStep  # the last accepted step
-    next_length: Scalar  # of the next step to try, s
+    next_length: Scalar  # length of the next step to try, s
     controller_state: Any
     search: _EventSearch
     minimum: InteriorMinimum
@@ -137,19 +140,21 @@ class _PhaseState(NamedTuple):
 
 
 class _SolverStepper(NamedTuple):
-    """A diffrax solver with its controller, as a function from state and length to state."""
+    """A diffrax solver with its step-size controller, as a function that advances a state by a
+    step.
+    """
 
-    field: VectorField
+    vector_field: VectorField
     solver: diffrax.AbstractAdaptiveSolver
     controller: diffrax.PIDController
     term: diffrax.ODETerm
 
     def init_states(self, state: StateVector, options: StepOptions) -> tuple[Any, Any]:
-        """Return the solver state and the controller state at the start of a phase."""
-        zero = jnp.zeros((), state.dtype)
+        """Return diffrax's solver state and controller state at the start of a phase."""
+        zero_time = jnp.zeros((), state.dtype)
         _, controller_state = self.controller.init(
             self.term,
-            zero,
+            zero_time,
             options.dt0,
             lax.stop_gradient(state),
             options.dt0,
@@ -161,16 +166,18 @@ class _SolverStepper(NamedTuple):
 
     def init_solver_state(self, state: StateVector, options: StepOptions) -> Any:
         """Return the solver's internal state at a state of the system."""
-        zero = jnp.zeros((), state.dtype)
-        return self.solver.init(self.term, zero, options.dt0, state, None)
+        zero_time = jnp.zeros((), state.dtype)
+        return self.solver.init(self.term, zero_time, options.dt0, state, None)
 
     def advance_state(
         self, state: StateVector, solver_state: Any, length: Scalar
     ) -> tuple[StateVector, StateVector, Any]:
-        """Return the state after `length`, its error estimate and the solver state there."""
-        zero = jnp.zeros_like(length)
+        """Return the state after a step of `length`, its error estimate, and the solver's
+        internal state there.
+        """
+        zero_time = jnp.zeros_like(length)
         end, error, _, solver_state, result = self.solver.step(
-            self.term, zero, length, state, None, solver_state, jnp.asarray(False)
+            self.term, zero_time, length, state, None, solver_state, jnp.asarray(False)
         )
         if error is None:
             raise ValueError(
@@ -188,23 +195,30 @@ class _SolverStepper(NamedTuple):
         length: Scalar,
         controller_state: Any,
     ) -> tuple[Bool[Array, ""], Scalar, Any]:
-        """Return whether the step is kept, the length of the next step, and the controller's state.
+        """Return whether the step's error is within tolerance, the length of the next step, and the
+        controller's state.
 
-        No result is differentiated: derivatives are those of the steps taken.
+        No result is differentiated, because derivatives are those of the steps taken.
         """
         start, end, error = lax.stop_gradient((start, end, error))
         is_finite = jnp.all(jnp.isfinite(end))
-        is_kept, next_start, next_end, _, controller_state, _ = self.controller.adapt_step_size(
-            jnp.zeros_like(length),
-            length,
-            start,
-            jnp.where(is_finite, end, start),
-            None,
-            jnp.where(is_finite, error, jnp.inf),
-            self.solver.error_order(self.term),  # type: ignore[arg-type]
+        is_within_tolerance, next_start, next_end, _, controller_state, _ = (
+            self.controller.adapt_step_size(
+                jnp.zeros_like(length),
+                length,
+                start,
+                jnp.where(is_finite, end, start),
+                None,
+                jnp.where(is_finite, error, jnp.inf),
+                self.solver.error_order(self.term),  # type: ignore[arg-type]
+                controller_state,
+            )
+        )
+        return (
+            jnp.asarray(is_within_tolerance),
+            jnp.asarray(next_end - next_start),
             controller_state,
         )
-        return jnp.asarray(is_kept), jnp.asarray(next_end - next_start), controller_state
 
 
 def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolver:
@@ -217,20 +231,22 @@ def make_solver(name: str, options: StepOptions) -> diffrax.AbstractAdaptiveSolv
             f"solver is {name!r}, but it must name a diffrax solver with an error estimate: "
             "take 'Dopri8', 'Tsit5', 'Dopri5', 'Kvaerno3' or 'Kvaerno5'."
         )
-    fields = getattr(solver_class, "__dataclass_fields__", {})
-    keywords: dict[str, Any] = {}
-    if "scan_kind" in fields:
-        keywords["scan_kind"] = "lax"
-    if "root_finder" in fields:
+    field_names = getattr(solver_class, "__dataclass_fields__", {})
+    solver_arguments: dict[str, Any] = {}
+    if "scan_kind" in field_names:
+        solver_arguments["scan_kind"] = "lax"
+    if "root_finder" in field_names:
         tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
-        keywords["root_finder"] = diffrax.VeryChord(**tolerances)
-    return solver_class(**keywords)
+        solver_arguments["root_finder"] = diffrax.VeryChord(**tolerances)
+    return solver_class(**solver_arguments)
 
 
 def _make_stepper(field: VectorField, options: StepOptions, max_growth: float) -> _SolverStepper:
-    """Return the solver of the options for a vector field."""
+    """Return the solver and controller of the options for a vector field; `max_growth` limits
+    successive step lengths.
+    """
     return _SolverStepper(
-        field=field,
+        vector_field=field,
         solver=make_solver(options.solver, options),
         controller=diffrax.PIDController(
             rtol=options.rtol, atol=options.atol, factormax=max_growth
@@ -243,44 +259,49 @@ def integrate_phase(
     field: VectorField,
     monitored_functions: MonitoredFunctions,
     start: StateVector,
-    active: Bool[Array, ""],
+    is_active: Bool[Array, ""],
     options: StepOptions,
     event_options: EventSearchOptions = EVENT_SEARCH_OPTIONS,
 ) -> PhaseEnd:
-    """Return the end of a phase: `field` integrated from `start` until the earliest guard reaches
-    zero from above.
+    """Integrate `field` from `start` until the earliest guard reaches zero from above, and return
+    the end.
 
     A guard that is negative at the start, or zero and not rising, ends the phase immediately with
-    duration 0. A guard that is zero and rising does not end it. The event time of a guard that
-    falls through zero at the start has its derivative: minus the guard's derivative by the start
-    over its rate. A guard that dips below zero and returns within one step is found: if the cubic
-    through values and rates dips, the step is retried up to the dip. Of two guards at the same
-    time, the first in the list ends the phase. With `active` False nothing is integrated. Errors
-    are those of the solver at the tolerances of `options`.
+    duration 0. A guard that is zero and rising does not end the phase. If a guard falls through
+    zero at the start, the event time has a derivative: minus the guard's derivative with respect to
+    the start over the guard's rate.
+
+    A guard that is negative only inside a step is found: if the cubic through values and rates may
+    be negative, the step is repeated up to the cubic's minimum. Of two guards that are zero at the
+    same time, the first in the list ends the phase. If `is_active` is False, nothing is integrated.
+    Errors are those of the solver at the tolerances of `options`.
     """
     stepper = _make_stepper(field, options, event_options.max_step_growth)
     context = _PhaseContext(stepper, monitored_functions, options, event_options)
-    loop = lax.while_loop(
-        lambda loop: opaque_condition(loop.purpose != StepPurpose.DONE, loop.n_tried_steps),
+    phase_state = lax.while_loop(
+        lambda phase_state: opaque_condition(
+            phase_state.purpose != StepPurpose.DONE, phase_state.n_tried_steps
+        ),
         functools.partial(_advance_phase, context),
-        _init_phase(context, start, active),
+        _init_phase(context, start, is_active),
     )
     minima = jnp.minimum(
-        loop.refinement.lowest_values, loop.accepted_step.values[monitored_functions.n_guards :]
+        phase_state.refinement.lowest_values,
+        phase_state.accepted_step.values[monitored_functions.n_guards :],
     )
     return PhaseEnd(
-        state=loop.accepted_step.state,
-        duration=loop.accepted_step.time,
-        guard=loop.guard,
-        timed_out=loop.timed_out,
-        gave_up=loop.gave_up,
-        solver_steps=loop.n_tried_steps,
+        state=phase_state.accepted_step.state,
+        duration=phase_state.accepted_step.time,
+        guard=phase_state.guard,
+        timed_out=phase_state.timed_out,
+        gave_up=phase_state.gave_up,
+        solver_steps=phase_state.n_tried_steps,
         minima=minima,
     )
 
 
 class _PhaseContext(NamedTuple):
-    """Constants of a phase's loop."""
+    """Arguments of a phase's loop that do not change."""
 
     stepper: _SolverStepper
     monitored_functions: MonitoredFunctions
@@ -288,7 +309,9 @@ class _PhaseContext(NamedTuple):
     event_options: EventSearchOptions
 
 
-def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, ""]) -> _PhaseState:
+def _init_phase(
+    context: _PhaseContext, start: StateVector, is_active: Bool[Array, ""]
+) -> _PhaseState:
     """Return the state of the loop before the first step.
 
     Every number that the loop will batch or perturb is batched or perturbed from the start.
@@ -296,18 +319,19 @@ def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, 
     """
     stepper, monitored_functions, options, _ = context
     zero_time = 0.0 * start[0]
-    zero_count = jnp.where(active, 0, 0).astype(jnp.int32)
+    zero_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
     zero_values = (
-        jnp.zeros(jax.eval_shape(monitored_functions.values, start).shape, start.dtype) + zero_time
+        jnp.zeros(jax.eval_shape(monitored_functions.evaluate, start).shape, start.dtype)
+        + zero_time
     )
-    false = active & False
+    constant_false = is_active & False
     constant_zero = lax.stop_gradient(zero_time)
     solver_state, controller_state = stepper.init_states(start, options)
-    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false
+    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | constant_false
     return _PhaseState(
-        purpose=jnp.where(active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
+        purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
         accepted_step=AcceptedPhaseStep(zero_time, start, solver_state, zero_values, zero_values),
-        next_length=zero_time,  # the first step has length zero: it evaluates the start
+        next_length=zero_time,  # The first step has length zero and evaluates the start.
         controller_state=jax.tree.map(lambda x: x + constant_zero, controller_state),
         search=_EventSearch(
             is_crossing,
@@ -327,41 +351,45 @@ def _init_phase(context: _PhaseContext, start: StateVector, active: Bool[Array, 
             zero_values[monitored_functions.n_guards :] + jnp.inf,
         ),
         guard=zero_count - 1,
-        timed_out=false,
-        gave_up=false,
+        timed_out=constant_false,
+        gave_up=constant_false,
         n_tried_steps=zero_count,
     )
 
 
-def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
-    """Take one solver step, and update the search for the event and for minima."""
+def _advance_phase(context: _PhaseContext, phase_state: _PhaseState) -> _PhaseState:
+    """Take one solver step, update the searches for the event and for minima, and return the new
+    state of the loop.
+    """
     _, monitored_functions, options, event_options = context
-    n, search = monitored_functions.n_guards, loop.search
-    previous_step, length = loop.accepted_step, loop.next_length
-    is_starting = loop.purpose == StepPurpose.START
-    is_searching = loop.purpose == StepPurpose.EVENT_SEARCH
-    step, error = _try_step(context, loop)
-    guards, rates = step.values[:n], step.rates[:n]
-    is_met, is_falling = guards_met_at_start(monitored_functions, guards, rates)
-    first_met = jnp.argmax(is_met).astype(jnp.int32)
+    n_guards, search = monitored_functions.n_guards, phase_state.search
+    previous_step, length = phase_state.accepted_step, phase_state.next_length
+    is_starting = phase_state.purpose == StepPurpose.START
+    is_searching = phase_state.purpose == StepPurpose.EVENT_SEARCH
+    step, error = _try_step(context, phase_state)
+    guards, rates = step.values[:n_guards], step.rates[:n_guards]
+    ends_phase, is_falling = find_guards_met_at_start(monitored_functions, guards, rates)
+    first_met_guard = jnp.argmax(ends_phase).astype(jnp.int32)
     # An event at time zero is searched for like any other, because its time depends on the start.
-    searched_at_start = is_starting & is_falling[first_met]
-    has_immediate_event = is_starting & jnp.any(is_met) & ~is_falling[first_met]
-    assessment = _assess_step(context, loop, step, error)
+    begins_search_at_start = is_starting & is_falling[first_met_guard]
+    has_immediate_event = is_starting & jnp.any(ends_phase) & ~is_falling[first_met_guard]
+    assessment = _assess_step(context, phase_state, step, error)
     proposal = _propose_event(search, guards, rates, length)
-    # A try counts if it changes the event's time by little compared with the step. For an event
-    # much earlier than the step's end, the change is also compared with the time since the phase
-    # began, unless round-off of the guard leaves nothing to gain.
+    # A try confirms the event if it changes the event's time by little compared with the step. For
+    # an event much earlier than the step's end, the change is also compared with the time since the
+    # phase began. The comparison is skipped if the change is only the guard's round-off.
     constant_proposal, constant_length, start_time = lax.stop_gradient(
         (proposal.length, length, previous_step.time)
     )
     change = jnp.abs(constant_proposal - constant_length)
-    is_small = change <= event_options.max_settled_change * (start_time + constant_proposal)
+    is_small_change = change <= event_options.max_confirmed_change * (
+        start_time + constant_proposal
+    )
     is_stalled = change >= event_options.min_stalled_ratio * search.change
-    is_close = (change <= search.time_tolerance) & (is_small | is_stalled)
-    is_at_zero, lowest_guard = is_at_roundoff(monitored_functions, search.is_crossing, guards)
+    is_confirmed = (change <= search.time_tolerance) & (is_small_change | is_stalled)
+    is_at_zero, lowest_guard = is_guard_at_roundoff(monitored_functions, search.is_crossing, guards)
     proposal = proposal._replace(guard=jnp.where(is_at_zero, lowest_guard, proposal.guard))
-    n_confirmed = search.n_confirmed + (is_searching & (is_close | is_at_zero))
+    n_confirmed = search.n_confirmed + (is_searching & (is_confirmed | is_at_zero))
     has_arrived = is_searching & (n_confirmed >= event_options.n_confirmations)
 
     timed_out = assessment.is_accepted & (step.time >= options.max_phase_time)
@@ -370,23 +398,23 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
         is_searching & ~has_arrived & (search.n_iterations >= options.max_event_iterations)
     )
     is_phase_end = has_immediate_event | has_arrived | timed_out | is_stuck
-    begins_search = assessment.has_crossed | searched_at_start
-    purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, loop.purpose)
-    purpose = jnp.where(begins_search, StepPurpose.EVENT_SEARCH, purpose)
+    begins_event_search = assessment.has_crossed | begins_search_at_start
+    purpose = jnp.where(is_starting, StepPurpose.INTEGRATION, phase_state.purpose)
+    purpose = jnp.where(begins_event_search, StepPurpose.EVENT_SEARCH, purpose)
     purpose = jnp.where(is_phase_end, StepPurpose.DONE, purpose).astype(jnp.int32)
     following_length = jnp.where(
-        searched_at_start, 0.0, lax.stop_gradient(assessment.following_length)
+        begins_search_at_start, 0.0, lax.stop_gradient(assessment.following_length)
     )
     following_length = jnp.where(is_searching, proposal.length, following_length)
     is_crossing = jnp.where(assessment.has_crossed, assessment.is_crossing, search.is_crossing)
-    is_first_met = searched_at_start & (jnp.arange(n) == first_met)
+    is_first_met_guard = begins_search_at_start & (jnp.arange(n_guards) == first_met_guard)
     is_counted = (assessment.is_accepted & ~is_starting) | has_arrived
     minimum = update_minimum(
-        monitored_functions, loop.minimum, previous_step, step, length, is_counted
+        monitored_functions, phase_state.minimum, previous_step, step, length, is_counted
     )
-    refinement = loop.refinement
+    refinement = phase_state.refinement
     if monitored_functions.includes_start:
-        was_refining = loop.purpose == StepPurpose.REFINEMENT
+        was_refining = phase_state.purpose == StepPurpose.REFINEMENT
         refinement, is_refining, length_to_minimum = refine_minimum(
             refinement,
             monitored_functions,
@@ -407,127 +435,150 @@ def _advance_phase(context: _PhaseContext, loop: _PhaseState) -> _PhaseState:
         next_length=following_length,
         controller_state=assessment.controller_state,
         search=_EventSearch(
-            is_crossing=jnp.where(searched_at_start, is_first_met, is_crossing),
-            lower_bound=jnp.where(begins_search, 0.0, proposal.lower_bound),
-            upper_bound=jnp.where(begins_search, lax.stop_gradient(length), proposal.upper_bound),
+            is_crossing=jnp.where(begins_search_at_start, is_first_met_guard, is_crossing),
+            lower_bound=jnp.where(begins_event_search, 0.0, proposal.lower_bound),
+            upper_bound=jnp.where(
+                begins_event_search, lax.stop_gradient(length), proposal.upper_bound
+            ),
             time_tolerance=jnp.where(
                 assessment.has_crossed, assessment.time_tolerance, search.time_tolerance
             ),
             n_iterations=search.n_iterations + is_searching,
             n_confirmed=n_confirmed,
-            change=jnp.where(begins_search, jnp.inf, change),
+            change=jnp.where(begins_event_search, jnp.inf, change),
         ),
         minimum=minimum,
         refinement=refinement,
         guard=jnp.where(
             has_immediate_event,
-            first_met,
-            jnp.where(has_arrived & ~timed_out, proposal.guard, loop.guard),
+            first_met_guard,
+            jnp.where(has_arrived & ~timed_out, proposal.guard, phase_state.guard),
         ),
-        timed_out=timed_out | loop.timed_out,
-        gave_up=is_stuck | loop.gave_up,
+        timed_out=timed_out | phase_state.timed_out,
+        gave_up=is_stuck | phase_state.gave_up,
         n_tried_steps=assessment.n_tried_steps,
     )
 
 
-def _try_step(context: _PhaseContext, loop: _PhaseState) -> tuple[AcceptedPhaseStep, Array]:
-    """Return the step to try, with the monitored functions at its end, and its error.
+def _try_step(context: _PhaseContext, phase_state: _PhaseState) -> tuple[AcceptedPhaseStep, Array]:
+    """Return the end of the step to try, with the monitored functions there, and the step's error
+    estimate.
 
-    One call of the solver and of the monitored functions serves every mode, so that the code is
+    One call of the solver and of the monitored functions serves every purpose, so that the code is
     compiled once.
     """
     stepper, monitored_functions, options, _ = context
-    start = loop.accepted_step.state, loop.accepted_step.solver_state
+    start = phase_state.accepted_step.state, phase_state.accepted_step.solver_state
     if monitored_functions.includes_start:
-        minimum_start = select_row(loop.refinement.monitor, loop.minimum.start_state)
-        restart = minimum_start, stepper.init_solver_state(minimum_start, options)
-        start = tree_where(loop.purpose == StepPurpose.REFINEMENT, restart, start)
-    end, error, solver_state = stepper.advance_state(*start, loop.next_length)
-    values, rates = jax.jvp(monitored_functions.values, (end,), (stepper.field(end),))
+        minimum_start = select_entry(
+            phase_state.refinement.margin_index, phase_state.minimum.start_state
+        )
+        restarts_at_minimum = minimum_start, stepper.init_solver_state(minimum_start, options)
+        start = tree_where(
+            phase_state.purpose == StepPurpose.REFINEMENT, restarts_at_minimum, start
+        )
+    end, error, solver_state = stepper.advance_state(*start, phase_state.next_length)
+    values, rates = jax.jvp(monitored_functions.evaluate, (end,), (stepper.vector_field(end),))
     error = jnp.where(jnp.all(jnp.isfinite(values)), error, jnp.inf)
-    limit = lax.stop_gradient(options.max_phase_time)
-    start_time, is_integrating = loop.accepted_step.time, loop.purpose == StepPurpose.INTEGRATION
-    is_last = is_integrating & (loop.next_length >= limit - start_time)
-    time = jnp.where(is_last, limit, start_time + loop.next_length)
+    time_limit = lax.stop_gradient(options.max_phase_time)
+    start_time, is_integrating = (
+        phase_state.accepted_step.time,
+        phase_state.purpose == StepPurpose.INTEGRATION,
+    )
+    is_last_step = is_integrating & (phase_state.next_length >= time_limit - start_time)
+    time = jnp.where(is_last_step, time_limit, start_time + phase_state.next_length)
     return AcceptedPhaseStep(time, end, solver_state, values, rates), error
 
 
 class _StepAssessment(NamedTuple):
-    """Assessment of a tried solver step."""
+    """Result of the examination of a tried solver step."""
 
-    is_accepted: Bool[Array, ""]  # the start counts as accepted
+    is_accepted: Bool[Array, ""]  # whether the step is accepted; the start is
     has_crossed: Bool[Array, ""]  # whether the step brackets an event
-    is_crossing: Bool[Array, " n_guards"]  # guards that are not positive at its end
+    is_crossing: Bool[Array, " n_guards"]  # guards that are not positive at the step's end
     is_stuck: Bool[Array, ""]
     following_length: Scalar  # length of the next step, s
-    time_tolerance: Scalar  # of the event's time, s
+    time_tolerance: Scalar  # tolerance of the event's time, s
     controller_state: Any
     n_tried_steps: Int[Array, ""]
 
 
 def _assess_step(
-    context: _PhaseContext, loop: _PhaseState, step: AcceptedPhaseStep, error: Array
+    context: _PhaseContext, phase_state: _PhaseState, step: AcceptedPhaseStep, error: Array
 ) -> _StepAssessment:
-    """Accept or reject the step, and detect crossings and dips within it."""
+    """Return whether the step is accepted, whether a guard crosses zero at its end or inside,
+    and the next length.
+    """
     stepper, monitored_functions, options, _ = context
-    n, previous_step, length = monitored_functions.n_guards, loop.accepted_step, loop.next_length
-    is_starting = loop.purpose == StepPurpose.START
-    is_integrating = loop.purpose == StepPurpose.INTEGRATION
-    nominal_length = jnp.where(is_starting, options.dt0, length)
-    is_kept, next_length, controller_state = stepper.control_step(
-        previous_step.state, step.state, error, nominal_length, loop.controller_state
+    n_guards, previous_step, length = (
+        monitored_functions.n_guards,
+        phase_state.accepted_step,
+        phase_state.next_length,
     )
-    is_kept = is_kept & is_integrating
-    is_crossing = step.values[:n] <= 0.0
-    dip_fractions, has_dip = _find_dips(previous_step, step.values, step.rates, length, n)
-    length_to_dip = length * jnp.min(jnp.where(has_dip & ~is_crossing, dip_fractions, 1.0))
-    must_retry = is_kept & (length_to_dip < length)
-    has_crossed = is_kept & jnp.any(is_crossing) & ~must_retry
-    n_tried_steps = loop.n_tried_steps + (loop.purpose != StepPurpose.REFINEMENT)
+    is_starting = phase_state.purpose == StepPurpose.START
+    is_integrating = phase_state.purpose == StepPurpose.INTEGRATION
+    nominal_length = jnp.where(is_starting, options.dt0, length)
+    is_within_tolerance, next_length, controller_state = stepper.control_step(
+        previous_step.state, step.state, error, nominal_length, phase_state.controller_state
+    )
+    is_within_tolerance = is_within_tolerance & is_integrating
+    is_crossing = step.values[:n_guards] <= 0.0
+    minimum_fractions, may_have_minimum = _find_guard_minima(
+        previous_step, step.values, step.rates, length, n_guards
+    )
+    length_to_minimum = length * jnp.min(
+        jnp.where(may_have_minimum & ~is_crossing, minimum_fractions, 1.0)
+    )
+    must_retry = is_within_tolerance & (length_to_minimum < length)
+    has_crossed = is_within_tolerance & jnp.any(is_crossing) & ~must_retry
+    n_tried_steps = phase_state.n_tried_steps + (phase_state.purpose != StepPurpose.REFINEMENT)
     cannot_continue = (n_tried_steps >= options.max_solver_steps) | (
         previous_step.time + next_length == previous_step.time
     )
     following_length = jnp.where(is_starting, options.dt0, next_length)
-    following_length = jnp.where(must_retry, length_to_dip, following_length)
-    is_accepted = is_starting | (is_kept & ~has_crossed & ~must_retry)
+    following_length = jnp.where(must_retry, length_to_minimum, following_length)
+    is_accepted = is_starting | (is_within_tolerance & ~has_crossed & ~must_retry)
     reached_time = jnp.where(is_accepted, step.time, previous_step.time)
     # The last step ends at the time limit.
     time_left = lax.stop_gradient(options.max_phase_time - reached_time)
     following_length = jnp.minimum(following_length, time_left)
-    guess = _guess_event_length(previous_step, step.values, step.rates, length, n, is_crossing)
-    resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
+    event_length_guess = _guess_event_length(
+        previous_step, step.values, step.rates, length, n_guards, is_crossing
+    )
+    time_resolution = 1e3 * jnp.finfo(length.dtype).eps * step.time
     return _StepAssessment(
         is_accepted=is_accepted,
         has_crossed=has_crossed,
         is_crossing=is_crossing,
         is_stuck=is_integrating & ~has_crossed & cannot_continue,
-        following_length=jnp.where(has_crossed, guess, following_length),
-        time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, resolution)),
+        following_length=jnp.where(has_crossed, event_length_guess, following_length),
+        time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, time_resolution)),
         controller_state=tree_where(
-            is_integrating & ~must_retry, controller_state, loop.controller_state
+            is_integrating & ~must_retry, controller_state, phase_state.controller_state
         ),
         n_tried_steps=n_tried_steps,
     )
 
 
-def _find_dips(
+def _find_guard_minima(
     previous_step: AcceptedPhaseStep, values: Array, rates: Array, length: Scalar, n_guards: int
 ) -> tuple[Array, Array]:
-    """Return, for each guard, the fraction of the step to try first, and whether it may dip.
+    """Return, for each guard, the fraction of the step to its minimum, and whether the guard may be
+    negative there.
 
     The cubic through values and rates does not fall below the least of its Bernstein coefficients,
-    so a guard with positive coefficients does not dip. Otherwise the step is repeated up to the
-    cubic's minimum, at most nine tenths of it. Shorter steps have coefficients closer to the guard,
-    until these are positive or a step ends in the dip.
+    so a guard with positive coefficients stays positive. Otherwise the step is repeated up to the
+    cubic's minimum, at most nine tenths of the step. Shorter steps have coefficients closer to the
+    guard, until these are positive or a step ends where the guard is negative.
     """
     v0, r0, v1, r1 = lax.stop_gradient((previous_step.values, previous_step.rates, values, rates))
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
     length = lax.stop_gradient(length)
     first_coefficient, second_coefficient = v0 + r0 * length / 3.0, v1 - r1 * length / 3.0
-    dip_fractions = jnp.clip(find_cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
-    advances_time = previous_step.time + dip_fractions * length > previous_step.time
-    may_dip = (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (r1 >= 0.0)
-    return dip_fractions, may_dip & advances_time
+    minimum_fractions = jnp.clip(find_cubic_minimum(v0, r0 * length, v1, r1 * length)[0], 0.1, 0.9)
+    advances_time = previous_step.time + minimum_fractions * length > previous_step.time
+    may_be_negative = (jnp.minimum(first_coefficient, second_coefficient) <= 0.0) & (r1 >= 0.0)
+    return minimum_fractions, may_be_negative & advances_time
 
 
 def _guess_event_length(
@@ -538,27 +589,37 @@ def _guess_event_length(
     n_guards: int,
     is_crossing: Array,
 ) -> Scalar:
-    """Return the length to the earliest crossing of the guards' cubics.
+    """Return the time from the step's start to the earliest zero of the crossing guards' cubics, s.
 
-    It is found by the secant, then by Newton's method.
+    The zero is found by the secant, then by Newton's method.
     """
     v0, r0, v1, r1 = lax.stop_gradient(
         (previous_step.values, previous_step.rates * length, values, rates * length)
     )
     v0, r0, v1, r1 = v0[:n_guards], r0[:n_guards], v1[:n_guards], r1[:n_guards]
-    fall = jnp.where(is_crossing & (v0 > v1), v0 - v1, 1.0)
-    fraction = jnp.where(is_crossing, jnp.clip(v0 / fall, 0.0, 1.0), 1.0)
-    # A guard that rises from zero, or from round-off above it: the cubic over x has the root.
-    linear, square = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
-    root = jnp.sqrt(jnp.maximum(linear * linear - 4.0 * r0 * square, 0.0)) - linear
-    other_root = jnp.clip(2.0 * r0 / jnp.where(root > 0.0, root, 1.0), 0.0, 1.0)
+    decrease = jnp.where(is_crossing & (v0 > v1), v0 - v1, 1.0)
+    fraction = jnp.where(is_crossing, jnp.clip(v0 / decrease, 0.0, 1.0), 1.0)
+    # A guard that rises from zero, or from round-off above it, has its other zero where the cubic
+    # divided by x vanishes.
+    linear_coefficient, quadratic_coefficient = 3.0 * v1 - 2.0 * r0 - r1, r0 - 2.0 * v1 + r1
+    root_denominator = (
+        jnp.sqrt(
+            jnp.maximum(
+                linear_coefficient * linear_coefficient - 4.0 * r0 * quadratic_coefficient, 0.0
+            )
+        )
+        - linear_coefficient
+    )
+    other_root = jnp.clip(
+        2.0 * r0 / jnp.where(root_denominator > 0.0, root_denominator, 1.0), 0.0, 1.0
+    )
     cubic_rate = lambda fraction: (
         6.0 * fraction * (fraction - 1.0) * (v0 - v1)
         + (1.0 - fraction) * (1.0 - 3.0 * fraction) * r0
         + fraction * (3.0 * fraction - 2.0) * r1
     )
-    starts_rising = is_crossing & (r0 > 0.0) & ((v0 == 0.0) | (cubic_rate(fraction) >= 0.0))
-    fraction = jnp.where(starts_rising, other_root, fraction)
+    rises_from_zero = is_crossing & (r0 > 0.0) & ((v0 == 0.0) | (cubic_rate(fraction) >= 0.0))
+    fraction = jnp.where(rises_from_zero, other_root, fraction)
     for _ in range(3):
         is_falling = (rate := cubic_rate(fraction)) < 0.0
         change = evaluate_cubic(fraction, v0, r0, v1, r1) / jnp.where(is_falling, rate, 1.0)
@@ -569,7 +630,9 @@ def _guess_event_length(
 
 
 class _EventProposal(NamedTuple):
-    """Newton's next proposal for an event's time, and the remaining bracket."""
+    """Newton's next proposal for an event's time, and the remaining bracket, s from the step's
+    start.
+    """
 
     length: Scalar
     guard: Int[Array, ""]
@@ -580,20 +643,22 @@ class _EventProposal(NamedTuple):
 def _propose_event(
     search: _EventSearch, guards: Array, rates: Array, length: Scalar
 ) -> _EventProposal:
-    """Return the earliest of the times that the crossing guards propose.
+    """Return the earliest of the event times that the crossing guards propose.
 
     Bisection keeps the proposal inside the shrinking bracket. The proposal carries derivatives:
     after k proposals in the quadratic regime, derivatives are accurate to order 2^k - 1.
     """
     is_falling = search.is_crossing & (rates < 0.0)
-    change = -guards / jnp.where(is_falling, rates, -1.0)
+    time_change = -guards / jnp.where(is_falling, rates, -1.0)
     # A guard that rises below zero has crossed at an unknown earlier time.
-    missed_time = jnp.where(search.is_crossing & (guards < 0.0), -jnp.inf, jnp.inf)
-    proposals = jnp.where(is_falling, length + change, missed_time)
-    # If no crossing guard falls here, the lowest of them is taken, never one that did not cross.
-    lowest = jnp.argmin(jnp.where(search.is_crossing, guards, jnp.inf))
-    guard = jnp.where(jnp.any(proposals < jnp.inf), jnp.argmin(proposals), lowest).astype(jnp.int32)
-    is_rising = (guards == 0.0) & (rates > 0.0)  # at the start of the step
+    time_of_missed_event = jnp.where(search.is_crossing & (guards < 0.0), -jnp.inf, jnp.inf)
+    proposals = jnp.where(is_falling, length + time_change, time_of_missed_event)
+    # If no crossing guard falls here, the lowest of the crossing guards is taken.
+    lowest_guard = jnp.argmin(jnp.where(search.is_crossing, guards, jnp.inf))
+    guard = jnp.where(jnp.any(proposals < jnp.inf), jnp.argmin(proposals), lowest_guard).astype(
+        jnp.int32
+    )
+    is_rising = (guards == 0.0) & (rates > 0.0)  # This happens at the start of the step.
     is_before_event = jnp.all(jnp.where(search.is_crossing, (guards > 0.0) | is_rising, True))
     lower_bound = jnp.where(is_before_event, lax.stop_gradient(length), search.lower_bound)
     upper_bound = jnp.where(is_before_event, search.upper_bound, lax.stop_gradient(length))
@@ -618,10 +683,10 @@ def sample_phase(
     accuracy.
     """
     stepper = _make_stepper(field, options, EVENT_SEARCH_OPTIONS.max_step_growth)
-    interval = duration / (n_samples - 1)
+    sample_interval = duration / (n_samples - 1)
 
     def integrate_to_next(state: StateVector, _sample: None) -> tuple[StateVector, StateVector]:
-        next_state = _integrate_interval(stepper, state, interval, options)
+        next_state = _integrate_interval(stepper, state, sample_interval, options)
         return next_state, next_state
 
     _, states = lax.scan(integrate_to_next, start, None, length=n_samples - 1)
@@ -631,23 +696,29 @@ def sample_phase(
 def _integrate_interval(
     stepper: _SolverStepper, state: StateVector, interval: Scalar, options: StepOptions
 ) -> StateVector:
-    """Return the state after `interval`, by adaptive steps of which the last ends exactly there."""
+    """Return the state after the time `interval`, s, by adaptive steps of which the last ends
+    exactly there.
+    """
 
     def advance_interval(carry: tuple) -> tuple:
         time, state, solver_state, length, controller_state, n_tried_steps = carry
         step_length = jnp.minimum(length, interval - time)
         end, error, end_solver_state = stepper.advance_state(state, solver_state, step_length)
-        is_kept, next_length, controller_state = stepper.control_step(
+        is_within_tolerance, next_length, controller_state = stepper.control_step(
             state, end, error, step_length, controller_state
         )
-        is_last = is_kept & (step_length >= interval - time)
-        time = jnp.where(is_last, interval, jnp.where(is_kept, time + step_length, time))
-        state, solver_state = tree_where(is_kept, (end, end_solver_state), (state, solver_state))
+        is_last_step = is_within_tolerance & (step_length >= interval - time)
+        time = jnp.where(
+            is_last_step, interval, jnp.where(is_within_tolerance, time + step_length, time)
+        )
+        state, solver_state = tree_where(
+            is_within_tolerance, (end, end_solver_state), (state, solver_state)
+        )
         return time, state, solver_state, next_length, controller_state, n_tried_steps + 1
 
     needs_step = lambda c: (c[0] < interval) & (c[-1] < options.max_solver_steps)
     zero_count = jnp.zeros((), jnp.int32)
     solver_state, controller_state = stepper.init_states(state, options)
-    zero = jnp.zeros_like(interval)
-    carry = (zero, state, solver_state, zero + options.dt0, controller_state, zero_count)
+    zero_time = jnp.zeros_like(interval)
+    carry = (zero_time, state, solver_state, zero_time + options.dt0, controller_state, zero_count)
     return lax.while_loop(needs_step, advance_interval, carry)[1]

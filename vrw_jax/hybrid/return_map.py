@@ -1,4 +1,4 @@
-"""Return maps of hybrid simulations: they carry the termination of each simulation."""
+"""Return maps of hybrid simulations, which carry the termination of each simulation."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -14,17 +14,18 @@ from vrw_jax.numerics import StepOptions
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReturnMap:
-    """Map of section coordinates to those after `events` events of a hybrid simulation.
+    """Map from section coordinates to the section coordinates after `events` events of a
+    simulation.
 
-    It is NaN if the simulation ends early, so that no method mistakes its last state for a return.
-    `solve_fixed_point` reports the termination with the point.
+    The map is NaN if the simulation ends early, so that no method takes its last state for a
+    return. `solve_fixed_point` reports the termination with the fixed point.
 
     - `modes`: as in `simulate_hybrid`;
-    - `embed`: the state of given section coordinates, where the simulation begins;
-    - `project`: section coordinates of a state, past the last event;
-    - `events`: of one return;
-    - `mode`: in which the simulation begins;
-    - `options`: of the simulation.
+    - `embed`: function that returns the state for section coordinates, where the simulation begins;
+    - `project`: function that returns the section coordinates of a state after the last event;
+    - `events`: number of events of one return;
+    - `mode`: index of the mode in which the simulation begins;
+    - `options`: options of the simulation.
     """
 
     modes: Sequence[Mode] | Mode
@@ -35,14 +36,14 @@ class ReturnMap:
     options: StepOptions | None = None
 
     def simulate(self, x: Float[Array, " n"]) -> HybridSolution:
-        """Return the simulation from section coordinates `x`."""
+        """Return the simulation that begins at section coordinates `x`, shape (n,)."""
         start, events = self.embed(x), self.events
         return simulate_hybrid(
             self.modes, start, events=events, mode=self.mode, options=self.options
         )
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the next section coordinates; NaN if the simulation ended early."""
+        """Return the next section coordinates, shape (n,); NaN if the simulation ended early."""
         solution = self.simulate(x)
         section = self.project(solution.state)
         return section * jnp.where(
@@ -50,7 +51,9 @@ class ReturnMap:
         ).astype(section.dtype)
 
     def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
-        """Return the `Termination` of the first of `period_n` returns that ends early."""
+        """Return the `Termination` of the first of `period_n` returns that ends early; else that
+        of the last.
+        """
         x = lax.stop_gradient(x)
         termination = jnp.full((), int(Termination.MAX_EVENTS_REACHED), jnp.int32)
         for _ in range(period_n):

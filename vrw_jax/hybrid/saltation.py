@@ -1,5 +1,5 @@
-"""Determinant of the flow's Jacobian through modes and events: Liouville's formula
-with saltation.
+"""Determinant of the flow's Jacobian through modes and events, by Liouville's formula with
+saltation matrices.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,17 +23,18 @@ def flow_jacobian_determinant(
     solution: HybridSolution,
     options: StepOptions | None = None,
 ) -> Scalar:
-    """Return the determinant of the final state's Jacobian with respect to `start`, past the last
+    """Return the determinant of the final state's Jacobian with respect to `start`, after the last
     event.
 
-    It is exp of the field's integrated divergence along each mode (Liouville), times the
-    determinant of each event's saltation matrix (R. I. Leine and H. Nijmeijer, Dynamics and
+    It is the exponential of the field's divergence integrated along each mode (Liouville), times
+    the determinant of each event's saltation matrix (R. I. Leine and H. Nijmeijer, Dynamics and
     Bifurcations of Non-Smooth Mechanical Systems, 2004, section 7). For an orbit that is periodic
-    after these events, it is the product of all its multipliers, including the 1 along the orbit. A
-    return map's Jacobian loses that product's digits where a guard is grazed, because its entries
+    after these events, it is the product of all multipliers, including the 1 along the orbit. A
+    return map's Jacobian loses the digits of that product if a guard is grazed, because its entries
     grow as one over the guard's rate.
 
-    The result is NaN if the solver steps are exhausted. Transforms apply, reverse mode does not.
+    The result is NaN if the solver steps are exhausted. Transforms of JAX apply, except reverse
+    mode.
     """
     options = StepOptions() if options is None else options
     modes, start = collect_modes(modes), check_reals("start", start)
@@ -44,31 +45,37 @@ def flow_jacobian_determinant(
 def _multiply_event_factors(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Scalar:
-    event_factors = [_event_factor(mode, guard, options) for mode in modes for guard in mode.guards]
+    event_factors = [
+        _make_event_factor(mode, guard, options) for mode in modes for guard in mode.guards
+    ]
     first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
     phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
     durations = jnp.diff(solution.times, prepend=0.0)
     next_modes = jnp.append(solution.modes[1:], solution.mode)
-    count = jnp.arange(len(solution.times))
-    next_modes = jnp.where(count == solution.n_events - 1, solution.mode, next_modes)
+    event_indices = jnp.arange(len(solution.times))
+    next_modes = jnp.where(event_indices == solution.n_events - 1, solution.mode, next_modes)
     fields = [mode.field for mode in modes]
 
     def multiply_event(product: Array, event_data: tuple) -> tuple[Array, None]:
-        k, state, state_before, state_after, duration, factor_index, next_mode = event_data
+        event_index, state, state_before, state_after, duration, factor_index, next_mode = (
+            event_data
+        )
         next_flow = lax.switch(next_mode, fields, state_after)
         factor = lax.switch(factor_index, event_factors, state, state_before, next_flow, duration)
-        return product * jnp.where(k < solution.n_events, factor, 1.0), None
+        return product * jnp.where(event_index < solution.n_events, factor, 1.0), None
 
     event_table = (
-        count, phase_starts, solution.states_before, solution.states_after, durations,
+        event_indices, phase_starts, solution.states_before, solution.states_after, durations,
         first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
     return lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
 
 
-def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
-    """Return the factor of one mode that this guard ends."""
+def _make_event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
+    """Return the function that computes the determinant's factor of one mode and the guard that
+    ends it.
+    """
 
     def flow_with_divergence(z: Array) -> Array:
         y = z[:-2]
@@ -83,13 +90,13 @@ def _event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
         )[-1]
         is_reached = (
             jnp.abs(end[-1] - duration) <= 1e-9 * duration
-        )  # otherwise the solver steps were spent
+        )  # Otherwise the solver steps were exhausted.
         reset_jacobian = jax.jacfwd(guard.reset)(state_before)
         guard_gradient = jax.jacfwd(guard.value)(state_before)
         flow_before = mode.field(state_before)
-        saltation = reset_jacobian + jnp.outer(
+        saltation_matrix = reset_jacobian + jnp.outer(
             next_flow - reset_jacobian @ flow_before, guard_gradient
         ) / (guard_gradient @ flow_before)
-        return jnp.where(is_reached, jnp.exp(end[-2]) * jnp.linalg.det(saltation), jnp.nan)
+        return jnp.where(is_reached, jnp.exp(end[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan)
 
     return evaluate_factor

@@ -20,15 +20,16 @@ def integrate_in_units(
     state_units: StateVector,
     time_unit: Scalar,
 ) -> PhaseEnd:
-    """Return the result of `integrate_phase`, integrated in these units, in SI.
+    """Return the result of `integrate_phase` in SI, integrated in other units.
 
-    All arguments but `options` are in SI, guards and margins too.
+    `state_units` are the unit of each coordinate of the state, and `time_unit` is in s. All other
+    arguments but `options` are in SI, guards and margins too.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    values = lambda y: monitored_functions.values(y * state_units)
+    evaluate_in_si = lambda y: monitored_functions.evaluate(y * state_units)
     end = integrate_phase(
         _scale_field(field, state_units, time_unit),
-        monitored_functions._replace(values=values),
+        monitored_functions._replace(evaluate=evaluate_in_si),
         start / state_units,
         active,
         options,
@@ -45,7 +46,9 @@ def sample_in_units(
     state_units: StateVector,
     time_unit: Scalar,
 ) -> Float[Array, "n_samples dim"]:
-    """Return the states of `sample_phase`, integrated in these units, in SI."""
+    """Return the states of `sample_phase` in SI, integrated in other units, see
+    `integrate_in_units`.
+    """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
     scaled_field = _scale_field(field, state_units, time_unit)
     start, duration = start / state_units, duration / time_unit

@@ -1,8 +1,9 @@
-"""Multipliers of a periodic orbit from its segments, without forming their product.
+"""Multipliers of a periodic orbit from its segments, without the product of their Jacobians.
 
-A product of matrices keeps what grows and loses what decays: a multiplier of 1e-20 beside one of 1
-has no correct digit in it. Orthogonal iteration around the period makes every factor triangular
-instead (a periodic Schur form). A multiplier is then a product of diagonal entries, each correct.
+A product of matrices keeps what grows and loses what decays: beside a multiplier of 1, one of 1e-20
+has no correct digit. Orthogonal iteration around the period makes every factor triangular instead
+(a periodic Schur form). A multiplier is then a product of diagonal entries, each of which is
+accurate.
 """
 
 from collections.abc import Sequence
@@ -21,13 +22,13 @@ from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
 
 
 class FlowSegments(NamedTuple):
-    """A flow in segments of equal time."""
+    """A flow divided into segments of equal time."""
 
-    states: Float[Array, "n_ends dim"]  # at the segments' ends, the start first
+    states: Float[Array, "n_ends dim"]  # states at the segments' ends, the start first
     jacobians: Float[
         Array, "n_segments n n"
     ]  # Jacobian of each segment's end with respect to its start
-    divergence: Scalar  # integrated over all segments: logarithm of the determinant
+    divergence: Scalar  # divergence integrated over all segments, the logarithm of the determinant
 
 
 def segment_maps(
@@ -38,13 +39,14 @@ def segment_maps(
     options: StepOptions,
     n_directions: int | None = None,
 ) -> FlowSegments:
-    """Return the flow of `field` with its Jacobians by the first `n_directions` coordinates
-    (default all).
+    """Return the flow of `field` over `duration`, s, in `n_segments` segments, with the Jacobian of
+    each segment.
 
-    Derivatives take part in the step-size control. Each tangent is a direction of about constant
-    length and the logarithm of its growth, so that decaying directions keep their digits. A segment
-    whose solver steps are exhausted is NaN. A clock among the coordinates is no direction and must
-    follow those that are.
+    The Jacobians are with respect to the first `n_directions` coordinates, by default all.
+    Derivatives take part in the step-size control. Each tangent is stored as a direction of about
+    constant length and the logarithm of its growth, so that decaying directions keep their digits.
+    A segment is NaN if its solver steps are exhausted. If a coordinate is a clock, it follows the
+    others and is no direction.
     """
     start = jnp.asarray(start, float)
     output_shape = jax.eval_shape(field, start)
@@ -61,59 +63,68 @@ def segment_maps(
             f"from 1 to "
             f"{start.size} and the other positive."
         )
-    static = (field, n_segments, n_tangents)
+    constants = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
-    segments = call_compiled(_integrate_segments, static, start, duration, options)
+    segments = call_compiled(_integrate_segments, constants, start, duration, options)
     return refuse_reverse_mode("segment_maps", segments)
 
 
 def _integrate_segments(
-    static: tuple[VectorField, int, int], start: Array, duration: Array, options: StepOptions
+    constants: tuple[VectorField, int, int], start: Array, duration: Array, options: StepOptions
 ) -> FlowSegments:
-    field, n_segments, n_tangents = static
-    dim, size = start.size, start.size * (1 + n_tangents)
-    length = duration / n_segments
+    field, n_segments, n_tangents = constants
+    n_coordinates, n_state_and_tangents = start.size, start.size * (1 + n_tangents)
+    segment_duration = duration / n_segments
 
     def flow_with_tangents(z: Array) -> Array:
-        y, tangents = z[:dim], z[dim:size].reshape(n_tangents, dim)
+        y, tangents = (
+            z[:n_coordinates],
+            z[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates),
+        )
         jvp_of_field = lambda tangent: jax.jvp(field, (y,), (tangent,))[1]
         tangent_rates = jax.vmap(jvp_of_field)(tangents)
-        growth = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(tangents * tangents, axis=1)
-        normalized_rates = tangent_rates - growth[:, None] * tangents
-        unit_rates = jax.vmap(jvp_of_field)(jnp.eye(n_tangents, dim, dtype=z.dtype))
+        growth_rates = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(
+            tangents * tangents, axis=1
+        )
+        normalized_rates = tangent_rates - growth_rates[:, None] * tangents
+        unit_rates = jax.vmap(jvp_of_field)(jnp.eye(n_tangents, n_coordinates, dtype=z.dtype))
         clock = jnp.ones_like(y[:1])
         return jnp.concatenate(
-            [field(y), normalized_rates.ravel(), growth, jnp.trace(unit_rates)[None], clock]
+            [field(y), normalized_rates.ravel(), growth_rates, jnp.trace(unit_rates)[None], clock]
         )
 
     def integrate_segment(state: Array, _: None) -> tuple[Array, tuple]:
         start_state = jnp.concatenate(
-            [state, jnp.eye(n_tangents, dim).ravel(), jnp.zeros(n_tangents + 2)]
+            [state, jnp.eye(n_tangents, n_coordinates).ravel(), jnp.zeros(n_tangents + 2)]
         )
-        end_state = sample_phase(flow_with_tangents, start_state, length, 2, options)[-1]
+        end_state = sample_phase(flow_with_tangents, start_state, segment_duration, 2, options)[-1]
         is_reached = (
-            jnp.abs(end_state[-1] - length) <= 1e-9 * length
-        )  # otherwise the solver steps were spent
-        tangents = end_state[dim:size].reshape(n_tangents, dim)
-        growth_factors = jnp.exp(end_state[size : size + n_tangents])
+            jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
+        )  # Otherwise the solver steps were exhausted.
+        tangents = end_state[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
+        growth_factors = jnp.exp(
+            end_state[n_state_and_tangents : n_state_and_tangents + n_tangents]
+        )
         jacobian = jnp.where(is_reached, tangents[:, :n_tangents].T * growth_factors, jnp.nan)
-        return end_state[:dim], (end_state[:dim], jacobian, end_state[-2])
+        return end_state[:n_coordinates], (end_state[:n_coordinates], jacobian, end_state[-2])
 
-    _, (states, maps, divergences) = lax.scan(integrate_segment, start, None, length=n_segments)
-    return FlowSegments(jnp.concatenate([start[None], states]), maps, jnp.sum(divergences))
+    _, (end_states, jacobians, divergences) = lax.scan(
+        integrate_segment, start, None, length=n_segments
+    )
+    return FlowSegments(jnp.concatenate([start[None], end_states]), jacobians, jnp.sum(divergences))
 
 
 class ProductMultipliers(NamedTuple):
-    """Eigenvalues of a product of matrices, the largest first."""
+    """Eigenvalues of a product of matrices, the largest modulus first."""
 
-    values: np.ndarray  # complex; NaN where `is_known` is False
-    logarithms: np.ndarray  # of their moduli, finite even if the value underflows
-    relative_error: np.ndarray  # estimated
+    values: np.ndarray  # eigenvalues, complex; NaN if `is_known` is False
+    logarithms: np.ndarray  # logarithms of their moduli, finite even if the value underflows
+    relative_error: np.ndarray  # estimated relative error
     is_known: np.ndarray  # whether the relative error is within `accuracy`
 
 
 N_SCHUR_SWEEPS = 60
-"""Number of sweeps around the period.
+"""Largest number of sweeps around the period.
 
 It is chosen because moduli that differ by a factor of two are then separated to the last digit.
 Closer moduli stay together in one block, whose product loses few digits.
@@ -123,10 +134,11 @@ Closer moduli stay together in one block, whose product loses few digits.
 def product_multipliers(
     jacobians: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
 ) -> ProductMultipliers:
-    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0] and whether each has `accuracy`.
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], and whether each has the
+    relative `accuracy`.
 
-    `tolerance` is the error of each Jacobian relative to its norm. The function accepts concrete
-    matrices only.
+    `jacobians` has the shape (n_segments, n, n), and `tolerance` is the error of each relative to
+    its norm. The function accepts concrete matrices only.
     """
     jacobians = np.asarray(jacobians, float)
     if jacobians.ndim != 3 or jacobians.shape[1] != jacobians.shape[2] or not jacobians.size:
@@ -161,10 +173,13 @@ def product_multipliers(
         np.concatenate(x) for x in zip(*block_results, strict=True)
     )
     is_known = relative_error <= accuracy
-    order = np.argsort(-logarithms, kind="stable")
-    output_shape = np.where(is_known, values, np.nan)
+    descending_order = np.argsort(-logarithms, kind="stable")
+    known_values = np.where(is_known, values, np.nan)
     return ProductMultipliers(
-        output_shape[order], logarithms[order], relative_error[order], is_known[order]
+        known_values[descending_order],
+        logarithms[descending_order],
+        relative_error[descending_order],
+        is_known[descending_order],
     )
 
 
@@ -175,24 +190,26 @@ def _block_multipliers(
     norms: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the multipliers of one diagonal block, their logarithms and relative errors."""
-    diagonal_blocks, size = triangles[:, block, block], block.stop - block.start
+    """Return the multipliers of one diagonal block, the logarithms of their moduli, and their
+    relative errors.
+    """
+    diagonal_blocks, block_size = triangles[:, block, block], block.stop - block.start
     diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_diagonal = np.log(diagonal)
         error_amplification = np.where(diagonal > 0.0, norms[:, None] / diagonal, 0.0)
-        error = tolerance * np.max(np.sum(error_amplification, axis=0))
-        scaled_product = np.eye(size)
+        relative_error = tolerance * np.max(np.sum(error_amplification, axis=0))
+        scaled_product = np.eye(block_size)
         log_scale = 0.0
-        spread = np.ptp(np.sum(log_diagonal, axis=0)) if size > 1 else 0.0
+        log_spread = np.ptp(np.sum(log_diagonal, axis=0)) if block_size > 1 else 0.0
         for factor in diagonal_blocks:
             scaled_product = factor @ scaled_product
-            largest = np.max(np.abs(scaled_product)) or 1.0
-            scaled_product, log_scale = scaled_product / largest, log_scale + np.log(largest)
+            max_entry = np.max(np.abs(scaled_product)) or 1.0
+            scaled_product, log_scale = scaled_product / max_entry, log_scale + np.log(max_entry)
         values = np.linalg.eigvals(closing_matrix[block, block] @ scaled_product)
         logarithms = np.log(np.abs(values)) + log_scale
-        if size == 1:
+        if block_size == 1:
             logarithms = np.sum(log_diagonal, axis=0)
         phases = np.where(values == 0.0, 1.0, values / np.abs(values))
-        output_shape = phases * np.exp(logarithms)
-    return output_shape, logarithms, np.full(size, error * np.exp(spread))
+        multipliers = phases * np.exp(logarithms)
+    return multipliers, logarithms, np.full(block_size, relative_error * np.exp(log_spread))

@@ -3,8 +3,8 @@
     ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
     simulate_hybrid((ball,), start, events=10)
 
-A mode with wrong shapes raises an error of one sentence. A failure during the simulation is one
-code, `Termination`, and the result keeps all events before it.
+A mode whose functions have wrong shapes raises a ValueError. A failure during the simulation is
+reported as a code, `Termination`, and the result contains all earlier events.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,32 +26,35 @@ from vrw_jax.runtime import with_default_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
-"""Most numbers stored in all events of a simulation, chosen because times, states before and states
-after then take 2.4 GB."""
+"""Largest amount of numbers stored in the events of a simulation. It is chosen because times,
+states before and states after then take 2.4 GB.
+"""
 
 
 class Guard(NamedTuple):
-    """A function `value`, positive inside its mode, that ends the mode when it falls to zero.
+    """A function `value` of the state, positive inside its mode, that ends the mode when it falls
+    to zero.
 
-    Then `reset` is applied to the state, and `target_mode` begins.
+    Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
     """
 
     value: Callable[[StateVector], Scalar]
     reset: Callable[[StateVector], StateVector] = lambda y: y
-    target_mode: int | None = None  # index of the next mode; None: the same mode
+    target_mode: int | None = None  # index of the next mode; None stands for the same mode
 
 
 class Mode(NamedTuple):
-    """An autonomous field, shape (dim,) to (dim,), and its guards, or the only one of them.
+    """An autonomous vector field, shape (dim,) to (dim,), and its guards.
 
-    Time is a coordinate if any.
+    A single guard may be given without a tuple. A field that depends on time has time as a
+    coordinate.
     """
 
     field: VectorField
     guards: tuple[Guard, ...]
 
     def guard_values(self, y: StateVector) -> Array:
-        """Return the values of all guards at a state."""
+        """Return the values of all guards at the state `y`, shape (guards,)."""
         return jnp.stack([guard.value(y) for guard in self.guards])
 
 
@@ -73,31 +76,33 @@ class Termination(StatusCode):
 
 
 RUNNING_CODE = -1
-"""Code of a simulation that has not ended, in place of its `Termination`."""
+"""Code of a simulation that has not ended, stored in place of its `Termination`."""
 
 
 class HybridSolution(NamedTuple):
-    """Events of a simulation in order of time; rows past `n_events` are zero."""
+    """Events of a simulation in order of time; entries after the first `n_events` are zero."""
 
     times: Float[Array, " events"]
     time_tolerance: Float[Array, " events"]
-    """Tolerances of the state as an error of each time, which is no bound."""
+    """Error of each event's time that corresponds to the tolerances of the state; it is no
+    bound.
+    """
     time_roundoff: Float[Array, " events"]
-    """Round-off of the state as an error of each time."""
+    """Error of each event's time that corresponds to the round-off of the state."""
     states_before: Float[Array, "events dim"]  # states on the guard
     states_after: Float[Array, "events dim"]  # states after the reset
-    modes: Int[Array, " events"]  # modes that ended
-    guards: Int[Array, " events"]  # guards that ended them
+    modes: Int[Array, " events"]  # indices of the modes that ended
+    guards: Int[Array, " events"]  # indices of the guards that ended them
     n_events: Int[Array, ""]
-    time: Scalar  # of the last state
-    state: StateVector  # at the end of the simulation
+    time: Scalar  # time of the last state
+    state: StateVector  # state at the end of the simulation
     mode: Int[Array, ""]
     solver_steps: Int[Array, ""]
     termination: Int[Array, ""]  # a Termination
 
     @property
     def ending(self) -> Any:
-        """Return why the simulation ended, as a sentence; a batch has an array of sentences."""
+        """Return why the simulation ended, as a sentence; for a batch, an array of sentences."""
         return describe_ending(self.termination, Termination)
 
 
@@ -112,12 +117,14 @@ def simulate_hybrid(
 ) -> HybridSolution:
     """Return the simulation of `modes` from `start` through at most `events` events.
 
-    Events are located by `integrate_phase`: the earliest first, at the integrator's accuracy, with
-    derivatives of event times and states. At the start of a mode, a guard within round-off of the
-    time of zero counts as zero. A guard that is zero with a zero rate there ends the mode only if
-    it will not rise. The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` apply, reverse mode does
-    not. One mode, or the only guard of a mode, may be given without a tuple. Outside of `jax.jit`
-    equal modes are compiled once: functions with equal code and equal constants share a program.
+    `mode` is the index of the first mode. Events are located by `integrate_phase`: the earliest
+    first, at the integrator's accuracy, with derivatives of event times and states. At the start of
+    a mode, a guard counts as zero if its time of zero is within round-off. A guard that is zero
+    with a zero rate there ends the mode only if it will not rise.
+
+    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` apply, reverse mode does not. One mode, or
+    the only guard of a mode, may be given without a tuple. Outside of `jax.jit` equal modes are
+    compiled once: functions with equal code and equal constants share a program.
     """
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
@@ -136,17 +143,18 @@ def time_errors(
     solution: HybridSolution,
     options: StepOptions | None = None,
 ) -> Float[Array, " events"]:
-    """Return estimated errors of the event times, s, from simulations at two looser tolerances.
+    """Return estimated errors of the event times, s, shape (events,), from simulations at two
+    looser tolerances.
 
     The simulation is repeated with tolerances that are ten and a hundred times as large. The change
     of each event's time is divided by its `time_tolerance`. The estimate of an event is twice the
-    largest of these ratios so far, at least 1, times its `time_tolerance`. It is not below the sum
-    of the round-off of all states and of the time.
+    largest of these ratios so far, at least 1, times its `time_tolerance`. The estimate is not
+    below the sum of the round-off of all states and of the time.
 
-    Unlike `time_tolerance`, the estimate contains errors of steps that add up, errors of earlier
-    events, and errors that an implicit solver's own estimate omits in a stiff field. It is infinite
-    from the first event that the simulation at ten times the tolerance does not reach. The estimate
-    is measured, not proved. `options` are those of the simulation.
+    Unlike `time_tolerance`, the estimate contains errors of steps that add up and errors of earlier
+    events. It also contains errors that an implicit solver's own estimate omits in a stiff field.
+    The estimate is infinite from the first event that the simulation at ten times the tolerance
+    does not reach. It is measured, not proved. `options` are those of the simulation.
     """
     options = StepOptions() if options is None else options
     modes = collect_modes(modes)
@@ -157,26 +165,28 @@ def time_errors(
 def _estimate_time_errors(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Float[Array, " events"]:
-    """Return `time_errors` of modes that are tuples."""
-    count = jnp.arange(len(solution.times))
+    """Return `time_errors` for modes that are tuples."""
+    event_indices = jnp.arange(len(solution.times))
 
-    def time_change(factor: Array) -> Array:
+    def compute_time_change(factor: Array) -> Array:
         looser_options = options.with_tightened_tolerances(factor)
-        static = (modes, len(count))
-        looser_solution = _simulate(static, looser_options, start, solution.modes[0])
+        modes_and_events = (modes, len(event_indices))
+        looser_solution = _simulate(modes_and_events, looser_options, start, solution.modes[0])
         is_same_event = (looser_solution.guards == solution.guards) & (
             looser_solution.modes == solution.modes
         )
-        is_same_event = jnp.cumprod(is_same_event & (count < looser_solution.n_events)) > 0
+        is_same_event = jnp.cumprod(is_same_event & (event_indices < looser_solution.n_events)) > 0
         return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
 
     # Each event adds the round-off of its state, and the time has its own.
-    rounding = jnp.cumsum(
+    accumulated_roundoff = jnp.cumsum(
         jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
     )
-    rounding = rounding + jnp.finfo(start.dtype).eps * jnp.abs(solution.times)
+    accumulated_roundoff = accumulated_roundoff + jnp.finfo(start.dtype).eps * jnp.abs(
+        solution.times
+    )
     changes_at_ten, changes_at_hundred = lax.stop_gradient(
-        lax.map(time_change, jnp.asarray([0.1, 0.01], start.dtype))
+        lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
     )
     max_change = (
         jnp.maximum(
@@ -185,24 +195,26 @@ def _estimate_time_errors(
         / solution.time_tolerance
     )
     max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
-    errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, rounding)
-    return jnp.where(count < solution.n_events, errors, 0.0)
+    errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, accumulated_roundoff)
+    return jnp.where(event_indices < solution.n_events, errors, 0.0)
 
 
 def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
-    """Return modes, and the guards of each, as tuples; a single one may be given without."""
-    if isinstance(modes, Mode | Guard):  # tuples themselves
+    """Return the modes as a tuple whose guards are tuples; a single mode or guard may be given
+    without.
+    """
+    if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
         modes = (modes,)  # type: ignore[assignment]
     check_type("modes", modes, (list, tuple), "give Modes in a list")
-    listed = []
+    normalized_modes = []
     for mode in modes:
         check_type("a mode", mode, Mode, "give Mode(field, guards)")
         guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
         check_type("guards", guards, (list, tuple), "give Guards in a tuple")
         for guard in guards:
             check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
-        listed.append(mode._replace(guards=tuple(guards)))
-    return tuple(listed)
+        normalized_modes.append(mode._replace(guards=tuple(guards)))
+    return tuple(normalized_modes)
 
 
 def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: int) -> None:
@@ -215,12 +227,14 @@ def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: i
         raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
     if not 0 <= mode < len(modes):
         raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
-    for i, (field, guards) in enumerate(modes):
+    for mode_number, (field, guards) in enumerate(modes):
         if not guards:
-            raise ValueError(f"mode {i} has no guard, but only a guard can end it: give one.")
-        _check_output_shape(f"the field of mode {i}", field, start, start.shape)
-        for k, guard in enumerate(guards):
-            name = f"guard {k} of mode {i}"
+            raise ValueError(
+                f"mode {mode_number} has no guard, but only a guard can end it: give one."
+            )
+        _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
+        for guard_number, guard in enumerate(guards):
+            name = f"guard {guard_number} of mode {mode_number}"
             _check_output_shape(name, guard.value, start, ())
             _check_output_shape(f"the reset of {name}", guard.reset, start, start.shape)
             if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
@@ -231,7 +245,7 @@ def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: i
 
 
 def _check_output_shape(name: str, function: Callable, start: Array, shape: tuple) -> None:
-    """Raise an error unless `function(start)` returns floats of this shape."""
+    """Raise a ValueError unless `function(start)` returns floats of this shape."""
     check_callable(name, function, "of the state")
     output: Any = jax.eval_shape(function, start)
     output_shape = getattr(output, "shape", None)
@@ -256,15 +270,16 @@ def _integrate_mode(
     values = mode.guard_values(state)
     rates, curvatures = jax.jvp(guard_rates, (state,), (mode.field(state),))
     values, rates, curvatures = lax.stop_gradient((values, rates, curvatures))
-    clock = lax.stop_gradient(time + options.dt0)
-    time_resolution = 1e3 * jnp.finfo(state.dtype).eps * clock
+    time_after_first_step = lax.stop_gradient(time + options.dt0)
+    time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
     is_near_zero = -values <= jnp.abs(rates) * time_resolution
     is_violated = jnp.any((values < 0.0) & ~is_near_zero)
     guard_offset = jnp.where((values < 0.0) & is_near_zero & (rates > 0.0), -values, 0.0)
-    # For a guard at rest the second derivative decides: it does not fire if it will rise.
-    is_rising = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
-    guard_offset = jnp.where(is_rising, jnp.finfo(state.dtype).tiny, guard_offset)
-    is_zero = (values <= 0.0) & is_near_zero & ~is_rising
+    # For a guard at rest the second derivative decides: the guard does not end the mode if it will
+    # rise.
+    will_rise = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
+    guard_offset = jnp.where(will_rise, jnp.finfo(state.dtype).tiny, guard_offset)
+    is_zero = (values <= 0.0) & is_near_zero & ~will_rise
     monitored_functions = MonitoredFunctions(
         lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), is_zero_at_start=is_zero
     )
@@ -274,7 +289,8 @@ def _integrate_mode(
 
 
 def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple[Array, Array]:
-    """Return tolerance and round-off of the state as errors of the event time.
+    """Return the errors of the event time, s, that correspond to the tolerance and to the round-off
+    of the state.
 
     They are large if the guard is grazed.
     """
@@ -290,17 +306,17 @@ def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple
 
 
 def _add_exactly(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the rounded sum and its rounding error (D. E. Knuth's two-sum)."""
-    total = time + duration
-    added = total - time
-    return total, (time - (total - added)) + (duration - added)
+    """Return the rounded sum of two times and its rounding error (D. E. Knuth's two-sum)."""
+    rounded_sum = time + duration
+    added_duration = rounded_sum - time
+    return rounded_sum, (time - (rounded_sum - added_duration)) + (duration - added_duration)
 
 
 def _simulate(
-    static: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
+    modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
-    """Return the simulation; `static` holds the modes and the number of events."""
-    modes, events = static
+    """Return the simulation; `modes_and_events` contains the modes and the number of events."""
+    modes, events = modes_and_events
 
     def make_mode_branch(mode_index: int) -> Callable:
         def run_mode(state: Array, time: Array) -> tuple:
@@ -319,40 +335,44 @@ def _simulate(
     max_simultaneous = sum(len(mode.guards) ** 2 for mode in modes)
 
     def advance_event(carry: tuple) -> tuple:
-        solution, n_stationary, remainder = carry
+        solution, n_events_without_progress, remainder = carry
         end, is_violated, time_scales, next_state, next_mode = lax.switch(
             solution.mode, mode_branches, solution.state, solution.time
         )
         has_event = ~is_violated & (end.guard >= 0)
         time, remainder = _add_exactly(solution.time, end.duration + remainder)
-        n_stationary = jnp.where(time > solution.time, 0, n_stationary + 1)
-        has_spent_steps = end.solver_steps >= options.max_solver_steps
+        n_events_without_progress = jnp.where(
+            time > solution.time, 0, n_events_without_progress + 1
+        )
+        has_exhausted_steps = end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
             solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), RUNNING_CODE
         )
-        termination = jnp.where(n_stationary > max_simultaneous, int(Termination.ZENO), termination)
-        failure = jnp.where(
+        termination = jnp.where(
+            n_events_without_progress > max_simultaneous, int(Termination.ZENO), termination
+        )
+        failure_code = jnp.where(
             end.timed_out, int(Termination.MAX_TIME_REACHED), int(Termination.STEP_SIZE_UNDERFLOW)
         )
-        failure = jnp.where(
-            end.gave_up & has_spent_steps, int(Termination.MAX_STEPS_REACHED), failure
+        failure_code = jnp.where(
+            end.gave_up & has_exhausted_steps, int(Termination.MAX_STEPS_REACHED), failure_code
         )
         termination = jnp.where(
             has_event,
             termination,
-            jnp.where(is_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure),
+            jnp.where(is_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_code),
         )
-        row_index = jnp.where(has_event, solution.n_events, events)
-        write_row = lambda row, value: row.at[row_index].set(value, mode="drop")
+        event_index = jnp.where(has_event, solution.n_events, events)
+        write_event = lambda row, value: row.at[event_index].set(value, mode="drop")
         return (
             HybridSolution(
-                times=write_row(solution.times, time),
-                time_tolerance=write_row(solution.time_tolerance, time_scales[0]),
-                time_roundoff=write_row(solution.time_roundoff, time_scales[1]),
-                states_before=write_row(solution.states_before, end.state),
-                states_after=write_row(solution.states_after, next_state),
-                modes=write_row(solution.modes, solution.mode),
-                guards=write_row(solution.guards, end.guard),
+                times=write_event(solution.times, time),
+                time_tolerance=write_event(solution.time_tolerance, time_scales[0]),
+                time_roundoff=write_event(solution.time_roundoff, time_scales[1]),
+                states_before=write_event(solution.states_before, end.state),
+                states_after=write_event(solution.states_after, next_state),
+                modes=write_event(solution.modes, solution.mode),
+                guards=write_event(solution.guards, end.guard),
                 n_events=solution.n_events + has_event,
                 time=time,
                 state=jnp.where(has_event, next_state, end.state),
@@ -360,22 +380,25 @@ def _simulate(
                 solver_steps=solution.solver_steps + end.solver_steps,
                 termination=termination.astype(jnp.int32),
             ),
-            n_stationary,
+            n_events_without_progress,
             remainder,
         )
 
-    zero_count, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
-    rows, zero_indices = jnp.zeros((events, start.size)) + zero, jnp.zeros((events,), jnp.int32)
-    zero_times = jnp.zeros(events) + zero
+    zero_count, traced_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    zero_states, zero_indices = (
+        jnp.zeros((events, start.size)) + traced_zero,
+        jnp.zeros((events,), jnp.int32),
+    )
+    zero_times = jnp.zeros(events) + traced_zero
     constant_zeros = lax.stop_gradient(zero_times)
     initial_solution = HybridSolution(
         times=zero_times, time_tolerance=constant_zeros, time_roundoff=constant_zeros,
-        states_before=rows, states_after=rows,
-        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=zero, state=start,
+        states_before=zero_states, states_after=zero_states,
+        modes=zero_indices, guards=zero_indices, n_events=zero_count, time=traced_zero, state=start,
         mode=zero_count + mode,
         solver_steps=zero_count, termination=zero_count + RUNNING_CODE,
     )  # fmt: skip
     is_running = lambda carry: opaque_condition(
         carry[0].termination == RUNNING_CODE, carry[0].n_events
     )
-    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, zero))[0]
+    return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, traced_zero))[0]
