@@ -57,18 +57,31 @@ def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
         x = step.section_state
 
 
-def test_derivatives_by_every_slope_are_differences_of_an_absolute_frame():
-    slopes, h = np.array(LINES[:4]), 1e-4
+def test_derivatives_of_a_walk_are_differences_of_an_absolute_frame():
+    """With respect to the start, every parameter and every slope, over three steps."""
+    slopes, n_lines = LINES[:4], 4
+    names = [name for name in PARAMETER_NAMES if name != "slope"]
+    point = np.array([*START, *(OTHER[name] for name in names), *slopes])
 
-    def other(change):
-        return uneven_ground.walk(OTHER, START, slopes + change)[-1].section_state
+    def other(point):
+        given = OTHER | dict(zip(names, point[3:-n_lines].tolist(), strict=True))
+        last = uneven_ground.walk(given, point[:3].tolist(), point[-n_lines:].tolist())[-1]
+        return np.concatenate([last.section_state, last.durations])
 
-    ends = lambda slopes: paper_walk(slopes, 3, options=TIGHT).steps.section_state[-1]
-    forward = jax.jacfwd(ends)(jnp.asarray(slopes))
-    np.testing.assert_allclose(jax.jacrev(ends)(jnp.asarray(slopes)), forward, atol=1e-12)
-    for j, unit in enumerate(h * np.eye(4)):
-        near, far = (other(a * unit) - other(-a * unit) for a in (1, 2))
-        np.testing.assert_allclose(forward[:, j], (8 * near - far) / (12 * h), atol=1e-8)
+    def end(point):
+        params = vrw.WheelParams(
+            **dict(zip(names, point[3:-n_lines], strict=True)), slope=point[-n_lines:]
+        )
+        last = vrw.walk(params, point[:3], 3, options=TIGHT).steps
+        return jnp.concatenate([last.section_state[-1], last.durations[-1]])
+
+    forward = jax.jacfwd(end)(jnp.asarray(point))
+    np.testing.assert_allclose(jax.jacrev(end)(jnp.asarray(point)), forward, atol=1e-11)
+    for j, unit in enumerate(np.eye(len(point))):
+        # Values have errors of 1e-13, and differences of these steps errors near 1e-8.
+        h = 1e-5 * max(abs(point[j]), 1.0)
+        difference = (other(point + h * unit) - other(point - h * unit)) / (2 * h)
+        np.testing.assert_allclose(forward[:, j], difference, rtol=1e-6, atol=1e-7, err_msg=str(j))
 
 
 def test_as_many_slopes_as_steps_use_the_last_one_twice():
@@ -265,24 +278,61 @@ def test_a_steep_line_ahead_is_not_met_before_the_foot_is_there():
     np.testing.assert_allclose(walk.steps.durations[0], other.durations, atol=1e-9)
 
 
+LINE_FRICTIONS = (0.7, 0.5, 0.9, 0.6, 0.8, 0.7, 0.65, 0.75, 0.55, 0.85)
+"""Friction of the footholds of ten steps; feet slip on the second and on the third."""
+
+
+def walk_by_complementarity(start, slopes, frictions, **parameters):
+    """Return the steps of the second formulation over these lines and footholds."""
+    steps, place = [], None
+    for k, (slope, ahead) in enumerate(itertools.pairwise(slopes)):
+        friction = np.r_[frictions[k], np.full(7, frictions[max(k - 1, 0)])]
+        wheel = complementarity.ComplementarityWheel(
+            friction, slope=slope, tilt=ahead - slope, **parameters
+        )
+        place = place or complementarity.paper_start(wheel, *start)
+        steps.append(complementarity.compute_step(wheel, place))
+        place = steps[-1].end
+    return steps
+
+
 @pytest.mark.slow
-def test_a_walk_over_uneven_ground_agrees_with_another_code():
-    params, model = make_uneven_ground()
-    walk = vrw.walk(params, START, 4, model=model, options=vrw.StepOptions.tight())
-    place = None
-    for k in range(4):
-        rough = np.r_[FRICTIONS[k], np.full(7, FRICTIONS[max(k - 1, 0)])]
-        tilt = SLOPES[min(k + 1, 3)] - SLOPES[k]
-        wheel = complementarity.ComplementarityWheel(rough, slope=SLOPES[k], tilt=tilt)
-        place = place or complementarity.paper_start(wheel, *START)
-        other = complementarity.compute_step(wheel, place)
-        place = other.end
-        assert int(walk.steps.outcome[k]) == vrw.Outcome.STEPPED
-        np.testing.assert_allclose(walk.steps.durations[k], other.durations, atol=1e-9)
-    theta = place.q[2] + complementarity.ALPHA
-    assert abs(float(walk.steps.section_state[-1, 0]) - theta) < 1e-9
-    level = vrw.walk(vrw.WheelParams(), START, 4, model=vrw.UnilateralWheel())
+def test_ten_steps_with_unilateral_contact_are_those_of_complementarity():
+    params, model = make_uneven_ground(LINES, LINE_FRICTIONS)
+    walk = vrw.walk(params, START, 10, model=model, options=TIGHT)
+    other = walk_by_complementarity(START, LINES, LINE_FRICTIONS)
+    assert int(walk.n_stepped) == 10
+    durations = np.stack([step.durations for step in other])
+    np.testing.assert_allclose(walk.steps.durations, durations, atol=1e-11)
+    theta = other[-1].end.q[2] + complementarity.ALPHA
+    assert abs(float(walk.steps.section_state[-1, 0]) - theta) < 1e-11
+    level = vrw.walk(vrw.WheelParams(), START, 10, model=vrw.UnilateralWheel())
     assert abs(float(jnp.sum(level.steps.durations - walk.steps.durations))) > 1e-3
+
+
+@pytest.mark.slow
+def test_ten_sampled_steps_with_unilateral_contact_are_those_of_complementarity():
+    params, model = make_uneven_ground(LINES, LINE_FRICTIONS)
+    sampled = vrw.simulate(params, START, 10, model=model, options=TIGHT)
+    other = walk_by_complementarity(START, LINES, LINE_FRICTIONS)
+    ends = [float(sampled.time.values[sampled.step.values == k][-1]) for k in range(10)]
+    exact = np.cumsum([step.durations.sum() for step in other])
+    np.testing.assert_allclose(ends, exact, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_ten_steps_of_a_batch_with_unilateral_contact_are_those_of_complementarity():
+    params = vrw.WheelParams(slope=np.tile(LINES, (2, 1)))
+    model = vrw.UnilateralWheel(friction=np.tile(LINE_FRICTIONS, (2, 1)))
+    found = vrw.step_batch(params, np.tile(START, (2, 1)), 10, model=model, options=TIGHT)
+    last = walk_by_complementarity(START, LINES, LINE_FRICTIONS)[-1]
+    assert found.n_stepped.tolist() == [10, 10]
+    np.testing.assert_allclose(found.durations[1], last.durations, atol=1e-11)
+    np.testing.assert_allclose(
+        found.section_state[1, :2],
+        [last.end.q[2] + complementarity.ALPHA, last.end.v[2]],
+        atol=1e-11,
+    )
 
 
 UNEVEN_SLOPES = 0.3 + 0.02 * np.array([[0.0, 1.0, -1.0], [1.0, -1.0, 2.0], [-2.0, 0.5, 0.0]])
@@ -320,20 +370,32 @@ def test_a_batch_on_uneven_ground_equals_single_wheels(more):
 
 
 @pytest.mark.slow
-def test_derivatives_by_every_slope_and_friction_are_differences():
-    n = 3
+def test_derivatives_with_unilateral_contact_are_differences_of_complementarity():
+    """With respect to the start, parameters, every slope and every friction, over three steps."""
+    names = {"c": "damping", "k": "stiffness", "Ls": "natural_length", "m": "leg_mass"}
+    point = np.array([*START, 250.0, 500.0, 1.02, 1.0, *SLOPES[:3], 0.3, *FRICTIONS[:3]])
 
-    def end(slope, friction):
-        wheel, model = vrw.WheelParams(damping=250.0, slope=slope), vrw.UnilateralWheel(friction)
-        return vrw.walk(wheel, START, n, model=model, options=TIGHT).steps.section_state[-1][:20]
+    def other(point):
+        parameters = dict(zip(names, point[3:7], strict=True))
+        last = walk_by_complementarity(point[:3], point[7:11], point[11:], **parameters)[-1]
+        motion = last.end.q[2] + complementarity.ALPHA, last.end.v[2]
+        return np.concatenate([motion, last.durations])
 
-    given = jnp.asarray((*SLOPES[:n], 0.3)), jnp.asarray(FRICTIONS[:n])
-    by = jax.jacfwd(end, (0, 1))(*given)
-    for which in range(2):
-        for j, unit in enumerate(1e-5 * np.eye(len(given[which]))):
-            ends = [end(*(x + s * unit * (i == which) if i == which else x
-                          for i, x in enumerate(given))) for s in (1, -1)]  # fmt: skip
-            np.testing.assert_allclose(by[which][:, j], (ends[0] - ends[1]) / 2e-5, atol=1e-6)
+    def end(point):
+        parameters = dict(zip(names.values(), point[3:7], strict=True))
+        params = vrw.WheelParams(**parameters, slope=point[7:11])
+        model = vrw.UnilateralWheel(friction=point[11:])
+        last = vrw.walk(params, point[:3], 3, model=model, options=TIGHT).steps
+        return jnp.concatenate([last.section_state[-1, :2], last.durations[-1]])
+
+    exact = np.asarray(jax.jacfwd(end)(jnp.asarray(point)))
+    assert (np.abs(exact).max(0) > 1e-3)[:-3].all()
+    assert np.abs(exact[:, -3:]).max() > 1e-3  # friction acts where a foot slips
+    for j, unit in enumerate(np.eye(len(point))):
+        h = 1e-5 * max(abs(point[j]), 1.0)
+        difference = (other(point + h * unit) - other(point - h * unit)) / (2 * h)
+        # Values have errors of 1e-13, and differences of these steps errors near 1e-8.
+        np.testing.assert_allclose(exact[:, j], difference, rtol=1e-6, atol=1e-7, err_msg=str(j))
 
 
 @pytest.mark.parametrize(
