@@ -19,7 +19,7 @@ from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import kinetic_energy, potential_energy
 from vrw_jax.contact.section import embed_section_state, full_section_size
 from vrw_jax.contact.single_step import sample_interval
-from vrw_jax.contact.walk_kernel import BatchWalk, advance_round, init_lanes
+from vrw_jax.contact.walk_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
 from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
 from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models import N_STEP_INPUTS, RigidWheel, StepResult, gait_step, jacobian_columns
@@ -145,7 +145,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
     model, tableau = UnilateralWheel(), load_explicit_tableau(SOLVER)
     size, n = full_section_size(n_legs), 3 + n_legs
 
-    def on(tolerance: Array) -> BatchWalk:
+    def on(tolerance: Array) -> BatchWalkSettings:
         rules = (
             jnp.int32(1),
             model.max_events,
@@ -153,7 +153,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
             model.uses_paper_rule,
             True,
         )
-        return BatchWalk(n_legs, *rules, _options(tolerance), tableau)
+        return BatchWalkSettings(n_legs, *rules, _options(tolerance), tableau)
 
     def columns(parameters: Array, friction: Array) -> Array:
         return jnp.concatenate([parameters, (friction + 0.0 * parameters[0])[None]])
@@ -164,12 +164,16 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
 
     def opened(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """Where a step from there stands before its first event."""
-        return (_flat(init_lanes(on(tolerance), columns(parameters, friction), x)[1]),)
+        return (_flat(init_lane_states(on(tolerance), columns(parameters, friction), x)[1]),)
 
     lane = jax.ShapeDtypeStruct((size, 1), float)
     number, given = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((9, 1), float)
     form = jax.eval_shape(
-        lambda t, mu, p, x: init_lanes(on(t), columns(p, mu), x)[1], number, number, given, lane
+        lambda t, mu, p, x: init_lane_states(on(t), columns(p, mu), x)[1],
+        number,
+        number,
+        given,
+        lane,
     )
 
     def onward(tolerance: Array, friction: Array, parameters: Array, lane: Array) -> tuple:
@@ -177,11 +181,11 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         coordinates, rates, contacts and stoppers, and how long it lasted; what the step tells so
         far; and its outcome, -1 while it goes on."""
         walk = on(tolerance)
-        past, after = advance_round(
+        past, after = process_and_integrate(
             walk, columns(parameters, friction), _rebuild_tree(lane, form), waits_for_events=True
         )
         (q, v, _), stance = past.interval.point, past.interval.contact_state
-        codes = [stance.contact.astype(float), stance.locked.astype(float)]
+        codes = [stance.contact_modes.astype(float), stance.locked.astype(float)]
         step = walk.compute_result(after, None)
         result = (
             step.durations, step.step_length, step.post_impact, step.slip, step.energy_impacts,

@@ -353,12 +353,11 @@ def test_independent_rates_and_their_shares_do_not_depend_on_other_batch_element
             ground_lanes._IndependentRates.from_projection(settled[[k]], requested[[k]]),
             basis.shape[1],
         )
-        np.testing.assert_array_equal(joint_result.combination[k, :n], single_result.combination[0])
+        weights = single_result.combination_weights[0]
+        np.testing.assert_array_equal(joint_result.combination_weights[k, :n], weights)
         retained = settled[k][:, joint_result.indices[k, :n]]
         # Largest in thirty such sets: 4e-16.
-        np.testing.assert_allclose(
-            retained @ single_result.combination[0], settled[k], rtol=0, atol=1e-14
-        )
+        np.testing.assert_allclose(retained @ weights, settled[k], rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow

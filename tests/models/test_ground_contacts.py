@@ -121,17 +121,17 @@ def select_contacts(q, v, at_stopper, locked, friction, moving):
     free = jax.tree.map(lambda a, b: jnp.where(moving, a, b), *levels)
     none = jnp.zeros(2, jnp.int32)
     allowed = AllowedModes(
-        contact=none + ALL_MODES_MASK,
-        may_hold=at_stopper,
-        keeps_mode=none > 0,
+        allowed_modes=none + ALL_MODES_MASK,
+        can_hold_stopper=at_stopper,
+        has_fixed_mode=none > 0,
         untested_modes=none,
-        untested_open=~at_stopper,
+        is_open_untested=~at_stopper,
     )
     small = SignTolerances(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
     choice = choose_combination(s, hub, free, allowed, friction, small, True)
-    measured = solve_combination(s, hub, free, choice.contact, choice.held, friction)
-    rates = jnp.stack([*measured.hub, *measured.length])
-    return choice.contact, choice.held, rates, choice.n_solutions
+    measured = solve_combination(s, hub, free, choice.slot_modes, choice.is_held, friction)
+    rates = jnp.stack([*measured.hub, *measured.length_motion])
+    return choice.slot_modes, choice.is_held, rates, choice.n_solutions
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["impulses", "forces"])

@@ -32,7 +32,7 @@ def random_impacts():
         rates, L = 2.0 * seeds[2:13] - 1.0, 0.85 + 0.15 * seeds[13:21]
         z = L[0] * jnp.cos(theta)
         motion = WheelMotion(jnp.zeros(()), z, theta, *rates[:3], L, rates[3:])
-        motion = project_motion(s, motion, stance.contact, locked)
+        motion = project_motion(s, motion, stance.contact_modes, locked)
         law = ContactLaw(s, friction, False, False, jnp.asarray(1e-6), restitution)
         change = resolve_event(law, motion, stance, event)
         legs = leg_directions(s, theta)

@@ -13,5 +13,5 @@ from vrw_jax.contact.mechanics import (
     potential_energy,
 )
 from vrw_jax.contact.section import LOCKED_CODE_OFFSET, FullState, embed_section_state
-from vrw_jax.contact.step_record import UnilateralStep, min_dip_depth
+from vrw_jax.contact.step_record import UnilateralStep, min_bounce_height
 from vrw_jax.contact.unilateral_wheel import UnilateralTrajectory, UnilateralWheel

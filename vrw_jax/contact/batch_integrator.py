@@ -21,11 +21,11 @@ from vrw_jax.contact.contact_state import (
     ContactState,
     ModeDynamics,
     accumulator_rates,
+    collect_contact_quantities,
     compute_forces,
+    compute_guard_scales,
     compute_state_units,
-    contact_quantities,
     evaluate_guards,
-    guard_scales,
 )
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, prevent_fusion
 from vrw_jax.hybrid import GUARD_ROUNDOFF_IN_EPS
@@ -57,7 +57,7 @@ class LaneStatus(IntEnum):
 class IntervalOptions:
     """Search for events with unilateral contact, and the loop over lanes."""
 
-    max_wait_tries: int = 8
+    max_wait_attempts: int = 8
     """Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
     painleve_atol: float = 1e-8
     """Determinant below which it counts as zero at Painlevé's singularity.
@@ -73,13 +73,13 @@ class IntervalOptions:
     n_parabola_iterations: int = 3
     """Number of event iterations by parabolas; the later ones use secants, which converge better in
     stiff dips."""
-    n_before_own_guard: int = 15
+    min_iterations_of_initiating_guard: int = 15
     """Number of event iterations after which a guard that starts at its own event may be the
     event."""
-    max_roundoff_fall: float = 1e-3
+    max_roundoff_fall_time: float = 1e-3
     """Time within which a guard must fall by its own round-off to count as falling, in the wheel's
     own unit: seconds for a wheel of Table 1's size."""
-    event_time_factor: float = 30.0
+    event_time_tolerance_factor: float = 30.0
     """Largest last correction to the time of an event, in tolerances of the step.
 
     It is chosen because the error of a parabola's proposal is about a hundredth of the correction.
@@ -104,8 +104,8 @@ class EventBracket(NamedTuple):
 
     is_active: Array
     is_crossing: Array  # (guards, lanes)
-    low: Array  # bracket of the event, s from the start of the step
-    high: Array
+    low_h: Array  # bracket of the event, s from the start of the step
+    high_h: Array
     time_tolerance: Array  # s
     n_iterations: Array
     previous_h: Array  # previously attempted step, s
@@ -119,12 +119,14 @@ class IntervalState(NamedTuple):
     contact_state: ContactState
     guard_values: Array  # guards at the point, (guards, lanes)
     guard_offset: Array  # value at the own event of a guard that starts there, minus rounding
-    accumulated: Array | None  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    interval_accumulators: (
+        Array | None
+    )  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
     h: Array  # of the next attempt, s
     time: Array  # since the last event, s
-    search: EventBracket
+    event_bracket: EventBracket
     status: Array  # a LaneStatus or an Outcome
-    guard: Array  # index of the guard that has triggered
+    triggered_guard: Array  # index of the guard that has triggered
     n_solver_steps: Array  # attempted since the last event
 
 
@@ -151,8 +153,8 @@ def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
     directions.
     """
     motion = motion_from_point(IntervalPoint(q, v, q))
-    current_forces = compute_forces(dynamics, motion)
-    quantities = contact_quantities(dynamics, current_forces)
+    forces = compute_forces(dynamics, motion)
+    quantities = collect_contact_quantities(dynamics, forces)
     contact_rows = [
         *quantities.normal,
         *quantities.tangential,
@@ -160,22 +162,26 @@ def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
         *quantities.slip_speed,
         quantities.painleve_determinant,
     ]
-    extra_rows = [] if quantities.airborne_stopper is None else [quantities.airborne_stopper]
-    if dynamics.accumulates:
-        accumulators = accumulator_rates(dynamics, motion, current_forces)
-        rows = accumulators.damping, accumulators.friction, accumulators.slip
-        extra_rows.append(jnp.stack(prevent_fusion(rows, opaque_one(motion))))
+    optional_rows = [] if quantities.airborne_stopper is None else [quantities.airborne_stopper]
+    if dynamics.has_accumulators:
+        accumulators = accumulator_rates(dynamics, motion, forces)
+        accumulator_rows = (
+            accumulators.damping_loss,
+            accumulators.friction_loss,
+            accumulators.slip_length,
+        )
+        optional_rows.append(jnp.stack(prevent_fusion(accumulator_rows, opaque_one(motion))))
     return jnp.concatenate(
         [
-            jnp.stack(current_forces.solution.hub),
-            current_forces.solution.lengths,
+            jnp.stack(forces.solution.hub),
+            forces.solution.length_motion,
             jnp.stack(contact_rows),
-            *extra_rows,
+            *optional_rows,
         ]
     )
 
 
-def guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
+def evaluate_guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
     """Return all guards in the order of `GuardLayout`, as long after the start of the contact
     state.
     """
@@ -187,40 +193,45 @@ def guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
         if dynamics.is_one_sided
         else None
     )
-    legs, pairs = leg_directions(dynamics.s, motion.theta), ((n1, n2), (t1, t2), (s1, s2), (x1, x2))
-    quantities = ContactQuantities(legs, *pairs, painleve_determinant, airborne_stopper)
-    has_begun = jnp.ones(point.q.shape[-1:], bool)
-    return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, has_begun))
+    legs, slot_pairs = (
+        leg_directions(dynamics.s, motion.theta),
+        ((n1, n2), (t1, t2), (s1, s2), (x1, x2)),
+    )
+    quantities = ContactQuantities(legs, *slot_pairs, painleve_determinant, airborne_stopper)
+    is_after_start = jnp.ones(point.q.shape[-1:], bool)
+    return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, is_after_start))
 
 
-def guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
+def compute_guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
     """Return the time derivatives of the guards along the motion."""
 
-    def guards_of_state(q: Array, v: Array) -> Array:
-        return guards_at_point(dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v)))
+    def evaluate_guards_at(q: Array, v: Array) -> Array:
+        return evaluate_guards_at_point(
+            dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+        )
 
     return jax.jvp(
-        guards_of_state, (point.q, point.v), (point.v, point.dynamics_rows[: len(point.q)])
+        evaluate_guards_at, (point.q, point.v), (point.v, point.dynamics_rows[: len(point.q)])
     )[1]
 
 
-def find_own_guards(dynamics: ModeDynamics) -> Array:
+def find_initiating_guards(dynamics: ModeDynamics) -> Array:
     """Return which guards are at the event that has just started the contact state."""
     contact_state = dynamics.contact_state
     has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
-    no_guard = jnp.zeros((2, contact_state.contact.shape[-1]), bool)
-    airborne = [contact_state.locked & False] if dynamics.is_one_sided else []
+    no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
+    airborne_release_flags = [contact_state.locked & False] if dynamics.is_one_sided else []
     return jnp.concatenate(
         [
             contact_state.has_just_lifted,
             contact_state.has_just_unlocked,
-            no_guard,
-            no_guard,
-            no_guard,
+            no_slot_flags,
+            no_slot_flags,
+            no_slot_flags,
             has_just_slid,
-            no_guard,
-            no_guard,
-            *airborne,
+            no_slot_flags,
+            no_slot_flags,
+            *airborne_release_flags,
         ]
     )
 
@@ -236,38 +247,52 @@ def init_interval(
 
     A lane is at an event again if one of its guards falls immediately.
     """
-    point, is_own = make_point(dynamics, motion), find_own_guards(dynamics)
-    values, rates = guards_at_point(dynamics, point), guard_rates(dynamics, point)
+    point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
+    guard_values, guard_rates = (
+        evaluate_guards_at_point(dynamics, point),
+        compute_guard_rates(dynamics, point),
+    )
     # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
     # rises from below has no event before it falls; events without duration leave several such.
-    roundoff = guard_scales(dynamics) * (GUARD_ROUNDOFF_IN_EPS * jnp.finfo(values.dtype).eps)
+    roundoff = compute_guard_scales(dynamics) * (
+        GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
+    )
     time_unit = compute_own_units(dynamics.s).time
-    min_rate = -roundoff / (interval_options.max_roundoff_fall * time_unit)
-    is_own = is_own | ((values <= roundoff) & (rates > min_rate))
-    has_passed = ~is_own & ((values < 0.0) | ((values == 0.0) & (rates <= 0.0)))
-    first_passed = jnp.zeros(has_passed.shape[1:], jnp.int32)
-    for row in reversed(range(len(has_passed))):
-        first_passed = jnp.where(has_passed[row], row, first_passed)
-    offset = jnp.where(is_own, values - 2.0 * roundoff, 0.0)
-    zero, zero_count = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
+    min_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
+    is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_rate))
+    is_triggered = ~is_initiating & (
+        (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
+    )
+    triggered_guard = jnp.zeros(is_triggered.shape[1:], jnp.int32)
+    for index in reversed(range(len(is_triggered))):
+        triggered_guard = jnp.where(is_triggered[index], index, triggered_guard)
+    guard_offset = jnp.where(is_initiating, guard_values - 2.0 * roundoff, 0.0)
+    float_zeros, int_zeros = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
     return IntervalState(
         point=point,
         contact_state=dynamics.contact_state,
-        guard_values=values - offset,
-        guard_offset=offset,
-        accumulated=jnp.zeros((N_ACCUMULATOR_ROWS, *zero.shape), zero.dtype)
-        if dynamics.accumulates
+        guard_values=guard_values - guard_offset,
+        guard_offset=guard_offset,
+        interval_accumulators=jnp.zeros((N_ACCUMULATOR_ROWS, *float_zeros.shape), float_zeros.dtype)
+        if dynamics.has_accumulators
         else None,
-        h=zero + h * time_unit,
-        time=zero,
-        search=EventBracket(
-            zero_count > 0, jnp.zeros_like(is_own), zero, zero, zero, zero_count, zero, values
+        h=float_zeros + h * time_unit,
+        time=float_zeros,
+        event_bracket=EventBracket(
+            int_zeros > 0,
+            jnp.zeros_like(is_initiating),
+            float_zeros,
+            float_zeros,
+            float_zeros,
+            int_zeros,
+            float_zeros,
+            guard_values,
         ),
-        status=jnp.where(jnp.any(has_passed, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING).astype(
-            jnp.int32
-        ),
-        guard=first_passed,
-        n_solver_steps=zero_count,
+        status=jnp.where(
+            jnp.any(is_triggered, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING
+        ).astype(jnp.int32),
+        triggered_guard=triggered_guard,
+        n_solver_steps=int_zeros,
     )
 
 
@@ -276,10 +301,10 @@ DynamicsFn = Callable[[Array], ModeDynamics]
 
 
 def integrate_interval(
-    dynamics_at: DynamicsFn,
-    columns: Array,
-    initial: IntervalState,
-    is_walking: Array,
+    dynamics_fn: DynamicsFn,
+    input_columns: Array,
+    initial_state: IntervalState,
+    has_unfinished_walk: Array,
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> IntervalState:
@@ -288,25 +313,31 @@ def integrate_interval(
     After `max_wait_tries` attempts, the loop ends as soon as a lane with `is_walking` is at an
     event.
     """
-    dynamics = dynamics_at(columns)
-    scales, options = guard_scales(dynamics), compute_own_units(dynamics.s).scale_times(options)
+    dynamics = dynamics_fn(input_columns)
+    guard_scales, options = (
+        compute_guard_scales(dynamics),
+        compute_own_units(dynamics.s).scale_times(options),
+    )
 
     def try_step(state: IntervalState) -> IntervalState:
         return integrator_step(
-            state, attempt_step(dynamics, tableau, options, state), scales, tableau, options
+            state, attempt_step(dynamics, tableau, options, state), guard_scales, tableau, options
         )
 
-    return run_until_done(
-        lambda state: state.status == LaneStatus.RUNNING, is_walking, try_step, initial
+    return iterate_until_stopped(
+        lambda state: state.status == LaneStatus.RUNNING,
+        has_unfinished_walk,
+        try_step,
+        initial_state,
     )
 
 
-def run_until_done(
+def iterate_until_stopped(
     is_running: Callable[[Any], Array],
-    is_walking: Array,
-    iterate: Callable,
-    initial: Any,
-    max_wait_tries: int = INTERVAL_OPTIONS.max_wait_tries,
+    has_unfinished_walk: Array,
+    advance_state: Callable,
+    initial_state: Any,
+    max_wait_attempts: int = INTERVAL_OPTIONS.max_wait_attempts,
 ) -> Any:
     """Return the state after repeated `iterate`, until no lane is running.
 
@@ -314,29 +345,29 @@ def run_until_done(
     """
 
     def should_continue(loop_state: tuple) -> Array:
-        state, n_tries = loop_state
+        state, n_attempts = loop_state
         is_active = is_running(state)
-        has_stopped = jnp.any(is_walking & ~is_active)
-        return jnp.any(is_active) & ((n_tries < max_wait_tries) | ~has_stopped)
+        has_stopped = jnp.any(has_unfinished_walk & ~is_active)
+        return jnp.any(is_active) & ((n_attempts < max_wait_attempts) | ~has_stopped)
 
-    zero = jnp.zeros((), jnp.int32)
-    iterate_once = lambda loop_state: (iterate(loop_state[0]), loop_state[1] + 1)
-    return lax.while_loop(should_continue, iterate_once, (initial, zero))[0]
+    n_initial = jnp.zeros((), jnp.int32)
+    advance_loop = lambda loop_state: (advance_state(loop_state[0]), loop_state[1] + 1)
+    return lax.while_loop(should_continue, advance_loop, (initial_state, n_initial))[0]
 
 
 class AttemptedStep(NamedTuple):
     """An attempted solver step."""
 
-    end: IntervalPoint
+    end_point: IntervalPoint
     squared_error: Array  # of the error over the tolerance
     guard_values: Array  # at the end
-    curvature: Array  # of the guards' parabolas
-    linear_term: Array
+    parabola_curvature: Array  # of the guards' parabolas
+    parabola_linear_term: Array
     dip_fraction: Array  # fraction of the step to a possible guard dip below zero, else 1
-    accumulated: Array | None  # increment of `IntervalState.accumulated`
+    accumulator_increments: Array | None  # increment of `IntervalState.accumulated`
 
 
-def stage_state(
+def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
     """Return coordinates and rates at a stage, from the accelerations of the stages before it."""
@@ -355,17 +386,19 @@ def attempt_step(
     """Return an attempted step of every lane."""
     h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
 
-    def stage(i: Array, stage_rows: Array) -> Array:
-        row = evaluate_dynamics(dynamics, *stage_state(tableau, i, point.q, point.v, stage_rows, h))
-        return lax.dynamic_update_index_in_dim(stage_rows, row, i, 0)
+    def evaluate_stage(i: Array, stage_rows: Array) -> Array:
+        stage_row = evaluate_dynamics(
+            dynamics, *compute_stage_state(tableau, i, point.q, point.v, stage_rows, h)
+        )
+        return lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
 
-    other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
-    stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
-    stage_rows = lax.fori_loop(1, last_stage + 1, stage, stage_rows)
-    return finish_attempt(dynamics, tableau, options, state, stage_rows)
+    later_stage_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([point.dynamics_rows[None], later_stage_rows])
+    stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage, stage_rows)
+    return complete_attempt(dynamics, tableau, options, state, stage_rows)
 
 
-def finish_attempt(
+def complete_attempt(
     dynamics: ModeDynamics,
     tableau: ButcherTableau,
     options: StepOptions,
@@ -375,38 +408,53 @@ def finish_attempt(
     """Return the attempted step with these rows of the dynamics at its stages."""
     h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
     n = len(point.q)
-    end = IntervalPoint(
-        *stage_state(tableau, last_stage, point.q, point.v, stage_rows, h), stage_rows[last_stage]
+    end_point = IntervalPoint(
+        *compute_stage_state(tableau, last_stage, point.q, point.v, stage_rows, h),
+        stage_rows[last_stage],
     )
-    accumulated = None
-    if dynamics.accumulates:
-        accumulated = h * sum(
+    accumulator_increments = None
+    if dynamics.has_accumulators:
+        accumulator_increments = h * sum(
             tableau.matrix[last_stage][j] * stage_rows[j, -N_ACCUMULATOR_ROWS:]
             for j in range(last_stage)
         )
-    inner_points = {
-        i: IntervalPoint(*stage_state(tableau, i, point.q, point.v, stage_rows, h), stage_rows[i])
+    inner_stage_points = {
+        i: IntervalPoint(
+            *compute_stage_state(tableau, i, point.q, point.v, stage_rows, h), stage_rows[i]
+        )
         for i in tableau.guard_stages
     }
-    points = *inner_points.values(), end
-    *inner_values, values = (
-        guards_at_point(dynamics, stage_point) - state.guard_offset for stage_point in points
+    guard_points = *inner_stage_points.values(), end_point
+    *inner_guard_values, end_guard_values = (
+        evaluate_guards_at_point(dynamics, guard_point) - state.guard_offset
+        for guard_point in guard_points
     )
-    weighted_sum = lambda weights: sum(
+    sum_stages = lambda weights: sum(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
-    errors = h * h * weighted_sum(tableau.b_error_position), h * weighted_sum(tableau.b_error)
-    squared_error = _squared_error(dynamics.s, options, errors, point, points[-1], values)
-    middle_values = (
-        inner_values[tableau.guard_stages.index(tableau.middle_stage)]
-        if inner_values
+    error_estimates = h * h * sum_stages(tableau.b_error_position), h * sum_stages(tableau.b_error)
+    squared_error = _squared_error(
+        dynamics.s, options, error_estimates, point, guard_points[-1], end_guard_values
+    )
+    middle_guard_values = (
+        inner_guard_values[tableau.guard_stages.index(tableau.middle_stage)]
+        if inner_guard_values
         else state.guard_values
     )
-    parabola_terms = fit_guard_parabola(tableau, state.guard_values, middle_values, values)
-    dip_fraction = _earliest_dip_fraction(
-        tableau, [state.guard_values, *inner_values, values], _is_at_own_event(state)
+    parabola_terms = fit_guard_parabola(
+        tableau, state.guard_values, middle_guard_values, end_guard_values
     )
-    return AttemptedStep(end, squared_error, values, *parabola_terms, dip_fraction, accumulated)
+    dip_fraction = _earliest_dip_fraction(
+        tableau, [state.guard_values, *inner_guard_values, end_guard_values], _is_initiating(state)
+    )
+    return AttemptedStep(
+        end_point,
+        squared_error,
+        end_guard_values,
+        *parabola_terms,
+        dip_fraction,
+        accumulator_increments,
+    )
 
 
 def is_at_singularity(
@@ -426,7 +474,7 @@ def is_at_singularity(
 def integrator_step(
     state: IntervalState,
     attempt: AttemptedStep,
-    scales: Array,
+    guard_scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
     interval_options: IntervalOptions = INTERVAL_OPTIONS,
@@ -434,9 +482,14 @@ def integrator_step(
     """Return the lanes after one attempt: accepted, repeated with another step size, or at an
     event.
     """
-    point, h, search, end = state.point, state.h, state.search, attempt.end
+    point, h, event_bracket, end_point = (
+        state.point,
+        state.h,
+        state.event_bracket,
+        attempt.end_point,
+    )
     is_running = state.status == LaneStatus.RUNNING
-    is_accurate = is_running & ~search.is_active & (attempt.squared_error <= 1.0)
+    is_accurate = is_running & ~event_bracket.is_active & (attempt.squared_error <= 1.0)
     needs_retry = (
         is_accurate
         & (attempt.dip_fraction < 1.0)
@@ -444,56 +497,58 @@ def integrator_step(
     )
     has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
     is_accepted = is_accurate & ~needs_retry & ~has_crossed
-    next_search, event = _search_event(
-        state, attempt, has_crossed, scales, options, interval_options
+    next_bracket, event = _search_event(
+        state, attempt, has_crossed, guard_scales, options, interval_options
     )
-    has_arrived = event.has_arrived
-    length_factor = jnp.where(
+    has_reached_event = event.has_reached_event
+    step_size_ratio = jnp.where(
         needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
     )
     # The last step ends at the time limit.
-    limit = options.max_phase_time
-    end_time = jnp.where(is_accepted & (h == limit - state.time), limit, state.time + h)
+    time_limit = options.max_phase_time
+    end_time = jnp.where(is_accepted & (h == time_limit - state.time), time_limit, state.time + h)
     reached_time = jnp.where(is_accepted, end_time, state.time)
-    integrating_h = jnp.minimum(h * length_factor, limit - reached_time)
-    next_h = jnp.where(search.is_active | has_crossed, event.next_h, integrating_h)
+    next_integration_h = jnp.minimum(h * step_size_ratio, time_limit - reached_time)
+    next_h = jnp.where(event_bracket.is_active | has_crossed, event.next_h, next_integration_h)
 
-    time_shift = jnp.where(has_arrived, event.time_shift, 0.0)
-    end = IntervalPoint(
-        end.q + time_shift * end.v,
-        end.v + time_shift * end.dynamics_rows[: len(end.q)],
-        end.dynamics_rows,
+    time_shift = jnp.where(has_reached_event, event.time_shift, 0.0)
+    end_point = IntervalPoint(
+        end_point.q + time_shift * end_point.v,
+        end_point.v + time_shift * end_point.dynamics_rows[: len(end_point.q)],
+        end_point.dynamics_rows,
     )
-    is_taken = is_accepted | has_arrived
-    accumulated = state.accumulated
-    if accumulated is not None and attempt.accumulated is not None:
-        accumulated = accumulated + jnp.where(is_taken, attempt.accumulated, 0.0)
-    time = jnp.where(is_taken, end_time + time_shift, state.time)
-    is_late = is_accepted & (time >= limit)
-    is_late = is_late | (has_arrived & (time > limit))
-    is_stuck = (next_search.n_iterations >= options.max_event_iterations) | (
+    is_state_updated = is_accepted | has_reached_event
+    interval_accumulators = state.interval_accumulators
+    if interval_accumulators is not None and attempt.accumulator_increments is not None:
+        interval_accumulators = interval_accumulators + jnp.where(
+            is_state_updated, attempt.accumulator_increments, 0.0
+        )
+    time = jnp.where(is_state_updated, end_time + time_shift, state.time)
+    is_past_time_limit = is_accepted & (time >= time_limit)
+    is_past_time_limit = is_past_time_limit | (has_reached_event & (time > time_limit))
+    has_failed = (next_bracket.n_iterations >= options.max_event_iterations) | (
         state.n_solver_steps + 1 >= options.max_solver_steps
     )
-    is_stuck = is_stuck | (~search.is_active & (state.time + next_h == state.time))
+    has_failed = has_failed | (~event_bracket.is_active & (state.time + next_h == state.time))
     determinant_row = len(point.q) + N_CONTACT_ROWS - 1
     determinant_before = point.dynamics_rows[determinant_row]
-    determinant_after = end.dynamics_rows[determinant_row]
-    status = jnp.where(is_stuck, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
-    status = jnp.where(has_arrived, LaneStatus.EVENT, status)
-    status = jnp.where(is_late, Outcome.NO_TOUCHDOWN_IN_TIME, status)
-    is_singular = is_taken & is_at_singularity(
+    determinant_after = end_point.dynamics_rows[determinant_row]
+    status = jnp.where(has_failed, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
+    status = jnp.where(has_reached_event, LaneStatus.EVENT, status)
+    status = jnp.where(is_past_time_limit, Outcome.NO_TOUCHDOWN_IN_TIME, status)
+    is_singular = is_state_updated & is_at_singularity(
         determinant_before, determinant_after, options, interval_options
     )
     status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
     return state._replace(
-        point=tree_where(is_taken, end, point),
+        point=tree_where(is_state_updated, end_point, point),
         guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
-        accumulated=accumulated,
+        interval_accumulators=interval_accumulators,
         h=jnp.where(is_running, next_h, h),
         time=time,
-        search=tree_where(is_running, next_search, search),
+        event_bracket=tree_where(is_running, next_bracket, event_bracket),
         status=jnp.where(is_running, status, state.status).astype(jnp.int32),
-        guard=jnp.where(has_arrived, event.guard, state.guard),
+        triggered_guard=jnp.where(has_reached_event, event.guard, state.triggered_guard),
         n_solver_steps=state.n_solver_steps + is_running,
     )
 
@@ -503,7 +558,7 @@ class _LocatedEvent(NamedTuple):
 
     next_h: Array  # step size of the next attempt, s
     time_shift: Array  # from this step size to the event's, s
-    has_arrived: Array  # whether the event is within tolerance
+    has_reached_event: Array  # whether the event is within tolerance
     guard: Array
 
 
@@ -511,104 +566,123 @@ def _search_event(
     state: IntervalState,
     attempt: AttemptedStep,
     has_crossed: Array,
-    scales: Array,
+    guard_scales: Array,
     options: StepOptions,
     interval_options: IntervalOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
     """Return one more iteration of the search, from the zeros of the guards' parabolas or
     secants.
     """
-    h, search = state.h, state.search
+    h, bracket = state.h, state.event_bracket
     is_below_zero = attempt.guard_values <= 0.0
-    is_crossing = jnp.where(search.is_active, search.is_crossing | is_below_zero, is_below_zero)
-    parabolas = state.guard_values, attempt.linear_term, attempt.curvature
-    root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_at_own_event(state))
-    secant_h, secant_guard = _earliest_secant(search, attempt.guard_values, h, is_crossing)
-    uses_secant = search.is_active & (search.n_iterations >= interval_options.n_parabola_iterations)
-    proposal = jnp.where(uses_secant, secant_h, h * root_fraction)
+    is_crossing = jnp.where(bracket.is_active, bracket.is_crossing | is_below_zero, is_below_zero)
+    parabolas = state.guard_values, attempt.parabola_linear_term, attempt.parabola_curvature
+    root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_initiating(state))
+    secant_h, secant_guard = _earliest_secant(bracket, attempt.guard_values, h, is_crossing)
+    uses_secant = bracket.is_active & (
+        bracket.n_iterations >= interval_options.n_parabola_iterations
+    )
+    proposed_h = jnp.where(uses_secant, secant_h, h * root_fraction)
     guard = jnp.where(uses_secant, secant_guard, guard)
-    has_passed = jnp.any(is_crossing & is_below_zero, axis=0)
-    low = jnp.where(search.is_active & ~has_passed, h, search.low)
-    high = jnp.where(search.is_active & has_passed, h, search.high)
-    low, high = jnp.where(has_crossed, 0.0, low), jnp.where(has_crossed, h, high)
-    resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
-    time_tolerance = jnp.maximum(interval_options.event_time_factor * options.rtol * h, resolution)
-    time_tolerance = jnp.where(search.is_active, search.time_tolerance, time_tolerance)
-    is_in_bracket = (proposal >= low - time_tolerance) & (proposal <= high + time_tolerance)
+    is_past_crossing = jnp.any(is_crossing & is_below_zero, axis=0)
+    low_h = jnp.where(bracket.is_active & ~is_past_crossing, h, bracket.low_h)
+    high_h = jnp.where(bracket.is_active & is_past_crossing, h, bracket.high_h)
+    low_h, high_h = jnp.where(has_crossed, 0.0, low_h), jnp.where(has_crossed, h, high_h)
+    time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (state.time + h)
+    time_tolerance = jnp.maximum(
+        interval_options.event_time_tolerance_factor * options.rtol * h, time_resolution
+    )
+    time_tolerance = jnp.where(bracket.is_active, bracket.time_tolerance, time_tolerance)
+    is_in_bracket = (proposed_h >= low_h - time_tolerance) & (proposed_h <= high_h + time_tolerance)
     # In a dip of microseconds, round-off moves proposals out of the bracket: it is bisected.
-    bisects = ~is_in_bracket | (uses_secant & ((search.n_iterations & 3) == 3))
+    needs_bisection = ~is_in_bracket | (uses_secant & ((bracket.n_iterations & 3) == 3))
     # A guard that starts at its own event falls again soon, or not at all.
-    middle = jnp.where((low == 0.0) & jnp.isinf(proposal), 0.125 * high, 0.5 * (low + high))
-    next_h = jnp.where(bisects, middle, proposal)
+    bisection_h = jnp.where(
+        (low_h == 0.0) & jnp.isinf(proposed_h), 0.125 * high_h, 0.5 * (low_h + high_h)
+    )
+    next_h = jnp.where(needs_bisection, bisection_h, proposed_h)
     time_shift = next_h - h
     # If a guard is within its rounding, no other step size is better than this one.
-    lowest_guard, lowest = _lowest_guard(attempt.guard_values / scales, is_crossing)
+    lowest_guard, lowest_value = _lowest_guard(attempt.guard_values / guard_scales, is_crossing)
     # A guard at its own event is within twice its rounding; without another event, it is the event.
-    roundoff = (
+    guard_roundoff = (
         GUARD_ROUNDOFF_IN_EPS
-        * jnp.where(search.n_iterations < interval_options.n_before_own_guard, 1.0, 3.0)
+        * jnp.where(
+            bracket.n_iterations < interval_options.min_iterations_of_initiating_guard, 1.0, 3.0
+        )
         * jnp.finfo(h.dtype).eps
     )
-    is_roundoff = search.is_active & (jnp.abs(lowest) <= roundoff)
-    time_shift = jnp.where(is_roundoff, 0.0, time_shift)
-    guard = jnp.where(is_roundoff, lowest_guard, guard)
-    is_close = search.is_active & (jnp.abs(time_shift) <= time_tolerance)
-    n_iterations = jnp.where(search.is_active, search.n_iterations + 1, 0)
-    is_active = (search.is_active | has_crossed) & ~is_close
-    next_search = EventBracket(
-        is_active, is_crossing, low, high, time_tolerance, n_iterations, h, attempt.guard_values
+    is_guard_within_roundoff = bracket.is_active & (jnp.abs(lowest_value) <= guard_roundoff)
+    time_shift = jnp.where(is_guard_within_roundoff, 0.0, time_shift)
+    guard = jnp.where(is_guard_within_roundoff, lowest_guard, guard)
+    is_within_tolerance = bracket.is_active & (jnp.abs(time_shift) <= time_tolerance)
+    n_iterations = jnp.where(bracket.is_active, bracket.n_iterations + 1, 0)
+    is_active = (bracket.is_active | has_crossed) & ~is_within_tolerance
+    next_bracket = EventBracket(
+        is_active, is_crossing, low_h, high_h, time_tolerance, n_iterations, h, attempt.guard_values
     )
-    return next_search, _LocatedEvent(
-        next_h, time_shift, is_close & (state.status == LaneStatus.RUNNING), guard
+    return next_bracket, _LocatedEvent(
+        next_h, time_shift, is_within_tolerance & (state.status == LaneStatus.RUNNING), guard
     )
 
 
 def _squared_error(
     s: Symbols,
     options: StepOptions,
-    errors: tuple[Array, Array],
+    error_estimates: tuple[Array, Array],
     point: IntervalPoint,
-    end: IntervalPoint,
-    guards: Array,
+    end_point: IntervalPoint,
+    guard_values: Array,
 ) -> Array:
     """Return the mean square of the error over its tolerance; infinite for a step that is not
     finite.
     """
-    total = 0.0 * jnp.sum(guards, axis=0)
+    total_error = 0.0 * jnp.sum(guard_values, axis=0)
     units = compute_state_units(s)
-    for error, a, b, unit in zip(errors, point[:2], end[:2], units, strict=True):
-        tolerance = options.atol * unit + options.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
-        total = total + jnp.sum(jnp.square(error / tolerance), axis=0)
-    return jnp.where(jnp.isfinite(total), total / (2 * point.q.shape[0]), jnp.inf)
+    for error, a, b, coordinate_unit in zip(
+        error_estimates, point[:2], end_point[:2], units, strict=True
+    ):
+        tolerance = options.atol * coordinate_unit + options.rtol * jnp.maximum(
+            jnp.abs(a), jnp.abs(b)
+        )
+        total_error = total_error + jnp.sum(jnp.square(error / tolerance), axis=0)
+    return jnp.where(jnp.isfinite(total_error), total_error / (2 * point.q.shape[0]), jnp.inf)
 
 
-def _is_at_own_event(state: IntervalState) -> Array:
+def _is_initiating(state: IntervalState) -> Array:
     """Return the guards at their own event, for lanes at the start of the contact state."""
     return (state.time == 0.0) & (state.guard_offset != 0.0)
 
 
-def _earliest_dip_fraction(tableau: ButcherTableau, values: list[Array], is_own: Array) -> Array:
+def _earliest_dip_fraction(
+    tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
+) -> Array:
     """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
     none.
 
     See `integrator.find_guard_minimum`. A guard that starts at its own event is not considered.
     """
-    has_dip, fraction = find_guard_minimum(tableau, values)
-    return jnp.min(jnp.where(has_dip & (values[0] > 0.0) & ~is_own, fraction, 1.0), axis=0)
+    has_dip, dip_fraction = find_dip(tableau, guard_values)
+    return jnp.min(
+        jnp.where(has_dip & (guard_values[0] > 0.0) & ~is_initiating, dip_fraction, 1.0), axis=0
+    )
 
 
-def _lowest_guard(values: Array, is_crossing: Array) -> tuple[Array, Array]:
+def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
     """Return the lowest of the crossing guards, and its value; infinite if none crosses."""
-    lowest, guard = jnp.full_like(values[0], jnp.inf), jnp.zeros(values.shape[1:], jnp.int32)
-    for index in range(len(values)):
-        is_lower = is_crossing[index] & (values[index] < lowest)
-        lowest = jnp.where(is_lower, values[index], lowest)
+    lowest_value, guard = (
+        jnp.full_like(guard_values[0], jnp.inf),
+        jnp.zeros(guard_values.shape[1:], jnp.int32),
+    )
+    for index in range(len(guard_values)):
+        is_lower = is_crossing[index] & (guard_values[index] < lowest_value)
+        lowest_value = jnp.where(is_lower, guard_values[index], lowest_value)
         guard = jnp.where(is_lower, index, guard)
-    return guard, lowest
+    return guard, lowest_value
 
 
 def _earliest_secant(
-    search: EventBracket, values: Array, h: Array, is_crossing: Array
+    bracket: EventBracket, guard_values: Array, h: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' secants through the last two attempts.
 
@@ -616,23 +690,23 @@ def _earliest_secant(
     is below zero and no longer falls, because it fell before. The ends of attempts are as accurate
     as the integration; the inner stage is not.
     """
-    rate = (values - search.guard_values) / jnp.where(
-        h == search.previous_h, jnp.inf, h - search.previous_h
+    secant_slope = (guard_values - bracket.guard_values) / jnp.where(
+        h == bracket.previous_h, jnp.inf, h - bracket.previous_h
     )
-    earliest, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
-    for index in range(len(values)):
-        is_falling = is_crossing[index] & (rate[index] < 0.0)
-        root_h = h - values[index] / jnp.where(is_falling, rate[index], 1.0)
-        has_fallen = is_crossing[index] & ~is_falling & (values[index] < 0.0)
-        root_h = jnp.where(has_fallen, -jnp.inf, root_h)
-        is_earlier = (is_falling | has_fallen) & (root_h < earliest)
-        earliest = jnp.where(is_earlier, root_h, earliest)
+    earliest_h, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
+    for index in range(len(guard_values)):
+        is_falling = is_crossing[index] & (secant_slope[index] < 0.0)
+        root_h = h - guard_values[index] / jnp.where(is_falling, secant_slope[index], 1.0)
+        is_already_below = is_crossing[index] & ~is_falling & (guard_values[index] < 0.0)
+        root_h = jnp.where(is_already_below, -jnp.inf, root_h)
+        is_earlier = (is_falling | is_already_below) & (root_h < earliest_h)
+        earliest_h = jnp.where(is_earlier, root_h, earliest_h)
         guard = jnp.where(is_earlier, index, guard)
-    return earliest, guard
+    return earliest_h, guard
 
 
 def _earliest_root(
-    g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_own: Array
+    g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_initiating: Array
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' parabolas, in step lengths, and the guard.
 
@@ -641,21 +715,24 @@ def _earliest_root(
     such a parabola ends below zero.
     """
     discriminant = linear_term * linear_term - 4.0 * curvature * g0
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    sqrt_discriminant = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     is_falling = linear_term < 0.0
-    numerator = jnp.where(is_falling, 2.0 * g0, -linear_term - root)
-    denominator = jnp.where(is_falling, root - linear_term, 2.0 * curvature)
+    numerator = jnp.where(is_falling, 2.0 * g0, -linear_term - sqrt_discriminant)
+    denominator = jnp.where(is_falling, sqrt_discriminant - linear_term, 2.0 * curvature)
     root_fraction = numerator / jnp.where(denominator == 0.0, 1.0, denominator)
     has_root = is_crossing & (discriminant >= 0.0) & (denominator != 0.0) & (root_fraction > 0.0)
-    has_root = has_root & ~(is_own & is_falling)
-    has_fallen = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
-    root_fraction, has_root = jnp.where(has_fallen, -jnp.inf, root_fraction), has_root | has_fallen
-    earliest = jnp.full_like(root_fraction[0], jnp.inf)
+    has_root = has_root & ~(is_initiating & is_falling)
+    is_already_below = is_crossing & ~has_root & (g0 + linear_term + curvature < 0.0)
+    root_fraction, has_root = (
+        jnp.where(is_already_below, -jnp.inf, root_fraction),
+        has_root | is_already_below,
+    )
+    earliest_fraction = jnp.full_like(root_fraction[0], jnp.inf)
     guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
     for index in reversed(range(len(root_fraction))):
         guard = jnp.where(is_crossing[index], index, guard)
     for index in range(len(root_fraction)):
-        is_earlier = has_root[index] & (root_fraction[index] < earliest)
-        earliest = jnp.where(is_earlier, root_fraction[index], earliest)
+        is_earlier = has_root[index] & (root_fraction[index] < earliest_fraction)
+        earliest_fraction = jnp.where(is_earlier, root_fraction[index], earliest_fraction)
         guard = jnp.where(is_earlier, index, guard)
-    return earliest, guard
+    return earliest_fraction, guard

@@ -30,7 +30,7 @@ from vrw_jax.contact.unilateral_wheel import UnilateralWheel
 from vrw_jax.contact.walk_kernel import (
     N_PARAMETERS,
     N_UNEVEN_COLUMNS,
-    BatchWalk,
+    BatchWalkSettings,
     make_result_template,
     run_walks,
 )
@@ -42,7 +42,7 @@ from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_own_units_of_rows, c
 
 
 def walk_batch(
-    columns: np.ndarray,
+    input_columns: np.ndarray,
     states: np.ndarray,
     n_steps: int,
     model: UnilateralWheel,
@@ -55,15 +55,15 @@ def walk_batch(
     section states, shape (wheels, 4 + 3 n). On uneven ground, one step at a time, two columns
     more: see `N_UNEVEN_COLUMNS`.
     """
-    config = _WalkConfig.from_model(model, options, n, False, len(columns))
-    walk = _run_walk(config, [columns, states.T], n_steps, options)
-    summary = walk.step_result
-    counts = walk.outcome, walk.n_stepped, walk.n_solver_steps
-    return summary.section_state, summary.durations, *counts, summary.step_length
+    config = _WalkConfig.from_model(model, options, n, False, len(input_columns))
+    walk_result = _run_walk(config, [input_columns, states.T], n_steps, options)
+    summary = walk_result.step_result
+    result_counts = walk_result.outcome, walk_result.n_stepped, walk_result.n_solver_steps
+    return summary.section_state, summary.durations, *result_counts, summary.step_length
 
 
 def step_batch_with_jacobian(
-    columns: np.ndarray,
+    input_columns: np.ndarray,
     states: np.ndarray,
     model: UnilateralWheel,
     options: StepOptions,
@@ -78,44 +78,50 @@ def step_batch_with_jacobian(
     codes) have zero derivatives. The number of rate tangents is the number that loaded feet leave
     independent (see `_IndependentRates`).
     """
-    config = _WalkConfig.from_model(model, options, n, True, len(columns))
+    config = _WalkConfig.from_model(model, options, n, True, len(input_columns))
     if len(states):  # before others are asked for: it is long in coming
-        _compile_walk(config, columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array)))
-    code = np.round(states[:, 4 + 2 * n :]).astype(int)
-    numbers = np.concatenate([columns.T, states], 1)
-    has_tangent = np.ones(numbers.shape, bool)
-    is_free_leg = code < LOCKED_CODE_OFFSET
-    is_free_entry = [
-        is_free_leg & ((code & (LOCKED_CODE_OFFSET - 1)) == ContactMode.OFF),
-        is_free_leg,
-        np.zeros(code.shape, bool),
+        _compile_walk(
+            config, input_columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array))
+        )
+    contact_codes = np.round(states[:, 4 + 2 * n :]).astype(int)
+    step_inputs = np.concatenate([input_columns.T, states], 1)
+    has_tangent = np.ones(step_inputs.shape, bool)
+    is_off_stopper = contact_codes < LOCKED_CODE_OFFSET
+    is_variable_entry = [
+        is_off_stopper & ((contact_codes & (LOCKED_CODE_OFFSET - 1)) == ContactMode.OFF),
+        is_off_stopper,
+        np.zeros(contact_codes.shape, bool),
     ]
-    has_tangent[:, len(columns) + 4 :] = np.concatenate(is_free_entry, 1)
+    has_tangent[:, len(input_columns) + 4 :] = np.concatenate(is_variable_entry, 1)
     if input_indices is not None:
-        has_tangent &= np.isin(np.arange(numbers.shape[1]), input_indices)
-    rate_indices = len(columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
-    section_units = compute_section_units(compute_own_units_of_rows(columns.T, n), n)
-    rate_units = np.stack(section_units, -1)[:, rate_indices - len(columns)]
+        has_tangent &= np.isin(np.arange(step_inputs.shape[1]), input_indices)
+    rate_indices = len(input_columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
+    section_units = compute_section_units(compute_own_units_of_rows(input_columns.T, n), n)
+    rate_units = np.stack(section_units, -1)[:, rate_indices - len(input_columns)]
     projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n)]]  # in the order of `coordinates`
-    projection = _project_rates(columns, states, n) * (
+    projection = _project_rates(input_columns, states, n) * (
         rate_units[:, None] / projected_units[:, :, None]
     )
     independent_rates = _IndependentRates.from_projection(
         projection, has_tangent[:, rate_indices]
     ).convert_to_si(rate_units)
     has_tangent[:, rate_indices] = independent_rates.is_independent()
-    wheel, input_index = np.nonzero(has_tangent)
-    lane, slot, owner = _pack_tangents(has_tangent.sum(1))
-    tangent_inputs = np.full((MAX_TANGENTS_PER_LANE, len(owner)), -1.0)
-    tangent_inputs[slot, lane] = input_index
-    arguments = [columns[:, owner], states[owner].T, tangent_inputs]
-    walk_result, tangents = _run_walk(config, arguments, 1, options.with_derivative_tolerances())
-    first_lane = np.searchsorted(owner, np.arange(len(states)))
+    wheel_index, input_index = np.nonzero(has_tangent)
+    lane_index, tangent_position, lane_wheels = _pack_tangents(has_tangent.sum(1))
+    tangent_input_indices = np.full((MAX_TANGENTS_PER_LANE, len(lane_wheels)), -1.0)
+    tangent_input_indices[tangent_position, lane_index] = input_index
+    walk_arguments = [input_columns[:, lane_wheels], states[lane_wheels].T, tangent_input_indices]
+    walk_result, tangents = _run_walk(
+        config, walk_arguments, 1, options.with_derivative_tolerances()
+    )
+    first_lane = np.searchsorted(lane_wheels, np.arange(len(states)))
 
     def gather_tangents(leaf: np.ndarray) -> np.ndarray:
-        jacobian_rows = np.zeros((*numbers.shape, *leaf.shape[2:]), leaf.dtype)
-        jacobian_rows[wheel, input_index] = leaf[lane, slot]
-        jacobian_rows[:, rate_indices] = independent_rates.expand(jacobian_rows[:, rate_indices])
+        jacobian_rows = np.zeros((*step_inputs.shape, *leaf.shape[2:]), leaf.dtype)
+        jacobian_rows[wheel_index, input_index] = leaf[lane_index, tangent_position]
+        jacobian_rows[:, rate_indices] = independent_rates.expand_to_all_rates(
+            jacobian_rows[:, rate_indices]
+        )
         return np.moveaxis(jacobian_rows, 1, -1)
 
     return jax.tree.map(lambda x: x[first_lane], walk_result.step_result), jax.tree.map(
@@ -127,15 +133,21 @@ MAX_TANGENTS_PER_LANE = 16
 """Largest number of tangents in one lane: more tangents are distributed over several lanes."""
 
 
-def _pack_tangents(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the lane and position of each wheel's tangents, one after another, and the lanes'
     owners.
     """
-    lane_rows = np.maximum(-(-counts // MAX_TANGENTS_PER_LANE), 1)
-    first_lane = np.cumsum(lane_rows) - lane_rows
-    position = np.concatenate([np.arange(n) for n in counts])
-    lane = np.repeat(first_lane, counts) + position // MAX_TANGENTS_PER_LANE
-    return lane, position % MAX_TANGENTS_PER_LANE, np.repeat(np.arange(len(counts)), lane_rows)
+    n_lanes_by_wheel = np.maximum(-(-n_tangents_by_wheel // MAX_TANGENTS_PER_LANE), 1)
+    first_lane = np.cumsum(n_lanes_by_wheel) - n_lanes_by_wheel
+    tangent_position = np.concatenate([np.arange(n) for n in n_tangents_by_wheel])
+    lane_index = (
+        np.repeat(first_lane, n_tangents_by_wheel) + tangent_position // MAX_TANGENTS_PER_LANE
+    )
+    return (
+        lane_index,
+        tangent_position % MAX_TANGENTS_PER_LANE,
+        np.repeat(np.arange(len(n_tangents_by_wheel)), n_lanes_by_wheel),
+    )
 
 
 RANK_TOLERANCE = 1e-10
@@ -151,7 +163,7 @@ class _IndependentRates(NamedTuple):
 
     indices: np.ndarray  # of the independent rates, (wheels, independent)
     is_used: np.ndarray  # which of these exist
-    combination: np.ndarray  # of all rates by these, (wheels, independent, rates)
+    combination_weights: np.ndarray  # of all rates by these, (wheels, independent, rates)
 
     @classmethod
     def from_projection(
@@ -161,89 +173,115 @@ class _IndependentRates(NamedTuple):
 
         Of the rates `is_requested`, the one with the largest remainder is selected repeatedly.
         """
-        requested = np.nan_to_num(projection) * is_requested[:, None]
-        remainder, wheels = requested.copy(), np.arange(len(is_requested))
+        requested_projection = np.nan_to_num(projection) * is_requested[:, None]
+        remainder, wheel_indices = requested_projection.copy(), np.arange(len(is_requested))
         max_norm = np.sqrt(np.sum(remainder**2, 1)).max(-1)
         indices: list[np.ndarray] = []
         is_used: list[np.ndarray] = []
-        directions: list[np.ndarray] = []
+        unit_directions: list[np.ndarray] = []
         for _ in range(int(is_requested.sum(1).max(initial=0))):
-            norm = np.sqrt(np.sum(remainder**2, 1))
-            largest_index = norm.argmax(-1)
-            is_significant = norm[wheels, largest_index] > RANK_TOLERANCE * max_norm
+            remainder_norm = np.sqrt(np.sum(remainder**2, 1))
+            largest_index = remainder_norm.argmax(-1)
+            is_significant = (
+                remainder_norm[wheel_indices, largest_index] > RANK_TOLERANCE * max_norm
+            )
             if not is_significant.any():
                 break
-            direction = (
-                remainder[wheels, :, largest_index]
-                / np.where(is_significant, norm[wheels, largest_index], np.inf)[:, None]
+            unit_direction = (
+                remainder[wheel_indices, :, largest_index]
+                / np.where(is_significant, remainder_norm[wheel_indices, largest_index], np.inf)[
+                    :, None
+                ]
             )
             remainder = (
                 remainder
-                - direction[:, :, None] * np.sum(direction[:, :, None] * remainder, 1)[:, None]
+                - unit_direction[:, :, None]
+                * np.sum(unit_direction[:, :, None] * remainder, 1)[:, None]
             )
             indices = [*indices, largest_index]
             is_used = [*is_used, is_significant]
-            directions = [*directions, direction]
+            unit_directions = [*unit_directions, unit_direction]
         if not indices:
-            empty = np.zeros((len(is_requested), 0), int)
-            return cls(empty, empty > 0, np.zeros((len(is_requested), 0, is_requested.shape[1])))
+            empty_indices = np.zeros((len(is_requested), 0), int)
+            return cls(
+                empty_indices,
+                empty_indices > 0,
+                np.zeros((len(is_requested), 0, is_requested.shape[1])),
+            )
         index_array, is_significant = np.stack(indices, 1), np.stack(is_used, 1)
         components = np.stack(
-            [np.sum(direction[:, :, None] * requested, 1) for direction in directions], 1
+            [
+                np.sum(unit_direction[:, :, None] * requested_projection, 1)
+                for unit_direction in unit_directions
+            ],
+            1,
         )
-        combination = np.zeros_like(components)
+        combination_weights = np.zeros_like(components)
         for i in reversed(range(len(indices))):  # each direction is the remainder of one rate
-            component = components[:, i].copy()
+            remaining_component = components[:, i].copy()
             for j in range(i + 1, len(indices)):
-                component -= components[wheels, i, index_array[:, j]][:, None] * combination[:, j]
-            norm = components[wheels, i, index_array[:, i]]
-            combination[:, i] = component / np.where(is_significant[:, i], norm, np.inf)[:, None]
-        return cls(index_array, is_significant, combination)
+                remaining_component -= (
+                    components[wheel_indices, i, index_array[:, j]][:, None]
+                    * combination_weights[:, j]
+                )
+            remainder_norm = components[wheel_indices, i, index_array[:, i]]
+            combination_weights[:, i] = (
+                remaining_component
+                / np.where(is_significant[:, i], remainder_norm, np.inf)[:, None]
+            )
+        return cls(index_array, is_significant, combination_weights)
 
     def convert_to_si(self, units: np.ndarray) -> "_IndependentRates":
         """Return the same for rates in SI, given rates in `units`, (wheels, rates)."""
         own_units = np.take_along_axis(units, self.indices, 1)
-        return self._replace(combination=self.combination * own_units[:, :, None] / units[:, None])
+        return self._replace(
+            combination_weights=self.combination_weights * own_units[:, :, None] / units[:, None]
+        )
 
     def is_independent(self) -> np.ndarray:
         """Return whether each rate is independent, (wheels, rates)."""
-        flags = np.zeros((len(self.indices), self.combination.shape[2]), bool)
-        wheel, column = np.nonzero(self.is_used)
-        flags[wheel, self.indices[wheel, column]] = True
-        return flags
+        independence_flags = np.zeros((len(self.indices), self.combination_weights.shape[2]), bool)
+        wheel_index, rate_position = np.nonzero(self.is_used)
+        independence_flags[wheel_index, self.indices[wheel_index, rate_position]] = True
+        return independence_flags
 
-    def expand(self, tangents: np.ndarray) -> np.ndarray:
+    def expand_to_all_rates(self, tangents: np.ndarray) -> np.ndarray:
         """Return the tangents of all rates, (wheels, rates, ...), from those of the independent
         ones.
         """
-        wheels, shape = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
-        total = np.zeros_like(tangents)
-        for column in range(self.indices.shape[1]):
-            weights = self.combination[:, column].reshape(
-                *self.combination[:, column].shape, *shape
+        wheel_indices, trailing_axes = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
+        all_tangents = np.zeros_like(tangents)
+        for rate_position in range(self.indices.shape[1]):
+            weights = self.combination_weights[:, rate_position].reshape(
+                *self.combination_weights[:, rate_position].shape, *trailing_axes
             )
-            total += weights * tangents[wheels, self.indices[:, column]][:, None]
-        return total
+            all_tangents += (
+                weights * tangents[wheel_indices, self.indices[:, rate_position]][:, None]
+            )
+        return all_tangents
 
 
-def _project_rates(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
+def _project_rates(input_columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
     """Return the effect of each rate of the section state on the start of a step, which is linear.
 
     The axes are (wheels, rates after, rates).
     """
-    units = np.eye(3 + n)
-    lane_rows = np.repeat(states, 3 + n, 0)
-    unit_rates = np.tile(units, (len(states), 1))
-    lane_rows[:, 1:4], lane_rows[:, 4 + n : 4 + 2 * n] = unit_rates[:, :3], unit_rates[:, 3:]
-    rows = [*np.repeat(columns[:N_PARAMETERS], 3 + n, 1), *lane_rows.T]
-    rates = _apply_to_rows(n, "rates at a start", rows).T
+    unit_rates = np.eye(3 + n)
+    repeated_states = np.repeat(states, 3 + n, 0)
+    tiled_rates = np.tile(unit_rates, (len(states), 1))
+    repeated_states[:, 1:4], repeated_states[:, 4 + n : 4 + 2 * n] = (
+        tiled_rates[:, :3],
+        tiled_rates[:, 3:],
+    )
+    lane_rows = [*np.repeat(input_columns[:N_PARAMETERS], 3 + n, 1), *repeated_states.T]
+    rates = _apply_to_rows(n, "rates at a start", lane_rows).T
     return np.swapaxes(rates.reshape(len(states), 3 + n, 3 + n), 1, 2)
 
 
 def _project_landing(s: Symbols, x: Array) -> WheelMotion:
     """Return the motion of a section state, projected onto its contacts."""
     motion, contact_state = unpack_section_state(s, x)
-    return project_motion(s, motion, contact_state.contact, contact_state.locked)
+    return project_motion(s, motion, contact_state.contact_modes, contact_state.locked)
 
 
 SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
@@ -253,29 +291,38 @@ SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
 """Functions of section states alone, with lanes on the last axis."""
 
 
-def _apply_to_rows(n: int, function_name: str, rows: list[np.ndarray]) -> np.ndarray:
+def _apply_to_rows(n: int, function_name: str, lane_rows: list[np.ndarray]) -> np.ndarray:
     """Return one of `SECTION_STATE_FUNCTIONS` of rows of parameters and section states.
 
     One program serves any number of wheels; JAX alone would compile a new one for each number.
     """
-    program = _compile_for_rows(n, function_name, len(rows), rows[0].dtype)
-    return np.stack(program([], [np.ascontiguousarray(row) for row in rows]))
+    program = _compile_for_rows(n, function_name, len(lane_rows), lane_rows[0].dtype)
+    return np.stack(program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
 
 
 @functools.cache
-def _compile_for_rows(n: int, function_name: str, size: int, dtype: np.dtype) -> Callable[..., Any]:
+def _compile_for_rows(
+    n: int, function_name: str, n_rows: int, dtype: np.dtype
+) -> Callable[..., Any]:
     """Return the compiled function of rows."""
 
-    def evaluate(_: tuple, lane_rows: tuple) -> tuple:
-        values, x = lane_rows[: len(PARAMETER_NAMES)], jnp.stack(lane_rows[len(PARAMETER_NAMES) :])
-        return tuple(SECTION_STATE_FUNCTIONS[function_name](compute_symbols(n, *values), x))
+    def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
+        parameter_values, x = (
+            lane_rows[: len(PARAMETER_NAMES)],
+            jnp.stack(lane_rows[len(PARAMETER_NAMES) :]),
+        )
+        return tuple(
+            SECTION_STATE_FUNCTIONS[function_name](compute_symbols(n, *parameter_values), x)
+        )
 
     if simd.is_available():
-        return cached_lane_program(evaluate, [], size, dtype, ("on real ground", function_name, n))
-    return _compile_with_xla(evaluate)
+        return cached_lane_program(
+            evaluate_section_function, [], n_rows, dtype, ("on real ground", function_name, n)
+        )
+    return _compile_with_xla(evaluate_section_function)
 
 
-def _compile_with_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
+def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
     """Return the function of numbers and rows, compiled by XLA in blocks of lanes.
 
     It is used without machine code.
@@ -283,27 +330,31 @@ def _compile_with_xla(function: Callable[[tuple, tuple], tuple]) -> Callable[...
     move_axis = lambda results, source, destination: tuple(
         jnp.moveaxis(x, source, destination) for x in results
     )
-    compiled = jax.jit(lambda uniform, lane_rows: move_axis(function(uniform, lane_rows), -1, 0))
+    compiled_function = jax.jit(
+        lambda lane_independent, lane_rows: move_axis(
+            lane_function(lane_independent, lane_rows), -1, 0
+        )
+    )
 
-    def in_blocks(uniform: list, lane_rows: list) -> tuple:
-        run_block = lambda *rows: compiled(tuple(uniform), rows)
+    def run_in_blocks(lane_independent: list, lane_rows: list) -> tuple:
+        run_block = lambda *rows: compiled_function(tuple(lane_independent), rows)
         return move_axis(
             map_in_batches(run_block, (batch_sizes.CONTACT_XLA_BATCH_SIZE,), *lane_rows), 0, -1
         )
 
-    return in_blocks
+    return run_in_blocks
 
 
 class _WalkConfig(NamedTuple):
     """Static configuration of a batch walk."""
 
-    static: StepOptions
+    static_options: StepOptions
     n_legs: int
     max_events: int
     is_one_sided: bool
     uses_paper_rule: bool
     has_tangents: bool  # whether the detailed step and its tangents are computed
-    uneven: bool
+    is_uneven: bool
 
     @classmethod
     def from_model(
@@ -321,7 +372,7 @@ class _WalkConfig(NamedTuple):
                 "vrw.walk, or map vrw.return_map over them."
             )
         static_options = eqx.filter(options, eqx.is_array, inverse=True)
-        uneven = n_columns > N_PARAMETERS + 1
+        is_uneven = n_columns > N_PARAMETERS + 1
         return cls(
             static_options,
             n,
@@ -329,12 +380,12 @@ class _WalkConfig(NamedTuple):
             model.has_one_sided_stoppers,
             model.uses_paper_rule,
             has_tangents,
-            uneven,
+            is_uneven,
         )
 
-    def make_walk(self, dynamic: StepOptions, n_steps: Array) -> BatchWalk:
+    def make_walk(self, traced_options: StepOptions, n_steps: Array) -> BatchWalkSettings:
         """Return the walk settings with traced options and number of steps."""
-        options = eqx.combine(dynamic, self.static)
+        options = eqx.combine(traced_options, self.static_options)
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # the caller looked
         rules = (
@@ -343,27 +394,30 @@ class _WalkConfig(NamedTuple):
             self.has_tangents,
             options,
             tableau,
-            self.uneven,
+            self.is_uneven,
         )
-        return BatchWalk(self.n_legs, n_steps, self.max_events, *rules)
+        return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *rules)
 
-    def row_counts(self) -> tuple[int, ...]:
+    def input_row_counts(self) -> tuple[int, ...]:
         """Of the arrays that are given: columns, states, and which of these directions are."""
-        sizes = N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.uneven, full_section_size(self.n_legs)
-        return (*sizes, MAX_TANGENTS_PER_LANE) if self.has_tangents else sizes
+        row_counts = (
+            N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.is_uneven,
+            full_section_size(self.n_legs),
+        )
+        return (*row_counts, MAX_TANGENTS_PER_LANE) if self.has_tangents else row_counts
 
     def result_structure(self, dtype: Any) -> Any:
         """Return shapes and dtypes of the results."""
         result = _result_shapes(self.n_legs, dtype, self.has_tangents)
         if not self.has_tangents:
             return result
-        floats = eqx.filter(
+        float_leaves = eqx.filter(
             result.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
         )
         add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
             (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
         )
-        return result, jax.tree.map(add_tangent_axis, floats)
+        return result, jax.tree.map(add_tangent_axis, float_leaves)
 
 
 @functools.cache
@@ -373,26 +427,32 @@ def _result_shapes(n_legs: int, dtype: Any, has_tangents: bool) -> Any:
 
 
 def _run_walk(
-    config: _WalkConfig, arguments: list[np.ndarray], n_steps: int, options: StepOptions
+    config: _WalkConfig, input_arrays: list[np.ndarray], n_steps: int, options: StepOptions
 ) -> Any:
     """Return the results of lanes with the lane axis, last in the input arrays, as the leading
     one.
     """
-    dtype = arguments[0].dtype
+    dtype = input_arrays[0].dtype
     # Neighboring lanes run as long as the slowest; high damping bounds the step by stability.
-    order = np.argsort(-arguments[0][PARAMETER_NAMES.index("damping")], kind="stable")
-    dynamic, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
-    uniform = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in dynamic)]
-    lane_rows = [row[order] for array in arguments for row in array]
-    rows = (
-        _compile_walk(config, dtype, options_structure)(uniform, lane_rows) if len(order) else None
+    lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
+    traced_options, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
+    lane_independent = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in traced_options)]
+    lane_rows = [input_row[lane_order] for input_array in input_arrays for input_row in input_array]
+    result_rows = (
+        _compile_walk(config, dtype, options_structure)(lane_independent, lane_rows)
+        if len(lane_order)
+        else None
     )
-    inverse_order = np.argsort(order, kind="stable")
+    inverse_lane_order = np.argsort(lane_order, kind="stable")
     leaves, structure = _result_structure(config, dtype)
-    if rows is None:
-        rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in leaves]
+    if result_rows is None:
+        result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in leaves]
     return jax.tree.unflatten(
-        structure, [np.moveaxis(np.asarray(array), -1, 0)[inverse_order] for array in rows]
+        structure,
+        [
+            np.moveaxis(np.asarray(input_array), -1, 0)[inverse_lane_order]
+            for input_array in result_rows
+        ],
     )
 
 
@@ -402,37 +462,50 @@ def _result_structure(config: _WalkConfig, dtype: np.dtype) -> tuple[list[Any], 
     return jax.tree.flatten(config.result_structure(dtype))
 
 
-def embed_section_states(columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
+def embed_section_states(input_columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
     """Return the full section states of three-number ones; others are returned unchanged."""
     if states.shape[1] != 3:
         return states
-    return _apply_to_rows(n, "full states", [*columns[:N_PARAMETERS], *states.T]).T
+    return _apply_to_rows(n, "full states", [*input_columns[:N_PARAMETERS], *states.T]).T
 
 
 @functools.cache
-def _compile_walk(config: _WalkConfig, dtype: np.dtype, structure: Any) -> Callable[..., Any]:
+def _compile_walk(
+    config: _WalkConfig, dtype: np.dtype, options_structure: Any
+) -> Callable[..., Any]:
     """Return the compiled walk over numbers and rows of lanes, for any number of steps."""
 
-    def walk(uniform: tuple, lane_rows: tuple) -> tuple:
-        n_steps, *dynamic = uniform
-        batch_walk = config.make_walk(jax.tree.unflatten(structure, dynamic), n_steps)
-        rows = iter(lane_rows)
-        arguments = [jnp.stack([next(rows) for _ in range(size)]) for size in config.row_counts()]
+    def run_compiled_walk(lane_independent: tuple, lane_rows: tuple) -> tuple:
+        n_steps, *traced_options = lane_independent
+        walk_settings = config.make_walk(
+            jax.tree.unflatten(options_structure, traced_options), n_steps
+        )
+        row_iterator = iter(lane_rows)
+        walk_inputs = [
+            jnp.stack([next(row_iterator) for _ in range(n_rows)])
+            for n_rows in config.input_row_counts()
+        ]
         if not config.has_tangents:
-            return tuple(jax.tree.leaves(run_walks(batch_walk, *arguments)))
-        columns, x, tangent_inputs = arguments
-        input_index = np.arange(len(columns) + len(x), dtype=np.int32)[:, None]
-        units = (tangent_inputs[:, None] == input_index).astype(x.dtype)
-        units = lax.optimization_barrier(units)
-        tangents = units[:, : len(columns)], units[:, len(columns) :]
-        n_tangents = jnp.sum(tangent_inputs >= 0, axis=0, dtype=jnp.int32)
+            return tuple(jax.tree.leaves(run_walks(walk_settings, *walk_inputs)))
+        input_columns, x, tangent_input_indices = walk_inputs
+        input_index = np.arange(len(input_columns) + len(x), dtype=np.int32)[:, None]
+        unit_tangents = (tangent_input_indices[:, None] == input_index).astype(x.dtype)
+        unit_tangents = lax.optimization_barrier(unit_tangents)
+        tangents = unit_tangents[:, : len(input_columns)], unit_tangents[:, len(input_columns) :]
+        n_tangents = jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32)
         return tuple(
-            jax.tree.leaves(walk_with_tangents(batch_walk, columns, x, *tangents, n_tangents))
+            jax.tree.leaves(
+                walk_with_tangents(walk_settings, input_columns, x, *tangents, n_tangents)
+            )
         )
 
     if simd.is_available():
-        kinds = [np.dtype(np.int32), *[dtype] * structure.num_leaves]
+        scalar_dtypes = [np.dtype(np.int32), *[dtype] * options_structure.num_leaves]
         return cached_lane_program(
-            walk, kinds, sum(config.row_counts()), dtype, ("walk on real ground", config)
+            run_compiled_walk,
+            scalar_dtypes,
+            sum(config.input_row_counts()),
+            dtype,
+            ("walk on real ground", config),
         )
-    return _compile_with_xla(walk)
+    return _compile_with_xla(run_compiled_walk)

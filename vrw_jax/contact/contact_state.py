@@ -13,7 +13,7 @@ from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     ForceSolution,
     slip_sign,
-    solve_motion,
+    solve_contact_forces,
 )
 from vrw_jax.contact.mechanics import (
     FootVelocity,
@@ -43,10 +43,10 @@ PackedState = Float[Array, "dim ..."]
 class Accumulators(NamedTuple):
     """Integrals along the motion, besides the motion itself."""
 
-    clock: Scalar  # time since the last event, s
-    damping: Scalar  # energy lost in the dampers, J
-    friction: Scalar  # energy lost by sliding, J
-    slip: Scalar  # path length of all sliding feet, m
+    time_since_event: Scalar  # time since the last event, s
+    damping_loss: Scalar  # energy lost in the dampers, J
+    friction_loss: Scalar  # energy lost by sliding, J
+    slip_length: Scalar  # path length of all sliding feet, m
 
 
 def pack_state(motion: WheelMotion, accumulators: Accumulators) -> PackedState:
@@ -65,7 +65,7 @@ def unpack_state(state: PackedState) -> tuple[WheelMotion, Accumulators]:
 class ContactState(NamedTuple):
     """Contact modes of the feet, stopper states of the legs, and what has just changed."""
 
-    contact: Int[Array, " n_legs"]  # mode of every foot
+    contact_modes: Int[Array, " n_legs"]  # mode of every foot
     locked: Bool[Array, " n_legs"]  # legs on their stoppers
     has_just_lifted: Bool[Array, " n_legs"]  # feet that have just left the ground
     has_just_unlocked: Bool[Array, " n_legs"]  # legs that have just left their stoppers
@@ -80,15 +80,15 @@ class ModeDynamics(NamedTuple):
     is_one_sided: bool  # airborne legs may leave their stoppers
     contact_state: ContactState
     slots: Slots
-    contact: Int[Array, "2"]  # of the slots
-    held: Bool[Array, "2"]  # the slots' legs on their stoppers
-    airborne: Bool[Array, " n_legs"]  # other legs on their stoppers
-    accumulates: bool  # in batches: the accumulators are integrated as well
+    slot_modes: Int[Array, "2"]  # of the slots
+    is_held: Bool[Array, "2"]  # the slots' legs on their stoppers
+    is_airborne_locked: Bool[Array, " n_legs"]  # other legs on their stoppers
+    has_accumulators: bool  # in batches: the accumulators are integrated as well
     tilt: Elementwise | None = None  # by which the next line is steeper, rad
 
     def configure(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration at this motion."""
-        slots = self.slots, self.contact, self.held, self.airborne
+        slots = self.slots, self.slot_modes, self.is_held, self.is_airborne_locked
         return ContactConfiguration(self.s, motion, self.friction, *slots)
 
 
@@ -97,17 +97,26 @@ def make_mode_dynamics(
     friction: Friction,
     is_one_sided: bool,
     contact_state: ContactState,
-    accumulates: bool = False,
+    has_accumulators: bool = False,
     tilt: Elementwise | None = None,
 ) -> ModeDynamics:
     """Return the dynamics of the wheel in this contact state."""
-    slots = find_slots(contact_state.contact != ContactMode.OFF)
-    contact = slots.gather_codes(contact_state.contact)
-    held = slots.gather_flags(contact_state.locked)
-    airborne = contact_state.locked & ~slots.is_filled
+    slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
+    slot_modes = slots.gather_codes(contact_state.contact_modes)
+    is_held = slots.gather_flags(contact_state.locked)
+    is_airborne_locked = contact_state.locked & ~slots.is_filled
     friction = slot_friction(friction, slots)
     return ModeDynamics(
-        s, friction, is_one_sided, contact_state, slots, contact, held, airborne, accumulates, tilt
+        s,
+        friction,
+        is_one_sided,
+        contact_state,
+        slots,
+        slot_modes,
+        is_held,
+        is_airborne_locked,
+        has_accumulators,
+        tilt,
     )
 
 
@@ -115,18 +124,20 @@ class ContactForces(NamedTuple):
     """Contact forces with the leg directions and foot velocities that they depend on."""
 
     legs: LegDirections
-    free_legs: LegArray  # see `free_legs`
+    free_leg_acceleration: LegArray  # see `free_legs`
     solution: ForceSolution
     foot_velocity: FootVelocity
 
 
 def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces:
     """Return contact and stopper forces with the resulting accelerations."""
-    unit, posture = opaque_one(motion), make_posture(dynamics.s, motion, dynamics.slots)
-    leg_acceleration = prevent_fusion(free_leg_motion(dynamics.s, motion, posture.legs), unit)
-    velocity = prevent_fusion(foot_velocity(motion, dynamics.slots, posture), unit)
+    unit_divisor, posture = opaque_one(motion), make_posture(dynamics.s, motion, dynamics.slots)
+    leg_acceleration = prevent_fusion(
+        free_leg_motion(dynamics.s, motion, posture.legs), unit_divisor
+    )
+    velocity = prevent_fusion(foot_velocity(motion, dynamics.slots, posture), unit_divisor)
     return ContactForces(
-        posture.legs, leg_acceleration, solve_motion(dynamics.configure(motion)), velocity
+        posture.legs, leg_acceleration, solve_contact_forces(dynamics.configure(motion)), velocity
     )
 
 
@@ -135,14 +146,15 @@ def airborne_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Leg
     sin, cos = forces.legs
     ax, az, _ = forces.solution.hub
     # Acceleration of each leg's length without forces of slots and stoppers, m/s^2.
-    free_acceleration = forces.free_legs + sin * ax + cos * az
-    return jnp.where(dynamics.airborne, dynamics.s.m * free_acceleration, 0.0)
+    free_acceleration = forces.free_leg_acceleration + sin * ax + cos * az
+    return jnp.where(dynamics.is_airborne_locked, dynamics.s.m * free_acceleration, 0.0)
 
 
 def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementwise:
     """Return the minimum of `airborne_stopper_force`; infinite if no leg in the air is locked."""
     return jnp.min(
-        jnp.where(dynamics.airborne, airborne_stopper_force(dynamics, forces), jnp.inf), axis=0
+        jnp.where(dynamics.is_airborne_locked, airborne_stopper_force(dynamics, forces), jnp.inf),
+        axis=0,
     )
 
 
@@ -150,31 +162,31 @@ def accumulator_rates(
     dynamics: ModeDynamics, motion: WheelMotion, forces: ContactForces
 ) -> Accumulators:
     """Return the rates of the accumulators."""
-    direction = slip_sign(dynamics.contact)
-    speeds = [direction[i] * forces.foot_velocity.x[i] for i in range(2)]
-    friction_force = [-forces.solution.tangential[i] * direction[i] for i in range(2)]
+    slip_signs = slip_sign(dynamics.slot_modes)
+    slip_speeds = [slip_signs[i] * forces.foot_velocity.x[i] for i in range(2)]
+    friction_forces = [-forces.solution.tangential[i] * slip_signs[i] for i in range(2)]
     return Accumulators(
-        clock=jnp.ones_like(motion.x),
-        damping=dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
-        friction=friction_force[0] * speeds[0] + friction_force[1] * speeds[1],
-        slip=speeds[0] + speeds[1],
+        time_since_event=jnp.ones_like(motion.x),
+        damping_loss=dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
+        friction_loss=friction_forces[0] * slip_speeds[0] + friction_forces[1] * slip_speeds[1],
+        slip_length=slip_speeds[0] + slip_speeds[1],
     )
 
 
 def vector_field(dynamics: ModeDynamics, state: PackedState) -> PackedState:
     """Return the time derivative of the packed state."""
     motion, _ = unpack_state(state)
-    current_forces = compute_forces(dynamics, motion)
+    forces = compute_forces(dynamics, motion)
     rates = WheelMotion(
         motion.vx,
         motion.vz,
         motion.dtheta,
-        *current_forces.solution.hub,
+        *forces.solution.hub,
         jnp.where(dynamics.contact_state.locked, 0.0, motion.dL),
-        current_forces.solution.lengths,
+        forces.solution.length_motion,
     )
     return prevent_fusion(
-        pack_state(rates, accumulator_rates(dynamics, motion, current_forces)), opaque_one(motion)
+        pack_state(rates, accumulator_rates(dynamics, motion, forces)), opaque_one(motion)
     )
 
 
@@ -191,7 +203,7 @@ class GuardLayout(NamedTuple):
     rolling_rate: int  # dtheta
     collapse: int  # shortest leg minus a
     airborne_release: int  # stopper force of airborne legs, one per leg, if one-sided
-    total: int
+    n_guards: int
 
     @property
     def n_legs(self) -> int:
@@ -223,7 +235,7 @@ class ContactQuantities(NamedTuple):
     airborne_stopper: LegArray | None  # stopper force of legs in the air, if stoppers are one-sided
 
 
-def contact_quantities(dynamics: ModeDynamics, forces: ContactForces) -> ContactQuantities:
+def collect_contact_quantities(dynamics: ModeDynamics, forces: ContactForces) -> ContactQuantities:
     """Return the quantities of the forces that `evaluate_guards` needs."""
     solution = forces.solution
     airborne_stopper = airborne_stopper_force(dynamics, forces) if dynamics.is_one_sided else None
@@ -243,7 +255,10 @@ def stack_friction(friction: Friction) -> Array:
 
 
 def evaluate_guards(
-    dynamics: ModeDynamics, motion: WheelMotion, quantities: ContactQuantities, has_begun: Array
+    dynamics: ModeDynamics,
+    motion: WheelMotion,
+    quantities: ContactQuantities,
+    is_after_start: Array,
 ) -> list[Array]:
     """Return the guards in the order of `GuardLayout`.
 
@@ -254,54 +269,62 @@ def evaluate_guards(
     """
     s, contact_state = dynamics.s, dynamics.contact_state
     ones = jnp.ones_like(motion.L)
-    is_airborne = (contact_state.contact == ContactMode.OFF) & (
-        has_begun | ~contact_state.has_just_lifted
+    is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
+        is_after_start | ~contact_state.has_just_lifted
     )
-    is_free_leg = ~contact_state.locked & (has_begun | ~contact_state.has_just_unlocked)
+    is_free_leg = ~contact_state.locked & (is_after_start | ~contact_state.has_just_unlocked)
     has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
     coefficient = stack_friction(finite_friction(dynamics.friction))
     normal, tangential = jnp.stack(quantities.normal), jnp.stack(quantities.tangential)
     # In the limit of large friction a resting foot begins to slide where its normal force
     # vanishes, see `impacts.resolve_event`; a sliding foot lifts where its friction vanishes.
-    is_limit = stack_friction(dynamics.friction) == jnp.inf
-    direction = jnp.stack(slip_sign(dynamics.contact))
-    pressure = jnp.where(is_limit & (direction != 0.0), -direction * tangential, normal)
-    has_cone = (dynamics.contact == ContactMode.STICK) & jnp.isfinite(
+    uses_friction_limit = stack_friction(dynamics.friction) == jnp.inf
+    slip_signs = jnp.stack(slip_sign(dynamics.slot_modes))
+    supporting_force = jnp.where(
+        uses_friction_limit & (slip_signs != 0.0), -slip_signs * tangential, normal
+    )
+    has_friction_cone = (dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
         stack_friction(dynamics.friction)
     )
-    is_sliding = (direction != 0.0) & (has_begun | ~has_just_slid)
-    if_watched = lambda condition, value: jnp.where(condition, value, 1.0)
+    is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
+    if_evaluated = lambda condition, value: jnp.where(condition, value, 1.0)
     airborne_guards = (
         []
         if quantities.airborne_stopper is None
-        else [jnp.where(dynamics.airborne, quantities.airborne_stopper, ones)]
+        else [jnp.where(dynamics.is_airborne_locked, quantities.airborne_stopper, ones)]
     )
     return [
         jnp.where(is_airborne, foot_heights(motion, quantities.legs, dynamics.tilt), ones),
         jnp.where(is_free_leg, s.L0 - motion.L, ones),
-        if_watched(dynamics.contact != ContactMode.OFF, pressure),
-        if_watched(has_cone, coefficient * normal - tangential),
-        if_watched(has_cone, coefficient * normal + tangential),
-        if_watched(is_sliding, direction * jnp.stack(quantities.slip_speed)),
-        if_watched(dynamics.held, jnp.stack(quantities.stopper)),
+        if_evaluated(dynamics.slot_modes != ContactMode.OFF, supporting_force),
+        if_evaluated(has_friction_cone, coefficient * normal - tangential),
+        if_evaluated(has_friction_cone, coefficient * normal + tangential),
+        if_evaluated(is_sliding, slip_signs * jnp.stack(quantities.slip_speed)),
+        if_evaluated(dynamics.is_held, jnp.stack(quantities.stopper)),
         motion.dtheta[None],
         (jnp.min(motion.L, axis=0) - s.a)[None],
         *airborne_guards,
     ]
 
 
-def guard_scales(dynamics: ModeDynamics) -> Array:
+def compute_guard_scales(dynamics: ModeDynamics) -> Array:
     """Return the scale of each guard, in the order of `GuardLayout`: m, N, m/s, rad/s."""
     s = dynamics.s
-    weight, speed = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
-    scales = [s.L0] * 2 * s.n + [weight] * 6 + [speed] * 2 + [weight] * 2 + [speed / s.L0, s.L0]
-    return jnp.stack(scales + [weight] * s.n * dynamics.is_one_sided)
+    force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
+    guard_scales = (
+        [s.L0] * 2 * s.n
+        + [force_scale] * 6
+        + [speed_scale] * 2
+        + [force_scale] * 2
+        + [speed_scale / s.L0, s.L0]
+    )
+    return jnp.stack(guard_scales + [force_scale] * s.n * dynamics.is_one_sided)
 
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's own units of (hub x, z, theta, lengths) and of their rates."""
-    units, one = compute_own_units(s), jnp.ones_like(s.L0)
-    position_units = [units.length, units.length, one, *[units.length] * s.n]
+    units, dimensionless = compute_own_units(s), jnp.ones_like(s.L0)
+    position_units = [units.length, units.length, dimensionless, *[units.length] * s.n]
     rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
     return jnp.stack(position_units), jnp.stack(rate_units)
 
@@ -326,27 +349,33 @@ def choose_stopping_guard(
     Rounding decides which of the two vanishes first. The friction of the stopped foot then decides
     whether the wheel rests or falls back.
     """
-    slip_signs = slip_sign(dynamics.contact)
+    slip_signs = slip_sign(dynamics.slot_modes)
     has_just_slid = dynamics.slots.gather_flags(dynamics.contact_state.has_just_slid)
     is_stopping = guard == layout.rolling_rate
     is_stopping &= is_still(rates, compute_state_units(dynamics.s)[1], atol)
-    for slot in reversed(range(2)):
-        slide_ends = is_stopping & (slip_signs[slot] != 0.0) & ~has_just_slid[slot]
-        guard = jnp.where(slide_ends, layout.slip_stop + slot, guard)
+    for slot_index in reversed(range(2)):
+        slide_ends = is_stopping & (slip_signs[slot_index] != 0.0) & ~has_just_slid[slot_index]
+        guard = jnp.where(slide_ends, layout.slip_stop + slot_index, guard)
     return guard
 
 
 def compute_packed_units(s: Symbols) -> PackedState:
     """Return the wheel's own units of the numbers of `pack_state`."""
-    units, (positions, rates) = compute_own_units(s), compute_state_units(s)
-    accumulators = Accumulators(units.time, units.energy, units.energy, units.length)
-    state = positions[:3], rates[:3], positions[3:], rates[3:], jnp.stack(accumulators)
-    return lax.stop_gradient(jnp.concatenate(state))
+    units, (position_units, rate_units) = compute_own_units(s), compute_state_units(s)
+    accumulator_units = Accumulators(units.time, units.energy, units.energy, units.length)
+    packed_units = (
+        position_units[:3],
+        rate_units[:3],
+        position_units[3:],
+        rate_units[3:],
+        jnp.stack(accumulator_units),
+    )
+    return lax.stop_gradient(jnp.concatenate(packed_units))
 
 
-def guard_values(dynamics: ModeDynamics, state: PackedState) -> Float[Array, " n_guards"]:
+def compute_guard_values(dynamics: ModeDynamics, state: PackedState) -> Float[Array, " n_guards"]:
     """Return all guards: positive inside the contact state, zero at its end, 1 if not evaluated."""
     motion, accumulators = unpack_state(state)
-    quantities = contact_quantities(dynamics, compute_forces(dynamics, motion))
-    guard_parts = evaluate_guards(dynamics, motion, quantities, accumulators.clock > 0.0)
+    quantities = collect_contact_quantities(dynamics, compute_forces(dynamics, motion))
+    guard_parts = evaluate_guards(dynamics, motion, quantities, accumulators.time_since_event > 0.0)
     return jnp.concatenate(prevent_fusion(guard_parts, opaque_one(motion)))

@@ -41,14 +41,14 @@ class ContactConfiguration(NamedTuple):
     motion: WheelMotion
     friction: Friction  # of the slots' feet
     slots: Slots
-    contact: Array  # of the slots
-    held: Array  # the slots' legs on their stoppers
-    airborne: Array  # other legs on their stoppers
+    slot_modes: Array  # of the slots
+    is_held: Array  # the slots' legs on their stoppers
+    is_airborne_locked: Array  # other legs on their stoppers
 
     @property
     def has_fixed_length(self) -> Array:
         """Whether the length of a leg is fixed."""
-        return self.airborne | (self.slots.scatter(self.held) > 0)
+        return self.is_airborne_locked | (self.slots.scatter(self.is_held) > 0)
 
 
 class ForceSolution(NamedTuple):
@@ -61,15 +61,15 @@ class ForceSolution(NamedTuple):
     pull: SlotPair
     hub: HubVector
     painleve_determinant: Array
-    lengths: LegArray  # accelerations of the legs' lengths, or rates after an impact
+    length_motion: LegArray  # accelerations of the legs' lengths, or rates after an impact
 
 
-def slip_sign(contact: Array) -> SlotPair:
+def slip_sign(slot_modes: Array) -> SlotPair:
     """Return 1 for a slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
     sign = lambda mode: jnp.where(
         mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
     )
-    return sign(contact[0]), sign(contact[1])
+    return sign(slot_modes[0]), sign(slot_modes[1])
 
 
 class _FrozenTerms(NamedTuple):
@@ -82,62 +82,77 @@ class _FrozenTerms(NamedTuple):
     hub: SlotPair  # beyond gravity's
 
 
-class _RowTangents(NamedTuple):
+class _EquationTangents(NamedTuple):
     """Tangents of the equations' rows with the frozen terms fixed."""
 
     radial: LegArray
     transverse: LegArray
     hub: SlotPair
-    springs: LegArray | float  # N
-    foot_e: SlotPair
-    foot_u: SlotPair
+    spring_force: LegArray | float  # N
+    foot_transverse: SlotPair
+    foot_radial: SlotPair
 
 
-_RowTangentFn = Callable[
+_EquationTangentFn = Callable[
     [ContactConfiguration, ContactConfiguration, ContactInverseInertia, ForceSolution],
-    tuple[_FrozenTerms, _RowTangents],
+    tuple[_FrozenTerms, _EquationTangents],
 ]
 
 
 @eqx.filter_jit  # traced once for all call sites
-def solve_motion(configuration: ContactConfiguration) -> ForceSolution:
+def solve_contact_forces(configuration: ContactConfiguration) -> ForceSolution:
     """Return the forces, and the resulting accelerations."""
-    return _differentiable_solution(free_acceleration, motion_row_tangents, configuration)
+    return _differentiable_solution(free_acceleration, motion_equation_tangents, configuration)
 
 
 @eqx.filter_jit
 def solve_impact(configuration: ContactConfiguration) -> ForceSolution:
     """Return the impulses, and the velocities after them."""
-    return _differentiable_solution(free_velocity, _impact_row_tangents, configuration)
+    return _differentiable_solution(free_velocity, _impact_equation_tangents, configuration)
 
 
 def solve_configuration(
-    configuration: ContactConfiguration, inertia: ContactInverseInertia, free: FreeMotion
+    configuration: ContactConfiguration, inertia: ContactInverseInertia, free_motion: FreeMotion
 ) -> ForceSolution:
     """Return the forces of a configuration for this free motion."""
-    s, _, friction, slots, contact, held, _ = configuration
-    solution = solve_combination(s, inertia, free, contact, held, friction)
-    outward = free.legs + inertia.legs.sin * solution.hub[0] + inertia.legs.cos * solution.hub[1]
-    lengths = jnp.where(
-        configuration.has_fixed_length, 0.0, outward - slots.scatter(solution.pull) / s.m
+    s, _, friction, slots, slot_modes, is_held, _ = configuration
+    solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
+    outward_motion = (
+        free_motion.leg_motion
+        + inertia.legs.sin * solution.hub[0]
+        + inertia.legs.cos * solution.hub[1]
+    )
+    length_motion = jnp.where(
+        configuration.has_fixed_length, 0.0, outward_motion - slots.scatter(solution.pull) / s.m
     )
     forces = solution.tangential, solution.normal, solution.stopper, solution.pull
-    return ForceSolution(*forces, solution.hub, solution.painleve_determinant, lengths)
+    return ForceSolution(*forces, solution.hub, solution.painleve_determinant, length_motion)
 
 
 def _solve_with_free_motion(
     free_motion_fn: Callable[..., FreeMotion], configuration: ContactConfiguration
 ) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
     """Return inertia, free motion and forces of a configuration."""
-    s, motion, unit = configuration.s, configuration.motion, opaque_one(configuration.motion)
-    inertia = prevent_fusion(
-        make_inverse_inertia(s, motion, configuration.slots, configuration.airborne), unit
+    s, motion, unit_divisor = (
+        configuration.s,
+        configuration.motion,
+        opaque_one(configuration.motion),
     )
-    free = prevent_fusion(free_motion_fn(s, motion, configuration.slots, inertia), unit)
-    return inertia, free, prevent_fusion(solve_configuration(configuration, inertia, free), unit)
+    inertia = prevent_fusion(
+        make_inverse_inertia(s, motion, configuration.slots, configuration.is_airborne_locked),
+        unit_divisor,
+    )
+    free_motion = prevent_fusion(
+        free_motion_fn(s, motion, configuration.slots, inertia), unit_divisor
+    )
+    return (
+        inertia,
+        free_motion,
+        prevent_fusion(solve_configuration(configuration, inertia, free_motion), unit_divisor),
+    )
 
 
-def solve_motion_with_free(
+def solve_forces_with_free_motion(
     configuration: ContactConfiguration,
 ) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
     """Return the inertia, the motion free of contact forces, and the forces."""
@@ -146,53 +161,57 @@ def solve_motion_with_free(
 
 def _differentiable_solution(
     free_motion_fn: Callable[..., FreeMotion],
-    row_tangent_fn: _RowTangentFn,
+    equation_tangent_fn: _EquationTangentFn,
     configuration: ContactConfiguration,
 ) -> ForceSolution:
     """Return the forces, with a derivative rule by the tangent of the residual."""
-    floats, rest = eqx.partition(configuration, eqx.is_inexact_array)
-    arrays, rest = eqx.partition(rest, eqx.is_array)
-    assemble = lambda floats, arrays: eqx.combine(floats, arrays, rest)
+    float_leaves, static_leaves = eqx.partition(configuration, eqx.is_inexact_array)
+    other_arrays, static_leaves = eqx.partition(static_leaves, eqx.is_array)
+    assemble = lambda float_leaves, other_arrays: eqx.combine(
+        float_leaves, other_arrays, static_leaves
+    )
     solve = jax.custom_jvp(
-        lambda *arguments: _solve_with_free_motion(free_motion_fn, assemble(*arguments))[2]
+        lambda *arrays: _solve_with_free_motion(free_motion_fn, assemble(*arrays))[2]
     )
 
     @solve.defjvp
     @with_default_settings
-    def rule(primals: tuple, tangents: tuple) -> tuple[ForceSolution, ForceSolution]:
+    def solution_jvp(primals: tuple, tangents: tuple) -> tuple[ForceSolution, ForceSolution]:
         configuration, tangent = assemble(*primals), assemble(tangents[0], primals[1])
-        inertia, free, solution = _solve_with_free_motion(free_motion_fn, configuration)
+        inertia, free_motion, solution = _solve_with_free_motion(free_motion_fn, configuration)
         residual = residual_jvp(
             configuration,
             tangent,
             inertia,
             solution,
-            *row_tangent_fn(configuration, tangent, inertia, solution),
+            *equation_tangent_fn(configuration, tangent, inertia, solution),
         )
         free_tangent = free_motion_tangent(
-            inertia, residual.legs, sum_residual(configuration.slots, residual)
+            inertia, residual.leg_lengths, sum_residual(configuration.slots, residual)
         )
         _, solution_tangent = jax.jvp(
-            lambda free: solve_configuration(configuration, inertia, free), (free,), (free_tangent,)
+            lambda free_motion: solve_configuration(configuration, inertia, free_motion),
+            (free_motion,),
+            (free_tangent,),
         )
         add_pairs = lambda first, second: (first[0] + second[0], first[1] + second[1])
         return solution, solution_tangent._replace(
-            tangential=add_pairs(solution_tangent.tangential, residual.friction_tangent),
+            tangential=add_pairs(solution_tangent.tangential, residual.friction_force),
             pull=add_pairs(solution_tangent.pull, residual.pull),
         )
 
-    return solve(floats, arrays)
+    return solve(float_leaves, other_arrays)
 
 
 class ResidualTangent(NamedTuple):
     """Tangent of the residual, in the form of its effect on the unknowns."""
 
-    legs: LegArray  # their lengths
-    hub: tuple[LegArray, LegArray, LegArray]  # each leg's part of the forces there
-    hub_extra: HubVector  # the forces there without the legs' part
-    foot_e: SlotPair
-    foot_u: SlotPair
-    friction_tangent: SlotPair  # tangent of friction by its coefficient
+    leg_lengths: LegArray  # their lengths
+    hub_by_leg: tuple[LegArray, LegArray, LegArray]  # each leg's part of the forces there
+    hub_without_legs: HubVector  # the forces there without the legs' part
+    foot_transverse: SlotPair
+    foot_radial: SlotPair
+    friction_force: SlotPair  # tangent of friction by its coefficient
     pull: SlotPair  # tangent of the slots' pulls by that, and by their legs' rotation
 
 
@@ -202,10 +221,10 @@ def residual_jvp(
     inertia: ContactInverseInertia,
     solution: ForceSolution,
     frozen: _FrozenTerms,
-    row_tangents: _RowTangents,
+    equation_tangents: _EquationTangents,
 ) -> ResidualTangent:
     """Return the tangent of the residual along a tangent of the configuration."""
-    s, ds, slots, (sin, cos), slot_range = (
+    s, ds, slots, (sin, cos), slot_indices = (
         configuration.s,
         tangent.s,
         configuration.slots,
@@ -213,7 +232,7 @@ def residual_jvp(
         range(2),
     )
     b, db, dtheta = configuration.motion.L - s.a, tangent.motion.L - ds.a, tangent.motion.theta
-    slip_signs = slip_sign(configuration.contact)
+    slip_signs = slip_sign(configuration.slot_modes)
     coefficient_tangent = jax.jvp(finite_friction, (configuration.friction,), (tangent.friction,))[
         1
     ]
@@ -223,41 +242,54 @@ def residual_jvp(
         else (coefficient_tangent, coefficient_tangent)
     )
     t, n, L, dL = solution.tangential, solution.normal, inertia.L, slots.gather(tangent.motion.L)
-    friction_tangent = [-slip_signs[i] * coefficient_tangent[i] * n[i] for i in slot_range]
-    transverse = [t[i] * inertia.cos[i] - n[i] * inertia.sin[i] for i in slot_range]
-    radial = [t[i] * inertia.sin[i] + n[i] * inertia.cos[i] for i in slot_range]
-    pull = [friction_tangent[i] * inertia.sin[i] + transverse[i] * dtheta for i in slot_range]
+    friction_tangent = [-slip_signs[i] * coefficient_tangent[i] * n[i] for i in slot_indices]
+    transverse = [t[i] * inertia.cos[i] - n[i] * inertia.sin[i] for i in slot_indices]
+    radial = [t[i] * inertia.sin[i] + n[i] * inertia.cos[i] for i in slot_indices]
+    pull = [friction_tangent[i] * inertia.sin[i] + transverse[i] * dtheta for i in slot_indices]
     moment = [
         dL[i] * transverse[i] + L[i] * (friction_tangent[i] * inertia.cos[i] - radial[i] * dtheta)
-        for i in slot_range
+        for i in slot_indices
     ]
 
-    (ax, az), (dx, dz) = frozen.hub, row_tangents.hub
-    outward, lever = sin * ax + cos * az, frozen.transverse - cos * ax + sin * az
-    legs = (cos * ax - sin * az) * dtheta - row_tangents.radial + sin * dx + cos * dz
-    legs = (
-        legs + (row_tangents.springs - slots.scatter(pull) + (outward - frozen.radial) * ds.m) / s.m
+    (ax, az), (dx, dz) = frozen.hub, equation_tangents.hub
+    radial_hub_motion, transverse_residual = (
+        sin * ax + cos * az,
+        frozen.transverse - cos * ax + sin * az,
     )
-    legs = jnp.where(inertia.is_released, legs, 0.0)
-    net_legs = legs + row_tangents.radial
+    length_tangent = (cos * ax - sin * az) * dtheta - equation_tangents.radial + sin * dx + cos * dz
+    length_tangent = (
+        length_tangent
+        + (
+            equation_tangents.spring_force
+            - slots.scatter(pull)
+            + (radial_hub_motion - frozen.radial) * ds.m
+        )
+        / s.m
+    )
+    length_tangent = jnp.where(inertia.is_released, length_tangent, 0.0)
+    radial_tangent = length_tangent + equation_tangents.radial
     x = frozen.radial * sin + frozen.transverse * cos
     z = frozen.radial * cos - frozen.transverse * sin
-    torque = db * lever + b * (row_tangents.transverse + outward * dtheta - cos * dx + sin * dz)
+    torque = db * transverse_residual + b * (
+        equation_tangents.transverse + radial_hub_motion * dtheta - cos * dx + sin * dz
+    )
     return ResidualTangent(
-        legs=legs,
-        hub=(
-            s.m * (net_legs * sin + row_tangents.transverse * cos + z * dtheta) + ds.m * x,
-            s.m * (net_legs * cos - row_tangents.transverse * sin - x * dtheta) + ds.m * z,
-            -s.m * torque - ds.m * (b * lever) - slots.scatter(moment),
+        leg_lengths=length_tangent,
+        hub_by_leg=(
+            s.m * (radial_tangent * sin + equation_tangents.transverse * cos + z * dtheta)
+            + ds.m * x,
+            s.m * (radial_tangent * cos - equation_tangents.transverse * sin - x * dtheta)
+            + ds.m * z,
+            -s.m * torque - ds.m * (b * transverse_residual) - slots.scatter(moment),
         ),
-        hub_extra=(
+        hub_without_legs=(
             friction_tangent[0] + friction_tangent[1] - ds.Mt * ax - s.Mt * dx,
             -ds.Mt * az - s.Mt * dz,
             0.0,
         ),
-        foot_e=row_tangents.foot_e,
-        foot_u=row_tangents.foot_u,
-        friction_tangent=(friction_tangent[0], friction_tangent[1]),
+        foot_transverse=equation_tangents.foot_transverse,
+        foot_radial=equation_tangents.foot_radial,
+        friction_force=(friction_tangent[0], friction_tangent[1]),
         pull=(pull[0], pull[1]),
     )
 
@@ -266,35 +298,37 @@ class TotalTangent(NamedTuple):
     """Tangent of the residual, summed over all legs and gathered for the slots."""
 
     hub: HubVector
-    slot_legs: SlotPair
-    foot_e: SlotPair
-    foot_u: SlotPair
-    friction_tangent: SlotPair
+    slot_lengths: SlotPair
+    foot_transverse: SlotPair
+    foot_radial: SlotPair
+    friction_force: SlotPair
 
 
 def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
     """Return the residual tangent summed over the legs."""
     x, z, rotation = (
-        sum_over_legs(legs) + extra
-        for legs, extra in zip(residual.hub, residual.hub_extra, strict=True)
+        sum_over_legs(leg_forces) + other_force
+        for leg_forces, other_force in zip(
+            residual.hub_by_leg, residual.hub_without_legs, strict=True
+        )
     )
     return TotalTangent(
         (x, z, rotation),
-        slots.gather(residual.legs),
-        residual.foot_e,
-        residual.foot_u,
-        residual.friction_tangent,
+        slots.gather(residual.leg_lengths),
+        residual.foot_transverse,
+        residual.foot_radial,
+        residual.friction_force,
     )
 
 
 def free_motion_tangent(
-    inertia: ContactInverseInertia, legs: LegArray, total: TotalTangent
+    inertia: ContactInverseInertia, leg_motion: LegArray, total_tangent: TotalTangent
 ) -> FreeMotion:
     """Return the tangent of the free motion that the residual tangent is equivalent to."""
-    hub_tangent, slot_legs, (u, v) = (
-        apply_inverse(inertia.inverse_inertia, total.hub),
-        total.slot_legs,
-        total.foot_u,
+    hub_tangent, slot_lengths, (u, v) = (
+        apply_inverse(inertia.inverse_inertia, total_tangent.hub),
+        total_tangent.slot_lengths,
+        total_tangent.foot_radial,
     )
     e = [
         inertia.cos[i] * hub_tangent[0]
@@ -302,64 +336,72 @@ def free_motion_tangent(
         - inertia.L[i] * hub_tangent[2]
         for i in range(2)
     ]
-    e = [e[i] + total.foot_e[i] for i in range(2)]
+    e = [e[i] + total_tangent.foot_transverse[i] for i in range(2)]
     return FreeMotion(
-        hub_tangent, legs, slot_legs, (e[0], e[1]), (u - slot_legs[0], v - slot_legs[1])
+        hub_tangent,
+        leg_motion,
+        slot_lengths,
+        (e[0], e[1]),
+        (u - slot_lengths[0], v - slot_lengths[1]),
     )
 
 
-def motion_row_tangents(
+def motion_equation_tangents(
     configuration: ContactConfiguration,
     tangent: ContactConfiguration,
     inertia: ContactInverseInertia,
     solution: ForceSolution,
-) -> tuple[_FrozenTerms, _RowTangents]:
+) -> tuple[_FrozenTerms, _EquationTangents]:
     """Return the frozen terms and the tangents of the rows of the equations of motion."""
     s, motion, slots = configuration.s, configuration.motion, configuration.slots
     ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
     b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
-    spin, double_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
-    spin_tangent = double_rate * motion_tangent.dtheta
-    double_rate_tangent = 2.0 * motion_tangent.dtheta
-    springs = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
-    springs = springs + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
+    squared_rate, twice_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
+    squared_rate_tangent = twice_rate * motion_tangent.dtheta
+    twice_rate_tangent = 2.0 * motion_tangent.dtheta
+    spring_force_tangent = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
+    spring_force_tangent = (
+        spring_force_tangent + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
+    )
     frozen = _FrozenTerms(
-        radial=solution.lengths - b * spin,
-        transverse=double_rate * motion.dL + b * ddtheta,
+        radial=solution.length_motion - b * squared_rate,
+        transverse=twice_rate * motion.dL + b * ddtheta,
         hub=(solution.hub[0] - s.g * s.sin_phi, solution.hub[1] + s.g * s.cos_phi),
     )
     L, dL, slot_rates, slot_rate_tangents = (
         inertia.L,
         *map(slots.gather, (motion_tangent.L, motion.dL, motion_tangent.dL)),
     )
-    slot_accelerations = slots.gather(solution.lengths)
-    foot_e = [
-        (L[i] * spin - slot_accelerations[i]) * dtheta
-        - double_rate * slot_rate_tangents[i]
-        - slot_rates[i] * double_rate_tangent
+    slot_accelerations = slots.gather(solution.length_motion)
+    foot_transverse = [
+        (L[i] * squared_rate - slot_accelerations[i]) * dtheta
+        - twice_rate * slot_rate_tangents[i]
+        - slot_rates[i] * twice_rate_tangent
         - ddtheta * dL[i]
         for i in range(2)
     ]
-    foot_u = [
-        (double_rate * slot_rates[i] + ddtheta * L[i]) * dtheta + spin * dL[i] + L[i] * spin_tangent
+    foot_radial = [
+        (twice_rate * slot_rates[i] + ddtheta * L[i]) * dtheta
+        + squared_rate * dL[i]
+        + L[i] * squared_rate_tangent
         for i in range(2)
     ]
-    return frozen, _RowTangents(
-        radial=-(db * spin + b * spin_tangent),
-        transverse=double_rate * motion_tangent.dL + motion.dL * double_rate_tangent + ddtheta * db,
+    return frozen, _EquationTangents(
+        radial=-(db * squared_rate + b * squared_rate_tangent),
+        transverse=twice_rate * motion_tangent.dL + motion.dL * twice_rate_tangent + ddtheta * db,
         hub=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
-        springs=springs,
-        foot_e=(foot_e[0], foot_e[1]),
-        foot_u=(foot_u[0], foot_u[1]),
+        spring_force=spring_force_tangent,
+        foot_transverse=(foot_transverse[0], foot_transverse[1]),
+        foot_radial=(foot_radial[0], foot_radial[1]),
     )
 
 
-def _impact_row_tangents(
+def _impact_equation_tangents(
     configuration: ContactConfiguration,
     tangent: ContactConfiguration,
     inertia: ContactInverseInertia,
     solution: ForceSolution,
-) -> tuple[_FrozenTerms, _RowTangents]:
+) -> tuple[_FrozenTerms, _EquationTangents]:
     """Return the frozen terms and the tangents of the rows of the impact equations."""
     s = configuration.s
     motion = configuration.motion
@@ -368,19 +410,21 @@ def _impact_row_tangents(
     dtheta_after = solution.hub[2]
     rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
     frozen = _FrozenTerms(
-        radial=solution.lengths - motion.dL,
+        radial=solution.length_motion - motion.dL,
         transverse=b * rate_jump,
         hub=(solution.hub[0] - motion.vx, solution.hub[1] - motion.vz),
     )
-    slot_rates, dL = slots.gather(solution.lengths), slots.gather(motion_tangent.L)
-    foot_e = [-dtheta_after * dL[i] - slot_rates[i] * motion_tangent.theta for i in range(2)]
-    return frozen, _RowTangents(
+    slot_rates, dL = slots.gather(solution.length_motion), slots.gather(motion_tangent.L)
+    foot_transverse = [
+        -dtheta_after * dL[i] - slot_rates[i] * motion_tangent.theta for i in range(2)
+    ]
+    return frozen, _EquationTangents(
         radial=-motion_tangent.dL,
         transverse=(motion_tangent.L - tangent.s.a) * rate_jump - b * motion_tangent.dtheta,
         hub=(-motion_tangent.vx, -motion_tangent.vz),
-        springs=0.0,
-        foot_e=(foot_e[0], foot_e[1]),
-        foot_u=(
+        spring_force=0.0,
+        foot_transverse=(foot_transverse[0], foot_transverse[1]),
+        foot_radial=(
             inertia.L[0] * dtheta_after * motion_tangent.theta,
             inertia.L[1] * dtheta_after * motion_tangent.theta,
         ),

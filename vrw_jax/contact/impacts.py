@@ -30,8 +30,8 @@ from vrw_jax.contact.dynamics_jvp import (
     ContactConfiguration,
     ForceSolution,
     solve_configuration,
+    solve_contact_forces,
     solve_impact,
-    solve_motion,
 )
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
@@ -74,7 +74,7 @@ class Event(NamedTuple):
         return jnp.any(self.lands, axis=0) | jnp.any(self.meets_stopper, axis=0)
 
 
-def _index_column(n: int, reference: Array) -> np.ndarray:
+def _leg_indices(n: int, reference: Array) -> np.ndarray:
     """Return 0 ... n - 1 on the first axis, for arrays of this shape."""
     return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(reference))
 
@@ -82,10 +82,10 @@ def _index_column(n: int, reference: Array) -> np.ndarray:
 def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
     """Return the event of a guard."""
     n = layout.n_legs
-    select_flags = lambda start, count: guard == start + _index_column(count, guard)
+    select_flags = lambda start, count: guard == start + _leg_indices(count, guard)
     leaves_stopper = (
         select_flags(layout.airborne_release, n)
-        if layout.total > layout.airborne_release
+        if layout.n_guards > layout.airborne_release
         else select_flags(layout.landing, n) & False
     )
     return Event(
@@ -132,10 +132,10 @@ PIVOT_OPTIONS = PivotOptions()
 class _LevelSolution(NamedTuple):
     """Solution for an assumed set of held legs in the air."""
 
-    chosen: ChosenCombination
+    chosen_combination: ChosenCombination
     solution: ForceSolution
     stopper_push: LegArray  # of the stoppers, N or N s
-    outward: LegArray  # of the legs, m/s^2 or m/s
+    outward_motion: LegArray  # of the legs, m/s^2 or m/s
     motion: WheelMotion  # of an impact: after it
 
 
@@ -147,10 +147,10 @@ def _solve_stopper_lcp(
     solve: _LevelSolver,
     law: ContactLaw,
     motion: WheelMotion,
-    at_stopper: Array,
+    is_at_stopper: Array,
     is_tested: Array,
     tolerances: SignTolerances,
-    options: PivotOptions = PIVOT_OPTIONS,
+    pivot_options: PivotOptions = PIVOT_OPTIONS,
 ) -> tuple[_LevelSolution, Array]:
     """Return the solution for the legs in the air that are held, and which legs are held.
 
@@ -160,57 +160,78 @@ def _solve_stopper_lcp(
     1974, Kostreva 1978). After that, all combinations are enumerated. The least violating solution
     is taken; it is admissible if its violation is at most `MAX_VIOLATION`.
     """
-    frozen = stop_gradients((law, motion))
-    rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
+    constant_inputs = stop_gradients((law, motion))
+    tested_rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
-        jnp.sum(is_tested, axis=0, dtype=jnp.int32), options.max_enumerated_legs
+        jnp.sum(is_tested, axis=0, dtype=jnp.int32), pivot_options.max_enumerated_legs
     )
-    leg_index = _index_column(len(at_stopper), n_combinations)
+    leg_index = _leg_indices(len(is_at_stopper), n_combinations)
 
     def is_unfinished(state: tuple) -> Array:
-        _, code, n_tries, best = state
-        return (n_tries == 0) | ((best[0] > 1.0) & (code < n_combinations))
+        _, combination_code, n_attempts, best_solution = state
+        return (n_attempts == 0) | ((best_solution[0] > 1.0) & (combination_code < n_combinations))
 
     def pivot(state: tuple) -> tuple:
-        held, code, n_tries, best = state
-        level = solve(frozen[0], frozen[1], held, None)
+        is_held, combination_code, n_attempts, best_solution = state
+        level_solution = solve(constant_inputs[0], constant_inputs[1], is_held, None)
         violation = jnp.where(
-            held, -level.stopper_push / tolerances.force, level.outward / tolerances.motion
+            is_held,
+            -level_solution.stopper_push / tolerances.force_tolerance,
+            level_solution.outward_motion / tolerances.motion_tolerance,
         )
         violation = jnp.where(is_tested, lax.stop_gradient(violation), 0.0)
         is_violated = violation > 1.0
-        max_violation = jnp.maximum(jnp.max(violation, axis=0), level.chosen.violation)
-        best = tree_where(max_violation < best[0], (max_violation, held, level.chosen), best)
-        is_last = leg_index == jnp.max(jnp.where(is_violated, leg_index, -1), axis=0)
-        switched = held ^ jnp.where(n_tries < options.max_block_pivots, is_violated, is_last)
-        is_pivoting = (
-            (code < 0)
-            & jnp.any(is_violated, axis=0)
-            & (n_tries < options.max_block_pivots + options.max_single_pivots)
+        max_violation = jnp.maximum(
+            jnp.max(violation, axis=0), level_solution.chosen_combination.violation
         )
-        code = jnp.where(is_pivoting, code, code + 1)
-        enumerated = jnp.where(is_tested, ((code >> rank) & 1) == 1, at_stopper)
+        best_solution = tree_where(
+            max_violation < best_solution[0],
+            (max_violation, is_held, level_solution.chosen_combination),
+            best_solution,
+        )
+        is_last_violated = leg_index == jnp.max(jnp.where(is_violated, leg_index, -1), axis=0)
+        switched_legs = is_held ^ jnp.where(
+            n_attempts < pivot_options.max_block_pivots, is_violated, is_last_violated
+        )
+        is_pivoting = (
+            (combination_code < 0)
+            & jnp.any(is_violated, axis=0)
+            & (n_attempts < pivot_options.max_block_pivots + pivot_options.max_single_pivots)
+        )
+        combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
+        enumerated_legs = jnp.where(
+            is_tested, ((combination_code >> tested_rank) & 1) == 1, is_at_stopper
+        )
         return tree_where(
             is_unfinished(state),
-            (jnp.where(is_pivoting, switched, enumerated), code, n_tries + 1, best),
+            (
+                jnp.where(is_pivoting, switched_legs, enumerated_legs),
+                combination_code,
+                n_attempts + 1,
+                best_solution,
+            ),
             state,
         )
 
-    zeros = jnp.zeros_like(n_combinations)
+    int_zeros = jnp.zeros_like(n_combinations)
     slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
-    infinite = jnp.full_like(frozen[1].theta, jnp.inf)
-    initial = (
-        at_stopper,
-        zeros - 1,
-        zeros,
-        (infinite, at_stopper, ChosenCombination(slot_zeros, slot_zeros > 0, infinite, zeros)),
+    infinite_violation = jnp.full_like(constant_inputs[1].theta, jnp.inf)
+    initial_state = (
+        is_at_stopper,
+        int_zeros - 1,
+        int_zeros,
+        (
+            infinite_violation,
+            is_at_stopper,
+            ChosenCombination(slot_zeros, slot_zeros > 0, infinite_violation, int_zeros),
+        ),
     )
-    final = lax.while_loop(lambda state: jnp.any(is_unfinished(state)), pivot, initial)
-    max_violation, held, chosen = final[3]
-    chosen = chosen._replace(
-        n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen.n_solutions, 0)
+    final_state = lax.while_loop(lambda state: jnp.any(is_unfinished(state)), pivot, initial_state)
+    max_violation, is_held, chosen_combination = final_state[3]
+    chosen_combination = chosen_combination._replace(
+        n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
     )
-    return solve(law, motion, held, chosen), held
+    return solve(law, motion, is_held, chosen_combination), is_held
 
 
 class EventResult(NamedTuple):
@@ -231,7 +252,7 @@ class EventResult(NamedTuple):
 def _motion_after_impact(motion: WheelMotion, solution: ForceSolution) -> WheelMotion:
     """Return the motion with the velocities of an impact's solution."""
     vx, vz, dtheta = solution.hub
-    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=solution.lengths)
+    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=solution.length_motion)
 
 
 def _apply_restitution(
@@ -244,23 +265,26 @@ def _apply_restitution(
     """Return the free velocities with the rebound of striking feet by Newton's law."""
     if law.restitution is None:
         return free
-    rebound = [law.restitution * z for z in foot_velocity(motion, slots, inertia).z]
+    rebound_speeds = [law.restitution * z for z in foot_velocity(motion, slots, inertia).z]
     # A rebound slower than the rest speed is at rest.
-    rebound = [jnp.where(z < -law.rest_speed, z, 0.0) for z in rebound]
+    rebound_speeds = [jnp.where(z < -law.rest_speed, z, 0.0) for z in rebound_speeds]
     return free._replace(
-        foot_e=(
-            free.foot_e[0] - inertia.sin[0] * rebound[0],
-            free.foot_e[1] - inertia.sin[1] * rebound[1],
+        foot_transverse=(
+            free.foot_transverse[0] - inertia.sin[0] * rebound_speeds[0],
+            free.foot_transverse[1] - inertia.sin[1] * rebound_speeds[1],
         ),
-        foot_u=(
-            free.foot_u[0] + inertia.cos[0] * rebound[0],
-            free.foot_u[1] + inertia.cos[1] * rebound[1],
+        foot_radial=(
+            free.foot_radial[0] + inertia.cos[0] * rebound_speeds[0],
+            free.foot_radial[1] + inertia.cos[1] * rebound_speeds[1],
         ),
     )
 
 
 def _limit_energy_gain(
-    law: ContactLaw, motion: WheelMotion, restituted: _LevelSolution, inelastic: _LevelSolution
+    law: ContactLaw,
+    motion: WheelMotion,
+    newton_solution: _LevelSolution,
+    inelastic_solution: _LevelSolution,
 ) -> _LevelSolution:
     """Return the part of Newton's rebound that energy allows.
 
@@ -268,24 +292,34 @@ def _limit_energy_gain(
     inelastic impact, which cannot create any, and Newton's. The result is the largest part without
     a gain. Impulses stay in the cone, because it is convex.
     """
-    kinetic = lambda state: kinetic_energy(law.s, state)
-    energy_inelastic, energy_restituted = kinetic(inelastic.motion), kinetic(restituted.motion)
-    energy_midpoint = kinetic(
-        jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic.motion, restituted.motion)
+    compute_energy = lambda state: kinetic_energy(law.s, state)
+    energy_inelastic, energy_newton = (
+        compute_energy(inelastic_solution.motion),
+        compute_energy(newton_solution.motion),
     )
-    curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_restituted)
-    linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_restituted
-    allowed_gain = jnp.maximum(kinetic(motion) - energy_inelastic, 0.0)
-    has_gain = energy_restituted > kinetic(motion)
-    root = jnp.sqrt(
-        jnp.where(has_gain, linear_term * linear_term + 4.0 * curvature * allowed_gain, 1.0)
+    energy_midpoint = compute_energy(
+        jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic_solution.motion, newton_solution.motion)
     )
-    fraction = jnp.where(
-        has_gain, 2.0 * allowed_gain / jnp.where(has_gain, linear_term + root, 1.0), 1.0
+    parabola_curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_newton)
+    parabola_linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_newton
+    allowed_gain = jnp.maximum(compute_energy(motion) - energy_inelastic, 0.0)
+    has_gain = energy_newton > compute_energy(motion)
+    sqrt_discriminant = jnp.sqrt(
+        jnp.where(
+            has_gain,
+            parabola_linear_term * parabola_linear_term + 4.0 * parabola_curvature * allowed_gain,
+            1.0,
+        )
     )
-    interpolate = lambda a, b: jnp.where(has_gain, a + fraction * (b - a), b)
+    rebound_fraction = jnp.where(
+        has_gain,
+        2.0 * allowed_gain / jnp.where(has_gain, parabola_linear_term + sqrt_discriminant, 1.0),
+        1.0,
+    )
+    interpolate = lambda a, b: jnp.where(has_gain, a + rebound_fraction * (b - a), b)
     return _LevelSolution(
-        restituted.chosen, *jax.tree.map(interpolate, inelastic[1:], restituted[1:])
+        newton_solution.chosen_combination,
+        *jax.tree.map(interpolate, inelastic_solution[1:], newton_solution[1:]),
     )
 
 
@@ -298,12 +332,12 @@ def _solve_velocity_level(
     It also returns the held legs in the air: with one-sided stoppers, those that need not pull. The
     paper's rule keeps resting feet planted when a leg meets its stopper.
     """
-    s, slots = law.s, find_slots((contact_state.contact != ContactMode.OFF) | event.lands)
+    s, slots = law.s, find_slots((contact_state.contact_modes != ContactMode.OFF) | event.lands)
     friction = slot_friction(law.friction, slots)
-    at_stopper = contact_state.locked | event.meets_stopper
-    is_loaded = jnp.stack([jnp.any(slots.first, axis=0), jnp.any(slots.second, axis=0)])
-    slot_locked = slots.gather_flags(at_stopper)
-    slot_modes = slots.gather_codes(contact_state.contact)
+    is_at_stopper = contact_state.locked | event.meets_stopper
+    is_loaded = jnp.stack([jnp.any(slots.first_mask, axis=0), jnp.any(slots.second_mask, axis=0)])
+    slot_locked = slots.gather_flags(is_at_stopper)
+    slot_modes = slots.gather_codes(contact_state.contact_modes)
     is_landing = jnp.any(event.lands, axis=0)
     is_planted = (
         (slot_modes == ContactMode.STICK)
@@ -313,77 +347,98 @@ def _solve_velocity_level(
     modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(jnp.int32)
     modes = jnp.where(is_planted, 1 << slot_modes, modes)
     allowed = AllowedModes(
-        contact=jnp.where(event.is_impact, modes, 0),  # without an impact, no mode is examined
-        may_hold=slot_locked,
-        keeps_mode=is_planted,
+        allowed_modes=jnp.where(
+            event.is_impact, modes, 0
+        ),  # without an impact, no mode is examined
+        can_hold_stopper=slot_locked,
+        has_fixed_mode=is_planted,
         untested_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
-        untested_open=~slot_locked,
+        is_open_untested=~slot_locked,
     )
     tolerances = SignTolerances(
         s.m * law.rest_speed / MAX_VIOLATION, law.rest_speed / MAX_VIOLATION
     )
 
     def solve(
-        law: ContactLaw, motion: WheelMotion, airborne: Array, chosen: ChosenCombination | None
+        law: ContactLaw,
+        motion: WheelMotion,
+        is_airborne_locked: Array,
+        chosen_combination: ChosenCombination | None,
     ) -> _LevelSolution:
         s, friction = law.s, slot_friction(law.friction, slots)
-        legs = leg_directions(s, motion.theta)
-        inertia = make_inverse_inertia(s, motion, slots, airborne)
-        free = free_velocity(s, motion, slots, inertia)
-        restituted_free = _apply_restitution(law, motion, slots, inertia, free)
-        if chosen is None:
-            chosen = choose_combination(
-                s, inertia, restituted_free, allowed, friction, tolerances, law.counts_solutions
+        directions = leg_directions(s, motion.theta)
+        inertia = make_inverse_inertia(s, motion, slots, is_airborne_locked)
+        free_motion = free_velocity(s, motion, slots, inertia)
+        rebound_motion = _apply_restitution(law, motion, slots, inertia, free_motion)
+        if chosen_combination is None:
+            chosen_combination = choose_combination(
+                s, inertia, rebound_motion, allowed, friction, tolerances, law.counts_solutions
             )
         configuration = ContactConfiguration(
-            s, motion, friction, slots, chosen.contact, chosen.held, airborne
+            s,
+            motion,
+            friction,
+            slots,
+            chosen_combination.slot_modes,
+            chosen_combination.is_held,
+            is_airborne_locked,
         )
         solution = (
             solve_impact(configuration)
             if law.restitution is None
-            else solve_configuration(configuration, inertia, restituted_free)
+            else solve_configuration(configuration, inertia, rebound_motion)
         )
         motion_after = _motion_after_impact(motion, solution)
         jump_x, jump_z = motion_after.vx - motion.vx, motion_after.vz - motion.vz
-        impulse = s.m * (legs.sin * jump_x + legs.cos * jump_z + motion.dL)
-        return _LevelSolution(chosen, solution, impulse, motion_after.dL, motion_after)
+        impulse = s.m * (directions.sin * jump_x + directions.cos * jump_z + motion.dL)
+        return _LevelSolution(chosen_combination, solution, impulse, motion_after.dL, motion_after)
 
-    airborne = at_stopper & ~slots.is_filled
+    is_airborne_locked = is_at_stopper & ~slots.is_filled
     if not law.is_one_sided:
-        return solve(law, motion, airborne, None), slots, airborne
-    is_tested = airborne & event.is_impact
-    level, held = _solve_stopper_lcp(solve, law, motion, airborne, is_tested, tolerances)
+        return solve(law, motion, is_airborne_locked, None), slots, is_airborne_locked
+    is_tested = is_airborne_locked & event.is_impact
+    level, held = _solve_stopper_lcp(solve, law, motion, is_airborne_locked, is_tested, tolerances)
     return level, slots, held
 
 
 def _following_modes(
-    event: Event, mode: Array, is_consistent: Array, follows_paper_rule: Array
+    event: Event, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
     """Return the modes that may follow an event in each slot, and those that need no test, as bits.
 
     - `is_consistent`: the next mode of a slot's foot has the direction of release (see
       `is_release_consistent`).
     """
-    own_bit, off_bit = 1 << mode, 1 << ContactMode.OFF
-    modes = jnp.where(mode == ContactMode.STICK, ALL_MODES_MASK, own_bit | off_bit)
-    reversed_bit = jnp.where(
-        mode == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
+    current_bit, off_bit = 1 << slot_modes, 1 << ContactMode.OFF
+    possible_modes = jnp.where(
+        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_bit | off_bit
     )
-    modes = jnp.where(event.stops_sliding, 1 << ContactMode.STICK | off_bit | reversed_bit, modes)
-    untested = jnp.where((mode == ContactMode.STICK) | event.stops_sliding, 0, own_bit)
-    for flags, following, ended_bit in (
-        (event.lifts_off, off_bit, own_bit),
+    reversed_bit = jnp.where(
+        slot_modes == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
+    )
+    possible_modes = jnp.where(
+        event.stops_sliding, 1 << ContactMode.STICK | off_bit | reversed_bit, possible_modes
+    )
+    untested_modes = jnp.where(
+        (slot_modes == ContactMode.STICK) | event.stops_sliding, 0, current_bit
+    )
+    for event_flags, following_mode, ended_mode in (
+        (event.lifts_off, off_bit, current_bit),
         (event.slides_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
         (event.slides_down, 1 << ContactMode.SLIP_DOWN, 1 << ContactMode.STICK),
     ):
         tested_bits = (
             ALL_MODES_MASK
-            & ~ended_bit
-            & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following)
+            & ~ended_mode
+            & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following_mode)
         )
-        modes = jnp.where(flags, jnp.where(is_consistent, following, tested_bits), modes)
-        untested = jnp.where(flags, jnp.where(is_consistent, following, 0), untested)
-    return modes, untested
+        possible_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, tested_bits), possible_modes
+        )
+        untested_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, 0), untested_modes
+        )
+    return possible_modes, untested_modes
 
 
 FORCE_ROUNDOFF_FRACTION = 1e-9
@@ -394,8 +449,8 @@ accurate to rounding."""
 def _solve_acceleration_level(
     law: ContactLaw,
     motion: WheelMotion,
-    contact: Int[Array, "n ..."],
-    at_stopper: Array,
+    contact_modes: Int[Array, "n ..."],
+    is_at_stopper: Array,
     event: Event,
 ) -> tuple[ChosenCombination, Slots, Array, Bool[Array, "n ..."]]:
     """Return the acceleration-level solution: the contacts that carry the following motion.
@@ -406,12 +461,12 @@ def _solve_acceleration_level(
     derivatives.
     """
     law, motion = stop_gradients((law, motion))
-    s, slots = law.s, find_slots(contact != ContactMode.OFF)
+    s, slots = law.s, find_slots(contact_modes != ContactMode.OFF)
     friction = slot_friction(law.friction, slots)
-    mode, slot_locked = slots.gather_codes(contact), slots.gather_flags(at_stopper)
-    was_resting = (mode == ContactMode.STICK) | event.stops_sliding
+    slot_modes, slot_locked = slots.gather_codes(contact_modes), slots.gather_flags(is_at_stopper)
+    was_resting = (slot_modes == ContactMode.STICK) | event.stops_sliding
     # At the release of such a foot, its tangential force jumps to zero.
-    follows_paper_rule = (mode == ContactMode.STICK) & (
+    follows_paper_rule = (slot_modes == ContactMode.STICK) & (
         stack_friction(friction) == PAPER_RULE_SENTINEL
     )
     slides_up, slides_down = event.slides_up, event.slides_down
@@ -422,42 +477,58 @@ def _solve_acceleration_level(
     tolerances = SignTolerances(FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g)
 
     def solve(
-        law: ContactLaw, motion: WheelMotion, airborne: Array, chosen: ChosenCombination | None
+        law: ContactLaw,
+        motion: WheelMotion,
+        is_airborne_locked: Array,
+        chosen_combination: ChosenCombination | None,
     ) -> _LevelSolution:
-        inertia = make_inverse_inertia(s, motion, slots, airborne)
-        free = free_acceleration(s, motion, slots, inertia)
-        if chosen is None:
+        inertia = make_inverse_inertia(s, motion, slots, is_airborne_locked)
+        free_motion = free_acceleration(s, motion, slots, inertia)
+        if chosen_combination is None:
             is_consistent = is_release_consistent(
-                s, inertia, free, (mode, slot_locked), friction, is_second, direction
+                s, inertia, free_motion, (slot_modes, slot_locked), friction, is_second, direction
             )
             modes, untested = _following_modes(
-                event, mode, is_consistent & ~follows_paper_rule, follows_paper_rule
+                event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
             )
             allowed = AllowedModes(modes, ~may_open, was_resting & False, untested, may_open)
-            chosen = choose_combination(
-                s, inertia, free, allowed, friction, tolerances, law.counts_solutions
+            chosen_combination = choose_combination(
+                s, inertia, free_motion, allowed, friction, tolerances, law.counts_solutions
             )
         configuration = ContactConfiguration(
-            s, motion, friction, slots, chosen.contact, chosen.held, airborne
+            s,
+            motion,
+            friction,
+            slots,
+            chosen_combination.slot_modes,
+            chosen_combination.is_held,
+            is_airborne_locked,
         )
-        solution = solve_configuration(configuration, inertia, free)
+        solution = solve_configuration(configuration, inertia, free_motion)
         ax, az, _ = solution.hub
-        outward = free.legs + inertia.legs.sin * ax + inertia.legs.cos * az
-        return _LevelSolution(chosen, solution, s.m * outward, outward, motion)
+        outward = free_motion.leg_motion + inertia.legs.sin * ax + inertia.legs.cos * az
+        return _LevelSolution(chosen_combination, solution, s.m * outward, outward, motion)
 
-    airborne = at_stopper & ~slots.is_filled
+    is_airborne_locked = is_at_stopper & ~slots.is_filled
     if not law.is_one_sided:
-        return solve(law, motion, airborne, None).chosen, slots, was_resting, airborne
-    level, held = _solve_stopper_lcp(solve, law, motion, airborne, airborne, tolerances)
-    return level.chosen, slots, was_resting, held
+        return (
+            solve(law, motion, is_airborne_locked, None).chosen_combination,
+            slots,
+            was_resting,
+            is_airborne_locked,
+        )
+    level, held = _solve_stopper_lcp(
+        solve, law, motion, is_airborne_locked, is_airborne_locked, tolerances
+    )
+    return level.chosen_combination, slots, was_resting, held
 
 
 def _bring_to_rest(
     law: ContactLaw,
     motion: WheelMotion,
     slots: Slots,
-    contact: Array,
-    at_stopper: Array,
+    contact_modes: Array,
+    is_at_stopper: Array,
     was_locked: Array,
 ) -> tuple[WheelMotion, Array, Array]:
     """Return the motion after an impact, the modes of the touching feet, and the legs on their
@@ -469,38 +540,38 @@ def _bring_to_rest(
 
     - `was_locked`: legs that were at their stoppers.
     """
-    legs = leg_directions(law.s, motion.theta)
-    tangential_speed, normal_speed = foot_speeds(motion, legs)
+    directions = leg_directions(law.s, motion.theta)
+    tangential_speed, normal_speed = foot_speeds(motion, directions)
     stays_loaded = slots.is_filled & (normal_speed < law.rest_speed)
     slip_mode = jnp.where(tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
-    mode = jnp.where(jnp.abs(tangential_speed) < law.rest_speed, ContactMode.STICK, slip_mode)
-    mode = jnp.where(
+    rest_modes = jnp.where(jnp.abs(tangential_speed) < law.rest_speed, ContactMode.STICK, slip_mode)
+    rest_modes = jnp.where(
         stays_loaded,
-        jnp.where(contact == ContactMode.STICK, ContactMode.STICK, mode),
+        jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, rest_modes),
         ContactMode.OFF,
     )
-    is_locked = at_stopper | (was_locked & (jnp.abs(motion.dL) < law.rest_speed))
-    has_changed = jnp.any((mode != contact) | (is_locked != at_stopper), axis=0)
+    is_locked = is_at_stopper | (was_locked & (jnp.abs(motion.dL) < law.rest_speed))
+    has_changed = jnp.any((rest_modes != contact_modes) | (is_locked != is_at_stopper), axis=0)
     s, frozen_motion, friction = stop_gradients((law.s, motion, law.friction))
 
     def find_reversed_slip(_: Array) -> Array:
         """Return the feet whose slip would be reversed by this: they come to rest as well."""
         speed_after, _ = foot_speeds(
-            project_motion(s, frozen_motion, mode, is_locked, friction), legs
+            project_motion(s, frozen_motion, rest_modes, is_locked, friction), directions
         )
-        return ((mode == ContactMode.SLIP_DOWN) & (speed_after < 0.0)) | (
-            (mode == ContactMode.SLIP_UP) & (speed_after > 0.0)
+        return ((rest_modes == ContactMode.SLIP_DOWN) & (speed_after < 0.0)) | (
+            (rest_modes == ContactMode.SLIP_UP) & (speed_after > 0.0)
         )
 
-    is_reversed = has_changed & run_if_any(
+    is_slip_reversed = has_changed & run_if_any(
         jnp.any(has_changed), find_reversed_slip, is_locked & False
     )
-    mode = jnp.where(is_reversed, ContactMode.STICK, mode)
+    rest_modes = jnp.where(is_slip_reversed, ContactMode.STICK, rest_modes)
     return (
         tree_where(
-            has_changed, project_motion(law.s, motion, mode, is_locked, law.friction), motion
+            has_changed, project_motion(law.s, motion, rest_modes, is_locked, law.friction), motion
         ),
-        mode,
+        rest_modes,
         is_locked,
     )
 
@@ -514,16 +585,17 @@ def _merge_touching(
     one by one, such contacts would throw each other off forever.
     """
     s, legs = law.s, leg_directions(law.s, motion.theta)
-    dip_depth = law.rest_speed**2 / (2.0 * s.g)
+    bounce_height = law.rest_speed**2 / (2.0 * s.g)
     heights = foot_heights(motion, legs, law.tilt)
-    is_touching = (heights <= dip_depth) & (foot_speeds(motion, legs)[1] <= law.rest_speed)
+    is_touching = (heights <= bounce_height) & (foot_speeds(motion, legs)[1] <= law.rest_speed)
     lands = event.lands | (
-        is_touching & (contact_state.contact == ContactMode.OFF) & event.is_impact
+        is_touching & (contact_state.contact_modes == ContactMode.OFF) & event.is_impact
     )
     fits_slots = (
-        jnp.sum(lands | (contact_state.contact != ContactMode.OFF), axis=0, dtype=jnp.int32) <= 2
+        jnp.sum(lands | (contact_state.contact_modes != ContactMode.OFF), axis=0, dtype=jnp.int32)
+        <= 2
     )
-    is_extended = (dip_depth >= s.L0 - motion.L) & (motion.dL >= -law.rest_speed)
+    is_extended = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -law.rest_speed)
     meets_stopper = event.meets_stopper | (is_extended & ~contact_state.locked & event.is_impact)
     return event._replace(
         lands=jnp.where(fits_slots, lands, event.lands), meets_stopper=meets_stopper
@@ -539,19 +611,22 @@ def _liftoff_to_slip(
     force no longer resists.
     """
     law, motion = stop_gradients((law, motion))
-    slots = find_slots(contact_state.contact != ContactMode.OFF)
-    friction, mode = slot_friction(law.friction, slots), slots.gather_codes(contact_state.contact)
+    slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
+    friction, slot_modes = (
+        slot_friction(law.friction, slots),
+        slots.gather_codes(contact_state.contact_modes),
+    )
     begins_slip = (
-        event.lifts_off & (mode == ContactMode.STICK) & (stack_friction(friction) == jnp.inf)
+        event.lifts_off & (slot_modes == ContactMode.STICK) & (stack_friction(friction) == jnp.inf)
     )
     slot_state = (
         slots,
-        mode,
+        slot_modes,
         slots.gather_flags(contact_state.locked),
         contact_state.locked & ~slots.is_filled,
     )
     tangential_forces = lambda _: (
-        solve_motion(ContactConfiguration(law.s, motion, friction, *slot_state)).tangential
+        solve_contact_forces(ContactConfiguration(law.s, motion, friction, *slot_state)).tangential
     )
     zeros = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
     is_uphill = jnp.stack(run_if_any(jnp.any(begins_slip), tangential_forces, zeros)) > 0.0
@@ -570,53 +645,55 @@ def resolve_event(
         law, motion, contact_state, _liftoff_to_slip(law, motion, contact_state, event)
     )
     s, is_impact = law.s, event.is_impact
-    was_touching = (contact_state.contact != ContactMode.OFF) | event.lands
+    was_touching = (contact_state.contact_modes != ContactMode.OFF) | event.lands
     was_locked = (contact_state.locked | event.meets_stopper) & ~event.leaves_stopper
-    velocity_level, slots, held = _solve_velocity_level(law, motion, contact_state, event)
+    velocity_solution, slots, is_held = _solve_velocity_level(law, motion, contact_state, event)
     if law.restitution is not None:
-        inelastic = _solve_velocity_level(
+        inelastic_solution = _solve_velocity_level(
             law._replace(restitution=None), motion, contact_state, event
         )[0]
-        velocity_level = _limit_energy_gain(law, motion, velocity_level, inelastic)
-    impact_modes = slots.scatter(velocity_level.chosen.contact).astype(jnp.int32)
+        velocity_solution = _limit_energy_gain(law, motion, velocity_solution, inelastic_solution)
+    impact_modes = slots.scatter(velocity_solution.chosen_combination.slot_modes).astype(jnp.int32)
     stays_locked = jnp.where(
-        slots.is_filled, slots.scatter(velocity_level.chosen.held) > 0, was_locked & held
+        slots.is_filled,
+        slots.scatter(velocity_solution.chosen_combination.is_held) > 0,
+        was_locked & is_held,
     )
     if law.restitution is not None:  # only a part of the impulse may act
-        stays_locked = stays_locked & (jnp.abs(velocity_level.motion.dL) < law.rest_speed)
-    rested = _bring_to_rest(
-        law, velocity_level.motion, slots, impact_modes, stays_locked, was_locked
+        stays_locked = stays_locked & (jnp.abs(velocity_solution.motion.dL) < law.rest_speed)
+    rest_result = _bring_to_rest(
+        law, velocity_solution.motion, slots, impact_modes, stays_locked, was_locked
     )
-    motion_after, contact, at_stopper = tree_where(
-        is_impact, rested, (motion, contact_state.contact, was_locked)
+    motion_after, contact_modes, is_at_stopper = tree_where(
+        is_impact, rest_result, (motion, contact_state.contact_modes, was_locked)
     )
-    legs = leg_directions(s, motion.theta)
+    directions = leg_directions(s, motion.theta)
     has_no_slot = was_touching & ~slots.is_filled
     energy_lost = kinetic_energy(s, motion) - kinetic_energy(s, motion_after)
-    stopper_impulse = jnp.where(held, velocity_level.stopper_push, jnp.inf)
+    stopper_impulse = jnp.where(is_held, velocity_solution.stopper_push, jnp.inf)
 
-    acceleration_level, slots, was_resting, held = _solve_acceleration_level(
-        law, motion_after, contact, at_stopper, event
+    acceleration_solution, slots, was_resting, is_held = _solve_acceleration_level(
+        law, motion_after, contact_modes, is_at_stopper, event
     )
-    contact = slots.scatter(acceleration_level.contact).astype(jnp.int32)
+    contact_modes = slots.scatter(acceleration_solution.slot_modes).astype(jnp.int32)
     is_locked = jnp.where(
-        slots.is_filled, slots.scatter(acceleration_level.held) > 0, at_stopper & held
+        slots.is_filled, slots.scatter(acceleration_solution.is_held) > 0, is_at_stopper & is_held
     )
-    is_sliding = (acceleration_level.contact == ContactMode.SLIP_DOWN) | (
-        acceleration_level.contact == ContactMode.SLIP_UP
+    is_sliding = (acceleration_solution.slot_modes == ContactMode.SLIP_DOWN) | (
+        acceleration_solution.slot_modes == ContactMode.SLIP_UP
     )
     contact_state = ContactState(
-        contact=contact,
+        contact_modes=contact_modes,
         locked=is_locked,
-        has_just_lifted=was_touching & (contact == ContactMode.OFF),
+        has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
         has_just_unlocked=(contact_state.locked | event.meets_stopper) & ~is_locked,
         has_just_slid=slots.scatter(is_sliding & was_resting) > 0,
     )
-    n_impact_solutions = velocity_level.chosen.n_solutions
-    n_force_solutions = acceleration_level.n_solutions
-    if_impact = lambda pair: (
-        jnp.where(is_impact, pair[0], 0.0),
-        jnp.where(is_impact, pair[1], 0.0),
+    n_impact_solutions = velocity_solution.chosen_combination.n_solutions
+    n_force_solutions = acceleration_solution.n_solutions
+    zero_without_impact = lambda slot_pair: (
+        jnp.where(is_impact, slot_pair[0], 0.0),
+        jnp.where(is_impact, slot_pair[1], 0.0),
     )
     return EventResult(
         motion=motion_after._replace(
@@ -625,8 +702,8 @@ def resolve_event(
         ),
         contact_state=contact_state,
         energy_lost=jnp.where(is_impact, energy_lost, 0.0),
-        normal_impulse=if_impact(velocity_level.solution.normal),
-        tangential_impulse=if_impact(velocity_level.solution.tangential),
+        normal_impulse=zero_without_impact(velocity_solution.solution.normal),
+        tangential_impulse=zero_without_impact(velocity_solution.solution.tangential),
         stopper_impulse=jnp.where(is_impact, jnp.min(stopper_impulse, axis=0), jnp.inf),
         n_solutions=jnp.where(
             is_impact, jnp.minimum(n_impact_solutions, n_force_solutions), n_force_solutions
@@ -635,7 +712,9 @@ def resolve_event(
         most_solutions=jnp.where(
             is_impact, jnp.maximum(n_impact_solutions, n_force_solutions), n_force_solutions
         ),
-        has_third_foot=jnp.any(has_no_slot & (foot_speeds(motion_after, legs)[1] < 0.0), axis=0)
+        has_third_foot=jnp.any(
+            has_no_slot & (foot_speeds(motion_after, directions)[1] < 0.0), axis=0
+        )
         & is_impact,
     )
 
@@ -643,8 +722,8 @@ def resolve_event(
 def project_motion(
     s: Symbols,
     motion: WheelMotion,
-    contact: Int[Array, "n ..."],
-    locked: Bool[Array, "n ..."],
+    contact_modes: Int[Array, "n ..."],
+    is_locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
     """Return the motion projected onto its contacts: loaded feet on the slope, sticking ones at
@@ -654,17 +733,19 @@ def project_motion(
     its contacts is unchanged up to round-off.
     """
     legs = leg_directions(s, motion.theta)
-    L = jnp.where((contact != ContactMode.OFF) & ~locked, motion.z / legs.cos, motion.L)
-    motion = motion._replace(L=jnp.where(locked, s.L0, L))
-    slots = find_slots(contact != ContactMode.OFF)
-    airborne = locked & ~slots.is_filled
-    modes, held = slots.gather_codes(contact), slots.gather_flags(locked)
+    L = jnp.where((contact_modes != ContactMode.OFF) & ~is_locked, motion.z / legs.cos, motion.L)
+    motion = motion._replace(L=jnp.where(is_locked, s.L0, L))
+    slots = find_slots(contact_modes != ContactMode.OFF)
+    is_airborne_locked = is_locked & ~slots.is_filled
+    slot_modes, is_held = slots.gather_codes(contact_modes), slots.gather_flags(is_locked)
     # Two resting feet on two held legs would constrain the hub twice.
-    is_overdetermined = jnp.all((modes == ContactMode.STICK) & held, axis=0)
-    held = jnp.stack([held[0], held[1] & ~is_overdetermined])
+    is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_held, axis=0)
+    is_held = jnp.stack([is_held[0], is_held[1] & ~is_overdetermined])
     slot_coefficients = (
         jnp.zeros_like(motion.theta) if friction is None else slot_friction(friction, slots)
     )
-    configuration = ContactConfiguration(s, motion, slot_coefficients, slots, modes, held, airborne)
-    projected = _motion_after_impact(motion, solve_impact(configuration))
-    return projected._replace(dL=jnp.where(locked, 0.0, projected.dL))
+    configuration = ContactConfiguration(
+        s, motion, slot_coefficients, slots, slot_modes, is_held, is_airborne_locked
+    )
+    projected_motion = _motion_after_impact(motion, solve_impact(configuration))
+    return projected_motion._replace(dL=jnp.where(is_locked, 0.0, projected_motion.dL))

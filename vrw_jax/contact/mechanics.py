@@ -64,7 +64,7 @@ def sum_over_legs(values: Array) -> Array:
     return jnp.sum(values, axis=0)
 
 
-def prevent_fusion(tree: Any, unit: Array) -> Any:
+def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
     """Return the same numbers, each divided by a `unit` that equals 1 but is known only at run
     time.
 
@@ -72,7 +72,7 @@ def prevent_fusion(tree: Any, unit: Array) -> Any:
     number by a hundred here. A division is computed only once.
     """
     is_float = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    return jax.tree.map(lambda leaf: leaf / unit if is_float(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: leaf / unit_divisor if is_float(leaf) else leaf, tree)
 
 
 def opaque_one(motion: "WheelMotion") -> Array:
@@ -89,13 +89,13 @@ def stop_gradients(tree: Any) -> Any:
 class Slots(NamedTuple):
     """The two legs whose feet may be loaded, fore first; an empty slot holds no leg."""
 
-    first: Bool[Array, "n_legs ..."]
-    second: Bool[Array, "n_legs ..."]
+    first_mask: Bool[Array, "n_legs ..."]
+    second_mask: Bool[Array, "n_legs ..."]
 
     @property
     def is_filled(self) -> Bool[Array, "n_legs ..."]:
         """Whether a leg is in a slot."""
-        return self.first | self.second
+        return self.first_mask | self.second_mask
 
     def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
         """Return the slots' entries of an integer per leg, as one array."""
@@ -109,19 +109,19 @@ class Slots(NamedTuple):
         """Return the slots' entries of a quantity per leg; 0 for an empty slot."""
         zero = jnp.zeros_like(values)
         return (
-            sum_over_legs(jnp.where(self.first, values, zero)),
-            sum_over_legs(jnp.where(self.second, values, zero)),
+            sum_over_legs(jnp.where(self.first_mask, values, zero)),
+            sum_over_legs(jnp.where(self.second_mask, values, zero)),
         )
 
     def scatter(self, pair: Any) -> LegArray:
         """Return the quantity per leg, zero for legs in no slot: the inverse of `gather`."""
-        return jnp.where(self.first, pair[0], 0.0) + jnp.where(self.second, pair[1], 0.0)
+        return jnp.where(self.first_mask, pair[0], 0.0) + jnp.where(self.second_mask, pair[1], 0.0)
 
 
 def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> Slots:
     """Return the slots of the first two touching legs."""
-    rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
-    return Slots(is_touching & (rank == 1), is_touching & (rank == 2))
+    touching_rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
+    return Slots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
 
 
 def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise | SlotPair:
@@ -133,7 +133,7 @@ def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise
     if not isinstance(friction, tuple):
         return friction
     last_friction, other_friction = friction
-    return jnp.where(slots.first[0], last_friction, other_friction), other_friction
+    return jnp.where(slots.first_mask[0], last_friction, other_friction), other_friction
 
 
 class ContactInverseInertia(NamedTuple):
@@ -145,8 +145,10 @@ class ContactInverseInertia(NamedTuple):
     sin: SlotPair
     cos: SlotPair
     L: SlotPair
-    response_e: tuple[HubVector, HubVector]  # hub's response to a unit force along e of each foot
-    response_u: tuple[HubVector, HubVector]  # to a unit pull of each stopper
+    response_transverse: tuple[
+        HubVector, HubVector
+    ]  # hub's response to a unit force along e of each foot
+    response_radial: tuple[HubVector, HubVector]  # to a unit pull of each stopper
     G: tuple[Any, Any, Any]  # 11, 12, 22: e to e
     H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: stopper to e
     K: tuple[Any, Any, Any]  # 11, 12, 22: stopper to stopper
@@ -177,14 +179,14 @@ def _invert_inertia(
     zt = s.m * sum_over_legs(b * legs.sin)
     tt = s.m * sum_over_legs(b * b)
     c_xx, c_xz, c_xt = zz * tt - zt * zt, xt * zt - xz * tt, xz * zt - zz * xt
-    scale = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
+    inverse_determinant = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
     return (
-        c_xx * scale,
-        c_xz * scale,
-        c_xt * scale,
-        (xx * tt - xt * xt) * scale,
-        (xz * xt - xx * zt) * scale,
-        (xx * zz - xz * xz) * scale,
+        c_xx * inverse_determinant,
+        c_xz * inverse_determinant,
+        c_xt * inverse_determinant,
+        (xx * tt - xt * xt) * inverse_determinant,
+        (xz * xt - xx * zt) * inverse_determinant,
+        (xx * zz - xz * xz) * inverse_determinant,
     )
 
 
@@ -204,14 +206,14 @@ def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
 
 
 def make_inverse_inertia(
-    s: Symbols, motion: WheelMotion, slots: Slots, airborne: Array
+    s: Symbols, motion: WheelMotion, slots: Slots, is_airborne_locked: Array
 ) -> ContactInverseInertia:
     """Return the response of hub and slots to forces at this posture.
 
     - `airborne`: legs in the air on their stoppers.
     """
     legs, sin, cos, L = make_posture(s, motion, slots)
-    is_released = slots.is_filled | ~airborne
+    is_released = slots.is_filled | ~is_airborne_locked
     inverse_inertia = _invert_inertia(s, legs, motion.L - s.a, is_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
@@ -226,8 +228,8 @@ def make_inverse_inertia(
         sin,
         cos,
         L,
-        response_e=z,
-        response_u=y,
+        response_transverse=z,
+        response_radial=y,
         G=(dot(e[0], z[0]), dot(e[0], z[1]), dot(e[1], z[1])),
         H=(
             plane_dot(u[0], z[0]),
@@ -243,10 +245,10 @@ class FreeMotion(NamedTuple):
     """Motion without the slots' forces: accelerations, or velocities in an impact."""
 
     hub: HubVector
-    legs: LegArray  # of a released leg's length, minus the hub's share u . hub
-    slot_legs: SlotPair  # the same for the slots' legs
-    foot_e: SlotPair  # of the slots' feet along e
-    foot_u: SlotPair  # along u
+    leg_motion: LegArray  # of a released leg's length, minus the hub's share u . hub
+    slot_leg_motion: SlotPair  # the same for the slots' legs
+    foot_transverse: SlotPair  # of the slots' feet along e
+    foot_radial: SlotPair  # along u
 
 
 def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> LegArray:
@@ -254,9 +256,9 @@ def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> Leg
     m/s^2.
     """
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
-    spin = (motion.L - s.a) * motion.dtheta * motion.dtheta
-    spring = s.k * (s.Ls - motion.L) - s.c * motion.dL
-    return spin - (legs.sin * gx + legs.cos * gz) + spring / s.m
+    centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
+    spring_force = s.k * (s.Ls - motion.L) - s.c * motion.dL
+    return centrifugal_acceleration - (legs.sin * gx + legs.cos * gz) + spring_force / s.m
 
 
 def free_acceleration(
@@ -269,24 +271,40 @@ def free_acceleration(
     sin, cos = inertia.legs
     b, dtheta = motion.L - s.a, motion.dtheta
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
-    spin, legs = b * dtheta * dtheta, free_leg_motion(s, motion, inertia.legs)
-    coriolis = 2.0 * motion.dL * dtheta
-    radial = jnp.where(inertia.is_released, legs, 0.0) - spin
-    force_x = s.Mt * gx + s.m * sum_over_legs(radial * sin + coriolis * cos)
-    force_z = s.Mt * gz + s.m * sum_over_legs(radial * cos - coriolis * sin)
-    torque = -s.m * sum_over_legs(b * (coriolis + cos * gx - sin * gz))
+    centrifugal_acceleration, leg_acceleration = (
+        b * dtheta * dtheta,
+        free_leg_motion(s, motion, inertia.legs),
+    )
+    coriolis_acceleration = 2.0 * motion.dL * dtheta
+    radial_acceleration = (
+        jnp.where(inertia.is_released, leg_acceleration, 0.0) - centrifugal_acceleration
+    )
+    force_x = s.Mt * gx + s.m * sum_over_legs(
+        radial_acceleration * sin + coriolis_acceleration * cos
+    )
+    force_z = s.Mt * gz + s.m * sum_over_legs(
+        radial_acceleration * cos - coriolis_acceleration * sin
+    )
+    torque = -s.m * sum_over_legs(b * (coriolis_acceleration + cos * gx - sin * gz))
     hub_acceleration = apply_inverse(inertia.inverse_inertia, (force_x, force_z, torque))
-    slot_coriolis, slot_legs = slots.gather(coriolis), slots.gather(legs)
-    foot_e = [
+    slot_coriolis, slot_leg_acceleration = (
+        slots.gather(coriolis_acceleration),
+        slots.gather(leg_acceleration),
+    )
+    foot_transverse = [
         inertia.cos[i] * hub_acceleration[0]
         - inertia.sin[i] * hub_acceleration[1]
         - inertia.L[i] * hub_acceleration[2]
         - slot_coriolis[i]
         for i in range(2)
     ]
-    foot_u = [inertia.L[i] * dtheta * dtheta - slot_legs[i] for i in range(2)]
+    foot_radial = [inertia.L[i] * dtheta * dtheta - slot_leg_acceleration[i] for i in range(2)]
     return FreeMotion(
-        hub_acceleration, legs, slot_legs, (foot_e[0], foot_e[1]), (foot_u[0], foot_u[1])
+        hub_acceleration,
+        leg_acceleration,
+        slot_leg_acceleration,
+        (foot_transverse[0], foot_transverse[1]),
+        (foot_radial[0], foot_radial[1]),
     )
 
 
@@ -301,22 +319,28 @@ def free_velocity(
     sin, cos = inertia.legs
     b, dtheta = motion.L - s.a, motion.dtheta
     hub_outward = sin * motion.vx + cos * motion.vz
-    legs = jnp.where(inertia.is_released, motion.dL - hub_outward, 0.0)
-    radial = legs - motion.dL
-    transverse = b * dtheta
-    px = s.Mt * motion.vx + s.m * sum_over_legs(radial * sin - transverse * cos)
-    pz = s.Mt * motion.vz + s.m * sum_over_legs(radial * cos + transverse * sin)
-    angular_momentum = -s.m * sum_over_legs(b * (cos * motion.vx - sin * motion.vz - transverse))
+    leg_velocity = jnp.where(inertia.is_released, motion.dL - hub_outward, 0.0)
+    radial_velocity = leg_velocity - motion.dL
+    transverse_velocity = b * dtheta
+    px = s.Mt * motion.vx + s.m * sum_over_legs(radial_velocity * sin - transverse_velocity * cos)
+    pz = s.Mt * motion.vz + s.m * sum_over_legs(radial_velocity * cos + transverse_velocity * sin)
+    angular_momentum = -s.m * sum_over_legs(
+        b * (cos * motion.vx - sin * motion.vz - transverse_velocity)
+    )
     hub_velocity = apply_inverse(inertia.inverse_inertia, (px, pz, angular_momentum))
-    slot_legs = slots.gather(legs)
-    foot_e = [
+    slot_leg_velocity = slots.gather(leg_velocity)
+    foot_transverse = [
         inertia.cos[i] * hub_velocity[0]
         - inertia.sin[i] * hub_velocity[1]
         - inertia.L[i] * hub_velocity[2]
         for i in range(2)
     ]
     return FreeMotion(
-        hub_velocity, legs, slot_legs, (foot_e[0], foot_e[1]), (-slot_legs[0], -slot_legs[1])
+        hub_velocity,
+        leg_velocity,
+        slot_leg_velocity,
+        (foot_transverse[0], foot_transverse[1]),
+        (-slot_leg_velocity[0], -slot_leg_velocity[1]),
     )
 
 
@@ -354,17 +378,17 @@ def foot_heights(
     heights = motion.z - motion.L * legs.cos
     if tilt is None:
         return heights
-    positions = foot_positions(motion, legs)
-    distance = positions[-1] - positions[0]
-    foremost_height = heights[-1] * jnp.cos(tilt) + distance * jnp.sin(tilt)
+    downhill_positions = foot_positions(motion, legs)
+    foremost_distance = downhill_positions[-1] - downhill_positions[0]
+    foremost_height = heights[-1] * jnp.cos(tilt) + foremost_distance * jnp.sin(tilt)
     return jnp.concatenate([heights[:-1], foremost_height[None]])
 
 
 def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:
     """Return the velocity of every foot along the slope and normal to it, m/s."""
-    transverse = motion.L * motion.dtheta
-    tangential = motion.vx - motion.dL * legs.sin - transverse * legs.cos
-    return tangential, motion.vz - motion.dL * legs.cos + transverse * legs.sin
+    transverse_velocity = motion.L * motion.dtheta
+    tangential_speed = motion.vx - motion.dL * legs.sin - transverse_velocity * legs.cos
+    return tangential_speed, motion.vz - motion.dL * legs.cos + transverse_velocity * legs.sin
 
 
 def foot_positions(motion: WheelMotion, legs: LegDirections) -> LegArray:
@@ -374,16 +398,16 @@ def foot_positions(motion: WheelMotion, legs: LegDirections) -> LegArray:
 
 def landing_position(n: int, motion: WheelMotion) -> Elementwise:
     """Return the downhill position of the foremost of `n` feet, m."""
-    leg_angle = motion.theta + (n - 1) * 2.0 * math.pi / n
-    return motion.x - motion.L[n - 1] * jnp.sin(leg_angle)
+    foremost_angle = motion.theta + (n - 1) * 2.0 * math.pi / n
+    return motion.x - motion.L[n - 1] * jnp.sin(foremost_angle)
 
 
 def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Return the kinetic energy of the hub and all leg masses, J."""
     legs = leg_directions(s, motion.theta)
-    transverse = (motion.L - s.a) * motion.dtheta
-    x = motion.vx - motion.dL * legs.sin - transverse * legs.cos
-    z = motion.vz - motion.dL * legs.cos + transverse * legs.sin
+    transverse_velocity = (motion.L - s.a) * motion.dtheta
+    x = motion.vx - motion.dL * legs.sin - transverse_velocity * legs.cos
+    z = motion.vz - motion.dL * legs.cos + transverse_velocity * legs.sin
     hub_mass = s.Mt - s.n * s.m
     return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
 
@@ -395,5 +419,5 @@ def potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
     legs = leg_directions(s, motion.theta)
     x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * legs.sin)
     z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * legs.cos)
-    elastic = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
-    return s.g * (z * s.cos_phi - x * s.sin_phi), elastic
+    elastic_energy = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
+    return s.g * (z * s.cos_phi - x * s.sin_phi), elastic_energy

@@ -31,9 +31,9 @@ def full_section_size(n: int) -> int:
 
 def compute_section_units(units: OwnUnits, n: int) -> list[Elementwise]:
     """Return the wheel's own units of each number of a full section state; 1 for the codes."""
-    one = units.length / units.length
-    hub = [one, units.rate, units.speed, units.speed]
-    return [*hub, *[units.length] * n, *[units.speed] * n, *[one] * n]
+    dimensionless = units.length / units.length
+    hub_units = [dimensionless, units.rate, units.speed, units.speed]
+    return [*hub_units, *[units.length] * n, *[units.speed] * n, *[dimensionless] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
@@ -69,14 +69,14 @@ def replace_invalid_start(
     safe_state = embed_section_state(
         WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
     )
-    safe_x = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
+    safe_column = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
     is_valid = is_valid_start(params, x) & (friction >= 0.0)
     is_valid = is_valid & (
         is_valid_slope(params.slope + tilt)
         if tilt is not None
-        else _is_possible(params.symbols(), x)
+        else _is_consistent_posture(params.symbols(), x)
     )
-    params, x = replace_invalid(is_valid, params, x, safe_x)
+    params, x = replace_invalid(is_valid, params, x, safe_column)
     return is_valid, params, jnp.where(is_valid, friction, 1.0), x
 
 
@@ -96,23 +96,34 @@ def _unpack_posture(
     """
     n = s.n
     theta = x[0] - s.alpha
-    leg_rows = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
-    L, dL, code = (jnp.concatenate([row[-1:], row[:-1]]) for row in leg_rows)
-    code = jnp.floor(code + 0.5).astype(jnp.int32)
-    contact, locked = code & (LOCKED_CODE_OFFSET - 1), code >= LOCKED_CODE_OFFSET
-    L = jnp.where(locked, s.L0, L)
-    legs = leg_directions(s, theta)
-    hub = L[0] * legs.sin[0], L[0] * legs.cos[0]
-    L = jnp.where((contact != ContactMode.OFF) & ~locked, hub[1] / legs.cos, L)
-    return theta, hub, L, dL, contact, locked
+    leg_values = (x[4 + i * n : 4 + (i + 1) * n] for i in range(3))
+    L, dL, contact_codes = (
+        jnp.concatenate([values_by_leg[-1:], values_by_leg[:-1]]) for values_by_leg in leg_values
+    )
+    contact_codes = jnp.floor(contact_codes + 0.5).astype(jnp.int32)
+    contact_modes, is_locked = (
+        contact_codes & (LOCKED_CODE_OFFSET - 1),
+        contact_codes >= LOCKED_CODE_OFFSET,
+    )
+    L = jnp.where(is_locked, s.L0, L)
+    directions = leg_directions(s, theta)
+    hub = L[0] * directions.sin[0], L[0] * directions.cos[0]
+    L = jnp.where((contact_modes != ContactMode.OFF) & ~is_locked, hub[1] / directions.cos, L)
+    return theta, hub, L, dL, contact_modes, is_locked
 
 
-def _is_possible(s: Symbols, x: FullState) -> Bool[Array, "..."]:
+def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
     """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long."""
-    theta, (_, z), L, _, contact, _ = _unpack_posture(s, x)
-    height, tolerance = z - L * leg_directions(s, theta).cos, PENETRATION_TOLERANCE * s.L0
-    is_contact_consistent = (contact == ContactMode.OFF) | (height <= tolerance)
-    return jnp.all((height >= -tolerance) & is_contact_consistent & (tolerance >= L - s.L0), axis=0)
+    theta, (_, z), L, _, contact_modes, _ = _unpack_posture(s, x)
+    foot_height, height_tolerance = (
+        z - L * leg_directions(s, theta).cos,
+        PENETRATION_TOLERANCE * s.L0,
+    )
+    is_contact_consistent = (contact_modes == ContactMode.OFF) | (foot_height <= height_tolerance)
+    return jnp.all(
+        (foot_height >= -height_tolerance) & is_contact_consistent & (height_tolerance >= L - s.L0),
+        axis=0,
+    )
 
 
 def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, ContactState]:
@@ -122,11 +133,11 @@ def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, Contact
     The landing foot is the origin. Loaded feet are placed on the slope, so that every vector near a
     section state is one. The landing brings sticking feet to rest.
     """
-    theta, (hub_x, hub_z), L, dL, contact, locked = _unpack_posture(s, x)
+    theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_posture(s, x)
     dtheta, vx, vz = x[1], x[2], x[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
-    no_legs = locked & False
-    return motion, ContactState(contact, locked, no_legs, no_legs, no_legs)
+    no_leg_flags = is_locked & False
+    return motion, ContactState(contact_modes, is_locked, no_leg_flags, no_leg_flags, no_leg_flags)
 
 
 def pack_section_state(
@@ -136,7 +147,7 @@ def pack_section_state(
 
     - `tilt`: angle by which that line is steeper, rad; None on flat ground.
     """
-    code = contact_state.contact + LOCKED_CODE_OFFSET * contact_state.locked
+    contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz
     if tilt is not None:
         sin, cos = jnp.sin(tilt), jnp.cos(tilt)
@@ -146,6 +157,6 @@ def pack_section_state(
             jnp.stack([theta, motion.dtheta, vx, vz]),
             motion.L,
             motion.dL,
-            code.astype(motion.L.dtype),
+            contact_codes.astype(motion.L.dtype),
         ]
     )

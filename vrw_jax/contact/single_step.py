@@ -34,12 +34,12 @@ from vrw_jax.contact.contact_state import (
 from vrw_jax.contact.mechanics import WheelMotion, find_slots
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
-    BatchWalk,
     BatchWalkResult,
+    BatchWalkSettings,
     StepSummary,
-    advance_round,
-    init_lanes,
+    init_lane_states,
     make_result_template,
+    process_and_integrate,
     run_walks,
 )
 from vrw_jax.contact.walk_tangents import walk_with_tangents
@@ -56,60 +56,67 @@ class ContactStepConfig(NamedTuple):
     structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
     is_detailed: bool
 
-    def unpack(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
+    def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return columns and section states of lanes, and the other settings."""
         wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
-        more = () if wheel.uneven is None else wheel.uneven
-        columns = jnp.stack([*stack_parameters(params), wheel.friction, *more])
-        return columns, x, (wheel, params, options)
+        uneven_columns = () if wheel.uneven is None else wheel.uneven
+        input_columns = jnp.stack([*stack_parameters(params), wheel.friction, *uneven_columns])
+        return input_columns, x, (wheel, params, options)
 
-    def make_walk(self, settings: Any) -> BatchWalk:
+    def make_walk_settings(self, settings: Any) -> BatchWalkSettings:
         """Return the batch settings of a walk of one step."""
         wheel, params, options = settings
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by the caller
-        rules = (
+        contact_rules = (
             wheel.max_events,
             wheel.has_one_sided_stoppers,
             wheel.uses_paper_rule,
             self.is_detailed,
         )
-        return BatchWalk(params.n_legs, 1, *rules, options, tableau, wheel.uneven is not None)
+        return BatchWalkSettings(
+            params.n_legs, 1, *contact_rules, options, tableau, wheel.uneven is not None
+        )
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return arrays in the structure of `compute_outputs`."""
-        params = self.unpack(leaves)[2][1]
+        params = self.unpack_leaves(leaves)[2][1]
         return _partition_result(
             make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
         """Return the result over lanes, which the leaves have on their last axis."""
-        columns, x, settings = self.unpack(leaves)
-        return _partition_result(run_walks(self.make_walk(settings), columns, x))
+        input_columns, x, settings = self.unpack_leaves(leaves)
+        return _partition_result(run_walks(self.make_walk_settings(settings), input_columns, x))
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
         """Return the tangents of the result's floats for one tangent of each lane, the floats, and
         the rest.
         """
-        columns, x, settings = self.unpack(leaves)
-        d_columns, d_x = (rows[None] for rows in self.unpack(tangents)[:2])
-        n_tangents = jnp.ones_like(columns[0], jnp.int32)
-        walk, result_tangents = walk_with_tangents(
-            self.make_walk(settings), columns, x, d_columns, d_x, n_tangents
+        input_columns, x, settings = self.unpack_leaves(leaves)
+        d_columns, d_x = (tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2])
+        n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
+        walk_result, result_tangents = walk_with_tangents(
+            self.make_walk_settings(settings), input_columns, x, d_columns, d_x, n_tangents
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
-        return _partition_result(walk._replace(step_result=result_tangents))[0], *_partition_result(
-            walk
-        )
+        return _partition_result(walk_result._replace(step_result=result_tangents))[
+            0
+        ], *_partition_result(walk_result)
 
 
-def _partition_result(walk: BatchWalkResult) -> tuple[Any, Any]:
+def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     """Return floats and other parts of a step: of the full result, or of the four minimal ones."""
-    step = walk.step_result
-    if isinstance(step, StepSummary):
-        step = step.section_state, step.durations, walk.outcome, walk.n_solver_steps
-    return eqx.partition(step, eqx.is_inexact_array)
+    step_result = walk_result.step_result
+    if isinstance(step_result, StepSummary):
+        step_result = (
+            step_result.section_state,
+            step_result.durations,
+            walk_result.outcome,
+            walk_result.n_solver_steps,
+        )
+    return eqx.partition(step_result, eqx.is_inexact_array)
 
 
 def build_contact_step_function(structure: Any, is_detailed: bool) -> ForwardFunction:
@@ -131,8 +138,8 @@ def build_contact_step_jacobian(
     config = ContactStepConfig(structure, is_detailed)
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
-        value, aux = config.make_template(*leaves)
-        return value, value, aux
+        value, other_outputs = config.make_template(*leaves)
+        return value, value, other_outputs
 
     cache_key = "step on real ground along directions", str(structure), is_detailed
     compute_tangents = unbatch(
@@ -142,15 +149,21 @@ def build_contact_step_jacobian(
     def evaluate_jacobian(*leaves: Array) -> tuple:
         *settings, options = jax.tree.unflatten(structure, leaves)
         leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
-        units = np.eye(sum(np.size(leaves[i]) for i in input_indices))
-        tangents, offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
+        unit_tangents = np.eye(sum(np.size(leaves[i]) for i in input_indices))
+        tangents, leaf_offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
         for i in input_indices:
-            rows = units[:, offset : (offset := offset + np.size(leaves[i]))]
-            tangents[i] = jnp.asarray(rows.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype)
+            leaf_tangents = unit_tangents[
+                :, leaf_offset : (leaf_offset := leaf_offset + np.size(leaves[i]))
+            ]
+            tangents[i] = jnp.asarray(
+                leaf_tangents.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype
+            )
         axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
-        columns, value, aux = jax.vmap(compute_tangents, (None, axes))(leaves, tuple(tangents))
-        value, aux = jax.tree.map(lambda x: x[0], (value, aux))
-        return (split_jacobian(columns, leaves, input_indices), value), aux
+        jacobian_columns, value, other_outputs = jax.vmap(compute_tangents, (None, axes))(
+            leaves, tuple(tangents)
+        )
+        value, other_outputs = jax.tree.map(lambda x: x[0], (value, other_outputs))
+        return (split_jacobian(jacobian_columns, leaves, input_indices), value), other_outputs
 
     return evaluate_jacobian
 
@@ -168,7 +181,7 @@ class SampledIntervals(NamedTuple):
     """Intervals at equal times, both ends included."""
 
     log: IntervalLog
-    ends: StepSummary
+    summary: StepSummary
     outcome: Array
     state: Array  # (intervals, samples, dim)
     tangential: Array  # on every foot, N, (intervals, samples, legs)
@@ -178,7 +191,7 @@ class SampledIntervals(NamedTuple):
 def sample_interval(
     dynamics: ModeDynamics,
     motion: WheelMotion,
-    accumulated: Array,
+    initial_accumulators: Array,
     duration: Array,
     n_samples: int,
     options: StepOptions,
@@ -189,22 +202,33 @@ def sample_interval(
     The rows are coordinates, rates, accumulators starting at `accumulated`, and normal and
     tangential forces of the slots.
     """
-    initial = init_interval(dynamics, motion, options.dt0)
+    initial_interval = init_interval(dynamics, motion, options.dt0)
 
     def take_sample_step(
-        sample: tuple[IntervalPoint, Array], length: Array
+        sample_state: tuple[IntervalPoint, Array], step_size: Array
     ) -> tuple[tuple[IntervalPoint, Array], Array]:
-        point, accumulated = sample
-        attempt = attempt_step(dynamics, tableau, options, initial._replace(point=point, h=length))
-        assert attempt.accumulated is not None
-        return (attempt.end, accumulated + attempt.accumulated), attempt.squared_error
+        start_point, accumulators = sample_state
+        attempt = attempt_step(
+            dynamics, tableau, options, initial_interval._replace(point=start_point, h=step_size)
+        )
+        assert attempt.accumulator_increments is not None
+        return (
+            attempt.end_point,
+            accumulators + attempt.accumulator_increments,
+        ), attempt.squared_error
 
-    def rows(sample: tuple[IntervalPoint, Array]) -> Array:
-        (q, v, dynamics_rows), accumulated = sample
-        return jnp.concatenate([q, v, accumulated, dynamics_rows[len(q) : len(q) + 4]])
+    def pack_sample(sample_state: tuple[IntervalPoint, Array]) -> Array:
+        (q, v, dynamics_rows), accumulators = sample_state
+        return jnp.concatenate([q, v, accumulators, dynamics_rows[len(q) : len(q) + 4]])
 
     return sample_at_equal_times(
-        take_sample_step, rows, (initial.point, accumulated), tableau, duration, n_samples, options
+        take_sample_step,
+        pack_sample,
+        (initial_interval.point, initial_accumulators),
+        tableau,
+        duration,
+        n_samples,
+        options,
     )
 
 
@@ -218,87 +242,129 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
     cache_key = str(structure)
 
     def begin_lane(*leaves: Array) -> Any:
-        columns, x, settings = config.unpack(leaves)
-        return init_lanes(config.make_walk(settings), columns, x)[1]
+        input_columns, x, settings = config.unpack_leaves(leaves)
+        return init_lane_states(config.make_walk_settings(settings), input_columns, x)[1]
 
-    def advance_to_event(leaves: tuple[Array, ...], lane: Any) -> tuple[Any, IntervalLog]:
-        columns, x, settings = config.unpack(leaves)
-        walk = config.make_walk(settings)
-        processed, lane = advance_round(
-            walk, walk.replace_invalid(columns, x)[0], lane, waits_for_events=True
+    def advance_to_event(leaves: tuple[Array, ...], lane_state: Any) -> tuple[Any, IntervalLog]:
+        input_columns, x, settings = config.unpack_leaves(leaves)
+        walk_settings = config.make_walk_settings(settings)
+        state_after_event, lane_state = process_and_integrate(
+            walk_settings,
+            walk_settings.replace_invalid(input_columns, x)[0],
+            lane_state,
+            waits_for_events=True,
         )
-        assert processed.accumulators is not None
-        (point, contact_state), zero = (
-            (processed.interval.point, processed.interval.contact_state),
-            jnp.zeros_like(lane.interval.time),
+        assert state_after_event.step_accumulators is not None
+        (point, contact_state), zero_time = (
+            (state_after_event.interval.point, state_after_event.interval.contact_state),
+            jnp.zeros_like(lane_state.interval.time),
         )
-        state = pack_state(motion_from_point(point), Accumulators(zero, *processed.accumulators))
-        return lane, IntervalLog(
-            state, contact_state.contact, contact_state.locked, lane.interval.time
+        state = pack_state(
+            motion_from_point(point), Accumulators(zero_time, *state_after_event.step_accumulators)
+        )
+        return lane_state, IntervalLog(
+            state, contact_state.contact_modes, contact_state.locked, lane_state.interval.time
         )
 
     def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
-        columns, x, settings = config.unpack(leaves)
-        walk, no_legs = config.make_walk(settings), log.locked & False
-        contact_state = ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
+        input_columns, x, settings = config.unpack_leaves(leaves)
+        walk_settings, no_leg_flags = config.make_walk_settings(settings), log.locked & False
+        contact_state = ContactState(
+            log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags
+        )
         motion, accumulators = unpack_state(log.state)
-        dynamics = walk.make_dynamics(walk.replace_invalid(columns, x)[0], contact_state)
-        arguments = jnp.stack(accumulators[1:]), log.duration, n_samples, walk.options, walk.tableau
-        return sample_interval(dynamics, motion, *arguments)
+        dynamics = walk_settings.make_dynamics(
+            walk_settings.replace_invalid(input_columns, x)[0], contact_state
+        )
+        sampling_arguments = (
+            jnp.stack(accumulators[1:]),
+            log.duration,
+            n_samples,
+            walk_settings.options,
+            walk_settings.tableau,
+        )
+        return sample_interval(dynamics, motion, *sampling_arguments)
 
-    def run(*leaves: Array) -> SampledIntervals:
+    def sample_step(*leaves: Array) -> SampledIntervals:
         wheel, params, *_ = jax.tree.unflatten(structure, leaves)
-        initial = begin_compiled(*leaves)
-        log_template = jax.eval_shape(advance_compiled, leaves, initial)[1]
+        initial_state = compiled_start(*leaves)
+        log_template = jax.eval_shape(compiled_advance, leaves, initial_state)[1]
         allocate = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)
 
         def record_interval_end(state: tuple) -> tuple:
-            previous, log = state
-            lane, row = advance_compiled(leaves, previous)
-            index = previous.counters.n_events
-            index = jnp.where(lane.counters.n_events > index, index, wheel.max_events)
-            write_row = lambda old, new: old.at[index].set(new, mode="drop")
-            return lane, jax.tree.map(write_row, log, row)
+            previous_state, interval_log = state
+            lane_state, interval_entry = compiled_advance(leaves, previous_state)
+            entry_index = previous_state.counters.n_events
+            entry_index = jnp.where(
+                lane_state.counters.n_events > entry_index, entry_index, wheel.max_events
+            )
+            write_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
+                entry_leaf, mode="drop"
+            )
+            return lane_state, jax.tree.map(write_entry, interval_log, interval_entry)
 
         should_continue = lambda state: state[0].outcome == STATUS_UNFINISHED
-        lane, log = lax.while_loop(
-            should_continue, record_interval_end, (initial, jax.tree.map(allocate, log_template))
+        lane_state, interval_log = lax.while_loop(
+            should_continue,
+            record_interval_end,
+            (initial_state, jax.tree.map(allocate, log_template)),
         )
-        final_state = motion_from_point(lane.interval.point), lane.interval.contact_state
-        columns, _, others = config.unpack(leaves)
-        walk = config.make_walk(others)
-        summary = walk.summarize(final_state, lane.counters, lane.outcome, walk.tilt(columns))
-        rows = jax.vmap(lambda log: sample_compiled(leaves, log))(log)
+        final_state = (
+            motion_from_point(lane_state.interval.point),
+            lane_state.interval.contact_state,
+        )
+        input_columns, _, step_settings = config.unpack_leaves(leaves)
+        walk_settings = config.make_walk_settings(step_settings)
+        summary = walk_settings.summarize_step(
+            final_state, lane_state.counters, lane_state.outcome, walk_settings.tilt(input_columns)
+        )
+        sample_rows = jax.vmap(lambda interval_log: compiled_sampling(leaves, interval_log))(
+            interval_log
+        )
         return SampledIntervals(
-            log, summary, lane.outcome, *_unpack_samples(params.n_legs, log, rows)
+            interval_log,
+            summary,
+            lane_state.outcome,
+            *_unpack_sample_rows(params.n_legs, interval_log, sample_rows),
         )
 
-    begin_compiled = unbatch(
+    compiled_start = unbatch(
         cached_lane_function(begin_lane, begin_lane, ("start on real ground", cache_key))
     )
     make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
-    advance_compiled = unbatch(
+    compiled_advance = unbatch(
         cached_lane_function(advance_to_event, make_template, ("to the next event", cache_key))
     )
-    sample_compiled = unbatch(
+    compiled_sampling = unbatch(
         cached_lane_function(
             sample_intervals,
             lambda leaves, log: log.duration,
             ("samples on real ground", cache_key, n_samples),
         )
     )
-    return jax.jit(run)
+    return jax.jit(sample_step)
 
 
-def _unpack_samples(n: int, log: IntervalLog, rows: Array) -> tuple[Array, Array, Array]:
+def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[Array, Array, Array]:
     """Return rows of `sample_interval` as packed states, and tangential and normal forces of all
     legs.
     """
-    n_samples, size = rows.shape[1], 3 + n
-    clock = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
-    q, v, accumulators, forces = jnp.split(rows, (size, 2 * size, 2 * size + 3), -1)
-    state = [q[..., :3], v[..., :3], q[..., 3:], v[..., 3:], clock[..., None], accumulators]
+    n_samples, n_coordinates = sample_rows.shape[1], 3 + n
+    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]
+    q, v, accumulators, forces = jnp.split(
+        sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + 3), -1
+    )
+    state_parts = [
+        q[..., :3],
+        v[..., :3],
+        q[..., 3:],
+        v[..., 3:],
+        time_since_event[..., None],
+        accumulators,
+    ]
     slots = jax.vmap(lambda contact: find_slots(contact != ContactMode.OFF))(log.contact)
-    scatter_to_legs = jax.vmap(jax.vmap(lambda slots, pair: slots.scatter(pair), (None, 0)))
+    scatter_to_legs = jax.vmap(
+        jax.vmap(lambda slots, slot_pair: slots.scatter(slot_pair), (None, 0))
+    )
     normal, tangential = (scatter_to_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
-    return jnp.concatenate(state, -1), tangential, normal
+    return jnp.concatenate(state_parts, -1), tangential, normal

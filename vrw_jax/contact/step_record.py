@@ -35,9 +35,9 @@ from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 class RestOptions:
     """Rules by which a foot that dips ever less comes to rest."""
 
-    dip_depth_per_atol: float = 1e-2
+    bounce_height_per_atol: float = 1e-2
     """Smallest depth of a dip that a step follows, as a fraction of the absolute tolerance."""
-    dip_depth_eps: float = 4e2
+    bounce_height_eps: float = 4e2
     """The same in units of round-off of a leg's length: 1e-13 m in float64."""
     n_events_before_ramp: int = 100
     """Number of events of a step after which each event raises the rest speed by its initial value.
@@ -51,12 +51,12 @@ class RestOptions:
 REST_OPTIONS = RestOptions()
 
 
-def min_dip_depth(
+def min_bounce_height(
     L0: Elementwise, options: StepOptions, rest_options: RestOptions = REST_OPTIONS
 ) -> Array:
     """Return the smallest depth of a dip that a step follows, m."""
-    roundoff_depth = rest_options.dip_depth_eps * jnp.finfo(L0.dtype).eps
-    return jnp.maximum(rest_options.dip_depth_per_atol * options.atol, roundoff_depth) * L0
+    roundoff_height = rest_options.bounce_height_eps * jnp.finfo(L0.dtype).eps
+    return jnp.maximum(rest_options.bounce_height_per_atol * options.atol, roundoff_height) * L0
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
@@ -80,7 +80,7 @@ def make_contact_law(
     """Return the contact law of a walk; the rest speed is that of the smallest dip under
     gravity.
     """
-    rest_speed = jnp.sqrt(2.0 * s.g * min_dip_depth(s.L0, options))
+    rest_speed = jnp.sqrt(2.0 * s.g * min_bounce_height(s.L0, options))
     return ContactLaw(s, friction, is_one_sided, counts_solutions, rest_speed, restitution, tilt)
 
 
@@ -104,7 +104,7 @@ def process_event(
     """
     ramp_start = max(rest_options.n_events_before_ramp, max_events // 4)
     law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
-    motion = project_motion(law.s, motion, contact_state.contact, contact_state.locked)
+    motion = project_motion(law.s, motion, contact_state.contact_modes, contact_state.locked)
     event = classify_event(layout, guard)
     result = resolve_event(law, motion, contact_state, event)
     outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
@@ -131,12 +131,12 @@ class StepCounters(NamedTuple):
     n_solver_steps: Int[Array, "..."]  # attempted
 
 
-def init_counters(reference: Array) -> StepCounters:
+def init_counters(template: Array) -> StepCounters:
     """Return the counters at the start of a step, for wheels of the shape and dtype of the
     argument.
     """
-    zero_count = jnp.zeros(reference.shape, jnp.int32)
-    return StepCounters(zero_count, jnp.zeros((3, *reference.shape), reference.dtype), zero_count)
+    int_zeros = jnp.zeros(template.shape, jnp.int32)
+    return StepCounters(int_zeros, jnp.zeros((3, *template.shape), template.dtype), int_zeros)
 
 
 def add_interval(
@@ -146,9 +146,9 @@ def add_interval(
     n_solver_steps: Array,
 ) -> StepCounters:
     """Return the counters after one more interval in this contact state."""
-    n_loaded = jnp.sum(contact_state.contact != ContactMode.OFF, axis=0)
-    has_n_feet = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
-    durations = counters.durations + jnp.where(has_n_feet, duration, 0.0)
+    n_loaded = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
+    is_foot_count = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
+    durations = counters.durations + jnp.where(is_foot_count, duration, 0.0)
     return counters._replace(
         durations=durations, n_solver_steps=counters.n_solver_steps + n_solver_steps
     )
@@ -157,10 +157,10 @@ def add_interval(
 def interval_outcome(
     counters: StepCounters,
     layout: GuardLayout,
-    is_at_event: Array,
+    has_reached_event: Array,
     guard: Array,
     has_landed: Array,
-    failure: Array,
+    failure_outcome: Array,
     is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
@@ -169,11 +169,13 @@ def interval_outcome(
     If the interval ended at no event, the result is `failure`. CAME_TO_REST replaces either if
     the wheel `is_resting`.
     """
-    code = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-    code = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, code)
-    code = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, code)
-    code = jnp.where(is_at_event, jnp.where(has_landed, Outcome.STEPPED, code), failure)
-    return replace_rest_outcome(code, is_resting)
+    outcome = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
+    outcome = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, outcome)
+    outcome = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, outcome)
+    outcome = jnp.where(
+        has_reached_event, jnp.where(has_landed, Outcome.STEPPED, outcome), failure_outcome
+    )
+    return replace_rest_outcome(outcome, is_resting)
 
 
 class StepDetails(NamedTuple):
@@ -192,18 +194,18 @@ class StepDetails(NamedTuple):
 
 def init_details(dtype: jnp.dtype) -> StepDetails:
     """Return the details of one wheel at the start of a step."""
-    zero, zero_count = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    pair = jnp.zeros((2,), dtype)
+    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    zero_pair = jnp.zeros((2,), dtype)
     return StepDetails(
-        post_impact=pair,
+        post_impact=zero_pair,
         mode_durations=jnp.zeros((4, 4), dtype),
-        landing_normal=pair,
-        landing_tangential=pair,
-        energy_impacts=zero,
-        margins=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
-        impacts=zero_count,
-        fewest_solutions=zero_count + jnp.iinfo(jnp.int32).max,
-        most_solutions=zero_count,
+        landing_normal=zero_pair,
+        landing_tangential=zero_pair,
+        energy_impacts=float_zero,
+        margins=UnilateralMargins(float_zero + jnp.inf, float_zero + jnp.inf),
+        impacts=int_zero,
+        fewest_solutions=int_zero + jnp.iinfo(jnp.int32).max,
+        most_solutions=int_zero,
     )
 
 
@@ -214,20 +216,20 @@ def record_event(
 
     - `is_first`: whether the event is the first of the step.
     """
-    opening = (
+    opening_values = (
         jnp.stack([result.motion.theta, result.motion.dtheta]),
         jnp.stack(result.normal_impulse),
         jnp.stack(result.tangential_impulse),
     )
-    previous = details.post_impact, details.landing_normal, details.landing_tangential
-    post_impact, normal, tangential = tree_where(is_first, opening, previous)
-    impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
+    previous_values = details.post_impact, details.landing_normal, details.landing_tangential
+    post_impact, normal, tangential = tree_where(is_first, opening_values, previous_values)
+    stopper_impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
     return details._replace(
         post_impact=post_impact,
         landing_normal=normal,
         landing_tangential=tangential,
         energy_impacts=details.energy_impacts + result.energy_lost,
-        margins=UnilateralMargins(details.margins.stopper_force, impulse),
+        margins=UnilateralMargins(details.margins.stopper_force, stopper_impulse),
         impacts=details.impacts + event.is_impact,
         fewest_solutions=jnp.minimum(details.fewest_solutions, result.n_solutions),
         most_solutions=jnp.maximum(details.most_solutions, result.most_solutions),
@@ -236,7 +238,7 @@ def record_event(
 
 def record_interval(
     details: StepDetails,
-    contact: Int[Array, "2 ..."],
+    slot_modes: Int[Array, "2 ..."],
     duration: Elementwise,
     stopper_force: Elementwise,
 ) -> StepDetails:
@@ -245,14 +247,14 @@ def record_interval(
     They gain the durations of the slots' modes, and the minimum stopper force of legs in the air at
     the ends of the interval.
     """
-    modes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
-    first_mode, second_mode = (
-        (modes == contact[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
+    mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
+    first_mode_indicator, second_mode_indicator = (
+        (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
     stopper_force = jnp.minimum(details.margins.stopper_force, stopper_force)
     return details._replace(
         mode_durations=details.mode_durations
-        + first_mode[:, None] * second_mode[None, :] * duration,
+        + first_mode_indicator[:, None] * second_mode_indicator[None, :] * duration,
         margins=UnilateralMargins(stopper_force, details.margins.stopper_impulse),
     )
 
@@ -338,19 +340,19 @@ def make_unilateral_step(
     tilt: Elementwise | None = None,
 ) -> UnilateralStep:
     """Return the step of this final state and these records."""
-    landing = landing_position(motion.L.shape[0], motion)
-    finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
+    landing_place = landing_position(motion.L.shape[0], motion)
+    replace_nonfinite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(
-        margins=jax.tree.map(finite, details.margins),
+        margins=jax.tree.map(replace_nonfinite, details.margins),
         fewest_solutions=jnp.where(counters.n_events > 0, details.fewest_solutions, 0),
     )
     return UnilateralStep(
         section_state=final_section_state(motion, contact_state, outcome, tilt),
         durations=counters.durations,
-        step_length=jnp.where(outcome == Outcome.STEPPED, landing, 0.0),
-        energy_damping=accumulators.damping,
-        energy_friction=accumulators.friction,
-        slip=accumulators.slip,
+        step_length=jnp.where(outcome == Outcome.STEPPED, landing_place, 0.0),
+        energy_damping=accumulators.damping_loss,
+        energy_friction=accumulators.friction_loss,
+        slip=accumulators.slip_length,
         events=counters.n_events,
         outcome=outcome,
         solver_steps=counters.n_solver_steps,

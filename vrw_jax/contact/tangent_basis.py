@@ -28,9 +28,9 @@ from vrw_jax.contact.dynamics_jvp import (
     ResidualTangent,
     TotalTangent,
     free_motion_tangent,
-    motion_row_tangents,
+    motion_equation_tangents,
     residual_jvp,
-    solve_motion_with_free,
+    solve_forces_with_free_motion,
     sum_residual,
 )
 from vrw_jax.contact.mechanics import (
@@ -52,7 +52,7 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 N_MOVING_LEGS = 3
 """Number of leading legs that usually include all that move: the others are on their stoppers."""
-_LEG_SLICES = slice(0, N_MOVING_LEGS), slice(N_MOVING_LEGS, None)
+_LEG_GROUP_SLICES = slice(0, N_MOVING_LEGS), slice(N_MOVING_LEGS, None)
 _MASS_PARAMETERS = "hub_mass", "leg_mass", "leg_com"
 _SPRING_PARAMETERS = "natural_length", "stiffness", "damping"
 _INPUT_NAMES = *PARAMETER_NAMES, "friction", "friction_before"  # the latter on uneven ground
@@ -75,8 +75,8 @@ CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
 class UnitResponse(NamedTuple):
     """Response to a unit input, with forces and accelerations fixed."""
 
-    legs: LegArray  # of their lengths
-    totals: TotalTangent
+    leg_lengths: LegArray  # of their lengths
+    total_tangent: TotalTangent
     foot_speed: SlotPair  # of the slots' feet along the slope
     damping: Array  # W
 
@@ -87,17 +87,17 @@ class _UnitLengthResponse(NamedTuple):
     - `slots`: responses of lengths, of feet along e and along u, and of foot speed.
     """
 
-    legs: LegArray  # of its own length
+    leg_lengths: LegArray  # of its own length
     hub: tuple[LegArray, LegArray, LegArray]
-    slots: tuple[SlotPair, SlotPair, SlotPair, SlotPair]
+    slot_responses: tuple[SlotPair, SlotPair, SlotPair, SlotPair]
 
 
 class _LengthResponse(NamedTuple):
     """Response to the lengths and rates of some legs along a tangent."""
 
     hub: HubVector
-    L: SlotPair  # the slots'
-    dL: SlotPair
+    slot_length: SlotPair  # the slots'
+    slot_length_rate: SlotPair
     damping: Array
 
 
@@ -107,8 +107,8 @@ class _PointLinearization(NamedTuple):
     dynamics: ModeDynamics
     motion: WheelMotion
     configuration: ContactConfiguration
-    hub: ContactInverseInertia
-    free: FreeMotion
+    inertia: ContactInverseInertia
+    free_motion: FreeMotion
     solution: ForceSolution
     zero_tangent: ContactConfiguration  # floats of the zero tangent
 
@@ -116,30 +116,32 @@ class _PointLinearization(NamedTuple):
     def from_motion(cls, dynamics: ModeDynamics, motion: WheelMotion) -> "_PointLinearization":
         """Return the linearization at this motion."""
         configuration = dynamics.configure(motion)
-        solved = solve_motion_with_free(configuration)
-        floats = eqx.filter(configuration, eqx.is_inexact_array)
-        zero_tangent = jax.tree.map(jnp.zeros_like, floats)
-        return cls(dynamics, motion, configuration, *solved, zero_tangent)
+        force_solution = solve_forces_with_free_motion(configuration)
+        float_leaves = eqx.filter(configuration, eqx.is_inexact_array)
+        zero_tangent = jax.tree.map(jnp.zeros_like, float_leaves)
+        return cls(dynamics, motion, configuration, *force_solution, zero_tangent)
 
     def make_leg_residual(
         self, leg_slice: slice
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]:
         """Return the residual tangent of some legs along a tangent, and the slots of these legs."""
-        rest = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
+        static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
         configuration = _restrict_legs(self.configuration, leg_slice)
-        directions = LegDirections(*(row[leg_slice] for row in self.hub.legs))
-        hub = self.hub._replace(legs=directions, is_released=self.hub.is_released[leg_slice])
-        solution = self.solution._replace(lengths=self.solution.lengths[leg_slice])
+        directions = LegDirections(*(leg_row[leg_slice] for leg_row in self.inertia.legs))
+        hub = self.inertia._replace(
+            legs=directions, is_released=self.inertia.is_released[leg_slice]
+        )
+        solution = self.solution._replace(length_motion=self.solution.length_motion[leg_slice])
 
         @jax.jit  # traced once
         def compute_residual(tangent: ContactConfiguration) -> ResidualTangent:
             arguments = (
                 configuration,
-                _restrict_legs(eqx.combine(tangent, rest), leg_slice),
+                _restrict_legs(eqx.combine(tangent, static_leaves), leg_slice),
                 hub,
                 solution,
             )
-            return residual_jvp(*arguments, *motion_row_tangents(*arguments))
+            return residual_jvp(*arguments, *motion_equation_tangents(*arguments))
 
         return lambda tangent: (compute_residual(tangent), configuration.slots)
 
@@ -151,7 +153,7 @@ class _PointLinearization(NamedTuple):
         )
         return jax.jvp(compute_speeds, (self.motion,), (tangent,))[1]
 
-    def respond(
+    def linearize_along(
         self,
         motion: WheelMotion,
         leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]],
@@ -163,40 +165,47 @@ class _PointLinearization(NamedTuple):
             motion
         )
 
-    def unit_length_responses(
+    def compute_unit_length_responses(
         self, leg_slice: slice
     ) -> tuple[_UnitLengthResponse, _UnitLengthResponse]:
         """Return the responses to some legs' lengths, and to their rates."""
         leg_residual = self.make_leg_residual(leg_slice)
 
-        def respond_to(name: str) -> _UnitLengthResponse:
-            row = getattr(self.zero_tangent.motion, name)
+        def respond_to_coordinate(coordinate_name: str) -> _UnitLengthResponse:
+            leg_row = getattr(self.zero_tangent.motion, coordinate_name)
             unit_tangent = jnp.stack(
-                [x + float(i in range(len(row))[leg_slice]) for i, x in enumerate(row)]
+                [x + float(i in range(len(leg_row))[leg_slice]) for i, x in enumerate(leg_row)]
             )
-            residual, slots, speed = self.respond(
-                self.zero_tangent.motion._replace(**{name: unit_tangent}), leg_residual
+            residual, slots, foot_speed = self.linearize_along(
+                self.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}), leg_residual
             )
             return _UnitLengthResponse(
                 residual.legs,
                 residual.hub,
-                (slots.gather(residual.legs), residual.foot_e, residual.foot_u, speed),
+                (
+                    slots.gather(residual.legs),
+                    residual.foot_transverse,
+                    residual.foot_radial,
+                    foot_speed,
+                ),
             )
 
-        return respond_to("L"), respond_to("dL")
+        return respond_to_coordinate("L"), respond_to_coordinate("dL")
 
     def linearize_solution(self) -> Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]:
         """Return the tangent map from free motion to hub acceleration, pulls and tangential
         forces.
         """
         s, friction = self.configuration.s, self.configuration.friction
-        contact, held = self.configuration.contact, self.configuration.held
+        slot_modes, is_held = self.configuration.slot_modes, self.configuration.is_held
 
-        def solve(free: FreeMotion) -> tuple[HubVector, SlotPair, SlotPair]:
-            solution = solve_combination(s, self.hub, free, contact, held, friction)
+        def solve(free_motion: FreeMotion) -> tuple[HubVector, SlotPair, SlotPair]:
+            solution = solve_combination(
+                s, self.inertia, free_motion, slot_modes, is_held, friction
+            )
             return solution.hub, solution.pull, solution.tangential
 
-        return jax.linearize(solve, self.free)[1]
+        return jax.linearize(solve, self.free_motion)[1]
 
 
 def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> ContactConfiguration:
@@ -204,8 +213,8 @@ def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> Con
     motion, slots = configuration.motion, configuration.slots
     return configuration._replace(
         motion=motion._replace(L=motion.L[leg_slice], dL=motion.dL[leg_slice]),
-        slots=Slots(slots.first[leg_slice], slots.second[leg_slice]),
-        airborne=configuration.airborne[leg_slice],
+        slots=Slots(slots.first_mask[leg_slice], slots.second_mask[leg_slice]),
+        is_airborne_locked=configuration.is_airborne_locked[leg_slice],
     )
 
 
@@ -220,202 +229,255 @@ class TangentBasis(NamedTuple):
     linearization: _PointLinearization
     forces: ContactForces
     solve_tangent: Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]
-    whole_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]
+    all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]
     angle_responses: tuple[UnitResponse, UnitResponse]  # to the angle, and to its rate
     length_responses: tuple[
         tuple[_UnitLengthResponse, _UnitLengthResponse],
         tuple[_UnitLengthResponse, _UnitLengthResponse],
     ]
     slot_responses: tuple[tuple[SlotPair, SlotPair, SlotPair, SlotPair], ...]
-    damping: LegArray  # W, for a unit rate of each leg
+    damping_response: LegArray  # W, for a unit rate of each leg
     slip_tangent: Callable[[SlotPair, SlotPair], Array]  # tangent of sliding loss and slip
 
     @classmethod
     def from_motion(
-        cls, dynamics: ModeDynamics, motion: WheelMotion, has_more_moving: Array
+        cls, dynamics: ModeDynamics, motion: WheelMotion, has_later_moving_legs: Array
     ) -> "TangentBasis":
         """Return the basis at this motion; `has_more_moving`: more than the first legs move."""
         linearization = _PointLinearization.from_motion(dynamics, motion)
-        current_forces = compute_forces(dynamics, motion)
-        whole_residual = linearization.make_leg_residual(slice(None))
-        first_responses, n = linearization.unit_length_responses(_LEG_SLICES[0]), len(motion.L)
-        make_zeros = lambda x: jnp.zeros(
-            (n - N_MOVING_LEGS, *x.shape[1:]) if x.ndim > 1 else x.shape, x.dtype
+        forces = compute_forces(dynamics, motion)
+        all_leg_residual = linearization.make_leg_residual(slice(None))
+        first_responses, n = (
+            linearization.compute_unit_length_responses(_LEG_GROUP_SLICES[0]),
+            len(motion.L),
+        )
+        make_zeros = lambda foot_velocity_x: jnp.zeros(
+            (n - N_MOVING_LEGS, *foot_velocity_x.shape[1:])
+            if foot_velocity_x.ndim > 1
+            else foot_velocity_x.shape,
+            foot_velocity_x.dtype,
         )
         other_responses = run_if_any(
-            has_more_moving,
-            lambda _: linearization.unit_length_responses(_LEG_SLICES[1]),
+            has_later_moving_legs,
+            lambda _: linearization.compute_unit_length_responses(_LEG_GROUP_SLICES[1]),
             jax.tree.map(make_zeros, first_responses),
         )
 
-        def compute_slip(x: SlotPair, tangential: SlotPair) -> Array:
-            solution = current_forces.solution._replace(tangential=tangential)
+        def compute_slip_rates(x: SlotPair, tangential: SlotPair) -> Array:
+            solution = forces.solution._replace(tangential=tangential)
             rates = accumulator_rates(
                 dynamics,
                 motion,
-                current_forces._replace(solution=solution, foot_velocity=FootVelocity(x, x)),
+                forces._replace(solution=solution, foot_velocity=FootVelocity(x, x)),
             )
-            return jnp.stack([rates.friction, rates.slip])
+            return jnp.stack([rates.friction_loss, rates.slip_length])
 
         compute_damping = lambda dL: (
-            accumulator_rates(dynamics, motion._replace(dL=dL), current_forces).damping
+            accumulator_rates(dynamics, motion._replace(dL=dL), forces).damping_loss
         )
-        (damping,) = jax.vjp(compute_damping, motion.dL)[1](jnp.ones_like(motion.theta))
+        (damping_response,) = jax.vjp(compute_damping, motion.dL)[1](jnp.ones_like(motion.theta))
         _, slip_tangent = jax.linearize(
-            compute_slip, current_forces.foot_velocity.x, current_forces.solution.tangential
+            compute_slip_rates, forces.foot_velocity.x, forces.solution.tangential
         )
-        ones = jnp.ones_like(motion.theta)
+        unit_tangent = jnp.ones_like(motion.theta)
 
-        def respond_to_angle(name: str) -> UnitResponse:
-            residual, slots, foot_speed = linearization.respond(
-                linearization.zero_tangent.motion._replace(**{name: ones}), whole_residual
+        def respond_to_angle(coordinate_name: str) -> UnitResponse:
+            residual, slots, foot_speed = linearization.linearize_along(
+                linearization.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}),
+                all_leg_residual,
             )
             return UnitResponse(
-                residual.legs, sum_residual(slots, residual), foot_speed, jnp.zeros_like(ones)
+                residual.legs,
+                sum_residual(slots, residual),
+                foot_speed,
+                jnp.zeros_like(unit_tangent),
             )
 
         angle_responses = respond_to_angle("theta"), respond_to_angle("dtheta")
         slot_responses = [
-            jax.tree.map(operator.add, *(x.slots for x in responses))
+            jax.tree.map(
+                operator.add, *(foot_velocity_x.slot_responses for foot_velocity_x in responses)
+            )
             for responses in zip(first_responses, other_responses, strict=True)
         ]
         return cls(
             linearization,
-            current_forces,
+            forces,
             linearization.linearize_solution(),
-            whole_residual,
+            all_leg_residual,
             angle_responses,
             (first_responses, other_responses),
             tuple(slot_responses),
-            damping,
+            damping_response,
             slip_tangent,
         )
 
-    def respond_to_columns(
-        self, flow_at: DynamicsFn, columns: Array, tangent: Array
+    def compute_column_response(
+        self, dynamics_fn: DynamicsFn, input_columns: Array, input_tangent: Array
     ) -> UnitResponse:
         """Return the response to a tangent of the input columns."""
-        linearization, zero_response = self.linearization, self.make_zero()
+        linearization, zero_response = self.linearization, self.make_zero_response()
 
-        def configure_columns(columns: Array) -> tuple[ContactConfiguration, Array]:
-            dynamics = flow_at(columns)
+        def configure_columns(input_columns: Array) -> tuple[ContactConfiguration, Array]:
+            dynamics = dynamics_fn(input_columns)
             rates = accumulator_rates(dynamics, linearization.motion, self.forces)
             return eqx.filter(
                 dynamics.configure(linearization.motion), eqx.is_inexact_array
-            ), rates.damping
+            ), rates.damping_loss
 
-        _, push_columns = jax.linearize(configure_columns, columns)
-        total = zero_response
-        for alike in PARAMETER_GROUPS:
-            group = [i for i in alike if i < len(tangent)]
+        _, column_pushforward = jax.linearize(configure_columns, input_columns)
+        total_response = zero_response
+        for parameter_group in PARAMETER_GROUPS:
+            input_indices = [i for i in parameter_group if i < len(input_tangent)]
             group_tangent = jnp.stack(
-                [row if i in group else 0.0 * row for i, row in enumerate(tangent)]
+                [
+                    input_row if i in input_indices else 0.0 * input_row
+                    for i, input_row in enumerate(input_tangent)
+                ]
             )
 
             def add_response(
-                total: UnitResponse, group_tangent: Array = group_tangent
+                total_response: UnitResponse, group_tangent: Array = group_tangent
             ) -> UnitResponse:
-                configuration, damping = push_columns(group_tangent)
-                residual, slots = self.whole_residual(configuration)
+                configuration, damping_tangent = column_pushforward(group_tangent)
+                residual, slots = self.all_leg_residual(configuration)
                 response = UnitResponse(
-                    residual.legs, sum_residual(slots, residual), zero_response.foot_speed, damping
+                    residual.leg_lengths,
+                    sum_residual(slots, residual),
+                    zero_response.foot_speed,
+                    damping_tangent,
                 )
-                return jax.tree.map(operator.add, total, response)
+                return jax.tree.map(operator.add, total_response, response)
 
-            has_tangent = jnp.any(jnp.stack([tangent[i] != 0.0 for i in group]))
-            total = run_if_any(has_tangent, add_response, total)
-        return total
+            has_tangent = jnp.any(jnp.stack([input_tangent[i] != 0.0 for i in input_indices]))
+            total_response = run_if_any(has_tangent, add_response, total_response)
+        return total_response
 
-    def make_zero(self) -> UnitResponse:
+    def make_zero_response(self) -> UnitResponse:
         """Return the zero response."""
         return jax.tree.map(jnp.zeros_like, self.angle_responses[0])
 
     def propagate_tangent(
         self,
-        coordinates: CoordinateTangentFn,
+        coordinate_tangent_fn: CoordinateTangentFn,
         column_response: UnitResponse,
-        has_more_moving: Array,
+        has_later_moving_legs: Array,
     ) -> Array:
         """Return the tangent of the accelerations and, if requested, of the accumulators."""
-        q, v = coordinates(slice(0, 3 + N_MOVING_LEGS))
-        theta, dtheta, first_tangents = q[2], v[2], (q[3:], v[3:])
-        other_tangents = lambda: coordinates(slice(3 + N_MOVING_LEGS, None))
+        q, v = coordinate_tangent_fn(slice(0, 3 + N_MOVING_LEGS))
+        theta, dtheta, first_length_tangents = q[2], v[2], (q[3:], v[3:])
+        later_length_tangents = lambda: coordinate_tangent_fn(slice(3 + N_MOVING_LEGS, None))
         add_trees = lambda first, second: jax.tree.map(operator.add, first, second)
-        lengths = self._propagate_lengths(0, *first_tangents)
-        lengths = run_if_any(
-            has_more_moving,
-            lambda _: add_trees(lengths, self._propagate_lengths(1, *other_tangents())),
-            lengths,
+        length_response = self._propagate_lengths(0, *first_length_tangents)
+        length_response = run_if_any(
+            has_later_moving_legs,
+            lambda _: add_trees(
+                length_response, self._propagate_lengths(1, *later_length_tangents())
+            ),
+            length_response,
         )
-        combine = lambda a, b, c: a * theta + b * dtheta + c
-        responses = [
-            jax.tree.map(combine, *rows)
-            for rows in zip(*self.angle_responses, column_response, strict=True)
+        combine_responses = lambda a, b, c: a * theta + b * dtheta + c
+        combined_responses = [
+            jax.tree.map(combine_responses, *slot_rows)
+            for slot_rows in zip(*self.angle_responses, column_response, strict=True)
         ][1:]
-        totals, foot_speed, damping = responses
-        rows = totals.slot_legs, totals.foot_e, totals.foot_u, foot_speed
-        slot_legs, foot_e, foot_u, foot_speed = (
-            tuple(a[i] + b[i] * lengths.L[i] + c[i] * lengths.dL[i] for i in range(2))
-            for a, b, c in zip(rows, *self.slot_responses, strict=True)
+        total_tangent, foot_speed, damping_tangent = combined_responses
+        slot_rows = (
+            total_tangent.slot_legs,
+            total_tangent.foot_transverse,
+            total_tangent.foot_radial,
+            foot_speed,
         )
-        hub = tuple(map(operator.add, totals.hub, lengths.hub))
-        totals = TotalTangent(hub, slot_legs, foot_e, foot_u, totals.friction_tangent)
-        free = free_motion_tangent(
-            self.linearization.hub, jnp.zeros_like(self.linearization.motion.L), totals
+        slot_lengths, foot_transverse, foot_radial, foot_speed = (
+            tuple(
+                a[i] + b[i] * length_response.L[i] + c[i] * length_response.dL[i] for i in range(2)
+            )
+            for a, b, c in zip(slot_rows, *self.slot_responses, strict=True)
         )
-        hub, pull, tangential = self.solve_tangent(free)
+        hub_tangent = tuple(map(operator.add, total_tangent.hub, length_response.hub))
+        total_tangent = TotalTangent(
+            hub_tangent, slot_lengths, foot_transverse, foot_radial, total_tangent.friction_force
+        )
+        free_tangent = free_motion_tangent(
+            self.linearization.inertia, jnp.zeros_like(self.linearization.motion.L), total_tangent
+        )
+        hub_tangent, pull_tangent, tangential_tangent = self.solve_tangent(free_tangent)
         propagate_legs = lambda group_index, *length_tangents: self._propagate_legs(
-            group_index, hub, pull, combine, column_response.legs, *length_tangents
+            group_index,
+            hub_tangent,
+            pull_tangent,
+            combine_responses,
+            column_response.leg_lengths,
+            *length_tangents,
         )
-        zero_legs = jnp.zeros((len(self.damping) - N_MOVING_LEGS, *theta.shape), theta.dtype)
+        zero_legs = jnp.zeros(
+            (len(self.damping_response) - N_MOVING_LEGS, *theta.shape), theta.dtype
+        )
         row_tangents = [
-            jnp.stack(hub),
-            propagate_legs(0, *first_tangents),
-            run_if_any(has_more_moving, lambda _: propagate_legs(1, *other_tangents()), zero_legs),
+            jnp.stack(hub_tangent),
+            propagate_legs(0, *first_length_tangents),
+            run_if_any(
+                has_later_moving_legs,
+                lambda _: propagate_legs(1, *later_length_tangents()),
+                zero_legs,
+            ),
         ]
-        if self.linearization.dynamics.accumulates:
+        if self.linearization.dynamics.has_accumulators:
             foot_speed = foot_speed[0] + v[0], foot_speed[1] + v[0]
-            tangential = tuple(map(operator.add, tangential, totals.friction_tangent))
+            tangential_tangent = tuple(
+                map(operator.add, tangential_tangent, total_tangent.friction_force)
+            )
             row_tangents += [
-                (damping + lengths.damping)[None],
-                self.slip_tangent(foot_speed, tangential),
+                (damping_tangent + length_response.damping)[None],
+                self.slip_tangent(foot_speed, tangential_tangent),
             ]
         return jnp.concatenate(row_tangents)
 
     def _propagate_lengths(self, group_index: int, L: Any, dL: Any) -> _LengthResponse:
-        by_length, by_rate = self.length_responses[group_index]
-        leg_slice = _LEG_SLICES[group_index]
-        total_response = lambda a, b: sum_over_legs(a * L + b * dL)
-        x, z, rotation = map(total_response, by_length.hub, by_rate.hub)
+        length_response, rate_response = self.length_responses[group_index]
+        leg_slice = _LEG_GROUP_SLICES[group_index]
+        sum_response = lambda a, b: sum_over_legs(a * L + b * dL)
+        x, z, rotation = map(sum_response, length_response.hub, rate_response.hub)
         slots = self.linearization.dynamics.slots
-        group_slots = Slots(slots.first[leg_slice], slots.second[leg_slice])
+        group_slots = Slots(slots.first_mask[leg_slice], slots.second_mask[leg_slice])
         return _LengthResponse(
             (x, z, rotation),
             group_slots.gather(L),
             group_slots.gather(dL),
-            sum_over_legs(self.damping[leg_slice] * dL),
+            sum_over_legs(self.damping_response[leg_slice] * dL),
         )
 
     def _propagate_legs(
         self,
         group_index: int,
-        hub: HubVector,
-        pull: SlotPair,
-        combine: Callable,
-        column_legs: Any,
+        hub_tangent: HubVector,
+        pull_tangent: SlotPair,
+        combine_responses: Callable,
+        column_leg_response: Any,
         L: Any,
         dL: Any,
     ) -> Array:
-        (by_length, by_rate), leg_slice, linearization = (
+        (length_response, rate_response), leg_slice, linearization = (
             self.length_responses[group_index],
-            _LEG_SLICES[group_index],
+            _LEG_GROUP_SLICES[group_index],
             self.linearization,
         )
-        by_angle = combine(
-            *(response.legs[leg_slice] for response in self.angle_responses), column_legs[leg_slice]
+        angle_response = combine_responses(
+            *(response.leg_lengths[leg_slice] for response in self.angle_responses),
+            column_leg_response[leg_slice],
         )
         configuration = _restrict_legs(linearization.configuration, leg_slice)
-        sin, cos = (row[leg_slice] for row in linearization.hub.legs)
-        outward = by_angle + by_length.legs * L + by_rate.legs * dL + sin * hub[0] + cos * hub[1]
-        outward = outward - configuration.slots.scatter(pull) / configuration.s.m
-        return jnp.where(linearization.configuration.has_fixed_length[leg_slice], 0.0, outward)
+        sin, cos = (row[leg_slice] for row in linearization.inertia.legs)
+        outward_motion = (
+            angle_response
+            + length_response.leg_lengths * L
+            + rate_response.leg_lengths * dL
+            + sin * hub_tangent[0]
+            + cos * hub_tangent[1]
+        )
+        outward_motion = (
+            outward_motion - configuration.slots.scatter(pull_tangent) / configuration.s.m
+        )
+        return jnp.where(
+            linearization.configuration.has_fixed_length[leg_slice], 0.0, outward_motion
+        )

@@ -20,9 +20,9 @@ from vrw_jax.contact.contact_state import (
     PackedState,
     choose_stopping_guard,
     compute_forces,
+    compute_guard_scales,
+    compute_guard_values,
     compute_packed_units,
-    guard_scales,
-    guard_values,
     is_wheel_at_rest,
     make_guard_layout,
     make_mode_dynamics,
@@ -255,7 +255,7 @@ class UnilateralWheel(AbstractWheel):
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for (theta-, dtheta-, dL1-), with Leg 1 on the ground."""
-        return _embedded(params, x) if x.shape == (3,) else x
+        return _embed_compiled(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
         """Return slope, friction, friction of the earlier feet, and tilt of the next line of each
@@ -293,24 +293,27 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
         """Return the outputs of a step, and the engine that took it."""
-        (leaves, structure), engine = self._leaves(params, x, options), self._engine(options)
+        (leaves, structure), engine = (
+            self._flatten_arguments(params, x, options),
+            self._choose_engine(options),
+        )
         return eqx.combine(*_compile_step(structure, is_detailed, engine)(*leaves)), engine
 
-    def _leaves(self, params: WheelParams, x: FullState, options: StepOptions) -> tuple[list, Any]:
+    def _flatten_arguments(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> tuple[list, Any]:
         """Return the leaves and the tree structure of (wheel, params, x, options)."""
         # Not by `replace`: friction is already validated and may be traced.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
-    def _engine(self, options: StepOptions) -> str:
+    def _choose_engine(self, options: StepOptions) -> str:
         """Return the name of the engine for these options."""
         return (
-            "lanes"
-            if self._is_supported_by_lanes(options) and can_use_lanes(options)
-            else "diffrax"
+            "lanes" if self._check_lane_support(options) and can_use_lanes(options) else "diffrax"
         )
 
-    def _is_supported_by_lanes(self, options: StepOptions) -> bool:
+    def _check_lane_support(self, options: StepOptions) -> bool:
         """Return whether machine code supports the ground: it has no restitution."""
         is_supported = self.restitution is None
         if options.engine == "lanes" and not is_supported:
@@ -323,23 +326,24 @@ class UnilateralWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        if self._engine(options) == "lanes":
-            leaves, structure = self._leaves(params, x, options)
+        if self._choose_engine(options) == "lanes":
+            leaves, structure = self._flatten_arguments(params, x, options)
             samples = build_contact_step_sampler(structure, n_samples)(*leaves)
         else:
             samples = self._sample_with_diffrax(params, x, options, n_samples)
-        log, summary = samples.log, samples.ends
-        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(log.duration)[:-1]])
+        interval_log, step_summary = samples.log, samples.summary
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(interval_log.duration)[:-1]])
         return UnilateralTrajectory(
-            time=start_times[:, None] + jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None],
+            time=start_times[:, None]
+            + jnp.linspace(0.0, 1.0, n_samples) * interval_log.duration[:, None],
             state=samples.state,
-            contact=log.contact,
-            locked=log.locked,
+            contact=interval_log.contact,
+            locked=interval_log.locked,
             tangential=samples.tangential,
             normal=samples.normal,
-            duration=log.duration,
-            section_state=summary.section_state,
-            step_length=summary.step_length,
+            duration=interval_log.duration,
+            section_state=step_summary.section_state,
+            step_length=step_summary.step_length,
             outcome=samples.outcome,
         )
 
@@ -347,41 +351,46 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> SampledIntervals:
         """Return the sampled step, integrated by diffrax."""
-        loop_state = _run_event_loop(self, params, x, options, is_detailed=False, has_log=True)
-        log, outcome = loop_state.log, loop_state.outcome
+        event_loop_state = _run_event_loop(
+            self, params, x, options, is_detailed=False, has_log=True
+        )
+        log, outcome = event_loop_state.log, event_loop_state.outcome
         assert log is not None
         tilt = None if self.uneven is None else self.uneven.tilt
         s, friction = params.symbols(), _foot_friction(self, self.friction)
 
-        def sample_phase_of_log(log: IntervalLog) -> tuple:
-            no_legs = jnp.zeros((s.n,), bool)
+        def sample_logged_interval(log: IntervalLog) -> tuple:
+            no_leg_flags = jnp.zeros((s.n,), bool)
             dynamics = make_mode_dynamics(
-                s, friction, False, ContactState(log.contact, log.locked, no_legs, no_legs, no_legs)
+                s,
+                friction,
+                False,
+                ContactState(log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags),
             )
-            units = compute_packed_units(s), compute_own_units(s).time
-            arguments = (
+            state_and_time_units = compute_packed_units(s), compute_own_units(s).time
+            sampling_arguments = (
                 partial(vector_field, dynamics),
                 log.state,
                 log.duration,
                 n_samples,
                 options,
-                *units,
+                *state_and_time_units,
             )
 
-            def foot_forces(state: PackedState) -> tuple:
+            def compute_foot_forces(state: PackedState) -> tuple:
                 solution = compute_forces(dynamics, unpack_state(state)[0]).solution
                 return dynamics.slots.scatter(solution.tangential), dynamics.slots.scatter(
                     solution.normal
                 )
 
-            states = sample_in_units(*arguments)
-            return states, *jax.vmap(foot_forces)(states)
+            states = sample_in_units(*sampling_arguments)
+            return states, *jax.vmap(compute_foot_forces)(states)
 
-        section_state, durations, *_ = _minimal_result(loop_state, tilt)
-        position = landing_position(s.n, unpack_state(loop_state.state)[0])
-        step_length = jnp.where(outcome == Outcome.STEPPED, position, 0.0)
-        summary = StepSummary(section_state, durations, step_length)
-        return SampledIntervals(log, summary, outcome, *lax.map(sample_phase_of_log, log))
+        section_state, durations, *_ = _minimal_result(event_loop_state, tilt)
+        landing_place = landing_position(s.n, unpack_state(event_loop_state.state)[0])
+        step_length = jnp.where(outcome == Outcome.STEPPED, landing_place, 0.0)
+        step_summary = StepSummary(section_state, durations, step_length)
+        return SampledIntervals(log, step_summary, outcome, *lax.map(sample_logged_interval, log))
 
 
 def _foot_friction(wheel: UnilateralWheel, friction: Elementwise) -> Friction:
@@ -408,13 +417,13 @@ def _run_event_loop(
     law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
     layout = make_guard_layout(n, wheel.has_one_sided_stoppers)
     motion, contact_state = unpack_section_state(s, x)
-    zero = jnp.zeros_like(motion.theta)
-    state = pack_state(motion, Accumulators(zero, zero, zero, zero))
+    float_zero = jnp.zeros_like(motion.theta)
+    state = pack_state(motion, Accumulators(float_zero, float_zero, float_zero, float_zero))
     allocate = lambda leaf: jnp.broadcast_to(leaf, (wheel.max_events, *leaf.shape))
-    first_log = IntervalLog(
+    log_template = IntervalLog(
         state, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), bool), jnp.zeros_like(x[0])
     )
-    initial = _EventLoopState(
+    initial_state = _EventLoopState(
         state=state,
         contact_state=contact_state,
         guard=jnp.int32(layout.landing),
@@ -422,13 +431,15 @@ def _run_event_loop(
         is_running=is_valid,
         counters=init_counters(x[0]),
         details=init_details(x.dtype) if is_detailed else None,
-        log=jax.tree.map(allocate, first_log) if has_log else None,
+        log=jax.tree.map(allocate, log_template) if has_log else None,
     )
     advance = partial(_advance_to_event, law, layout, wheel.max_events, options)
     return lax.while_loop(
-        lambda loop_state: opaque_condition(loop_state.is_running, loop_state.counters.n_events),
+        lambda event_loop_state: opaque_condition(
+            event_loop_state.is_running, event_loop_state.counters.n_events
+        ),
         advance,
-        initial,
+        initial_state,
     )
 
 
@@ -437,35 +448,40 @@ def _advance_to_event(
     layout: GuardLayout,
     max_events: int,
     options: StepOptions,
-    loop_state: _EventLoopState,
+    event_loop_state: _EventLoopState,
 ) -> _EventLoopState:
     """Return the state at the next event."""
-    motion, accumulators = unpack_state(loop_state.state)
-    event_arguments = loop_state.guard, loop_state.counters.n_events, max_events
+    motion, accumulators = unpack_state(event_loop_state.state)
+    event_arguments = event_loop_state.guard, event_loop_state.counters.n_events, max_events
     result, event, outcome = process_event(
-        law, layout, motion, loop_state.contact_state, *event_arguments
+        law, layout, motion, event_loop_state.contact_state, *event_arguments
     )
     dynamics = make_mode_dynamics(
         law.s, law.friction, law.is_one_sided, result.contact_state, tilt=law.tilt
     )
     is_valid = outcome == Outcome.STEPPED
-    start = pack_state(
-        result.motion, accumulators._replace(clock=jnp.zeros_like(accumulators.clock))
+    start_state = pack_state(
+        result.motion,
+        accumulators._replace(time_since_event=jnp.zeros_like(accumulators.time_since_event)),
     )
-    start = jnp.where(is_valid, start, loop_state.state)
+    start_state = jnp.where(is_valid, start_state, event_loop_state.state)
     guard_spec = MonitoredFunctions(
-        partial(guard_values, dynamics), layout.total, guard_scales=guard_scales(dynamics)
+        partial(compute_guard_values, dynamics),
+        layout.n_guards,
+        guard_scales=compute_guard_scales(dynamics),
     )
     units = compute_packed_units(dynamics.s), compute_own_units(dynamics.s).time
-    end = integrate_in_units(
-        partial(vector_field, dynamics), guard_spec, start, is_valid, options, *units
+    interval_end = integrate_in_units(
+        partial(vector_field, dynamics), guard_spec, start_state, is_valid, options, *units
     )
 
-    counters = loop_state.counters._replace(n_events=loop_state.counters.n_events + 1)
-    counters = add_interval(counters, result.contact_state, end.duration, end.solver_steps)
+    counters = event_loop_state.counters._replace(n_events=event_loop_state.counters.n_events + 1)
+    counters = add_interval(
+        counters, result.contact_state, interval_end.duration, interval_end.solver_steps
+    )
     end_forces = (
         compute_forces(dynamics, result.motion),
-        compute_forces(dynamics, unpack_state(end.state)[0]),
+        compute_forces(dynamics, unpack_state(interval_end.state)[0]),
     )
     determinant_before, determinant_after = (
         lax.stop_gradient(event_arguments.solution.painleve_determinant)
@@ -473,35 +489,46 @@ def _advance_to_event(
     )
     # Forces change sign at the singularity without passing through zero.
     is_singular = is_at_singularity(determinant_before, determinant_after, options)
-    failure = jnp.where(end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
-    failure = jnp.where(
-        is_valid, jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, failure), outcome
+    failure_outcome = jnp.where(
+        interval_end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
     )
-    end_motion, end_solution = unpack_state(end.state)[0], end_forces[1].solution
+    failure_outcome = jnp.where(
+        is_valid, jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, failure_outcome), outcome
+    )
+    end_motion, end_solution = unpack_state(interval_end.state)[0], end_forces[1].solution
     rates = lax.stop_gradient(pack_coordinates(end_motion)[1])
-    accelerations = lax.stop_gradient([*end_solution.hub, *end_solution.lengths])
-    guard = choose_stopping_guard(layout, dynamics, rates, end.guard, options.atol)
+    accelerations = lax.stop_gradient([*end_solution.hub, *end_solution.length_motion])
+    guard = choose_stopping_guard(layout, dynamics, rates, interval_end.guard, options.atol)
     is_resting = is_wheel_at_rest(dynamics.s, rates, accelerations, options.atol)
     has_event = is_valid & (guard >= 0) & ~is_singular
     has_landed = has_event & (guard == layout.foremost_landing)
-    arguments = counters, layout, has_event, guard, has_landed, failure
-    outcome = interval_outcome(*arguments, is_resting, max_events)
-    details, log = loop_state.details, loop_state.log
+    outcome_arguments = counters, layout, has_event, guard, has_landed, failure_outcome
+    outcome = interval_outcome(*outcome_arguments, is_resting, max_events)
+    details, log = event_loop_state.details, event_loop_state.log
     if details is not None:
-        details = record_event(details, loop_state.counters.n_events == 0, result, event)
+        details = record_event(details, event_loop_state.counters.n_events == 0, result, event)
         stopper_forces = [
             min_stopper_force(dynamics, event_arguments) for event_arguments in end_forces
         ]
         details = record_interval(
-            details, dynamics.contact, end.duration, jnp.minimum(*stopper_forces)
+            details, dynamics.slot_modes, interval_end.duration, jnp.minimum(*stopper_forces)
         )
     if log is not None:
-        row = IntervalLog(
-            start, result.contact_state.contact, result.contact_state.locked, end.duration
+        log_entry = IntervalLog(
+            start_state,
+            result.contact_state.contact_modes,
+            result.contact_state.locked,
+            interval_end.duration,
         )
-        log = jax.tree.map(lambda old, new: old.at[loop_state.counters.n_events].set(new), log, row)
+        log = jax.tree.map(
+            lambda log_leaf, entry_leaf: log_leaf.at[event_loop_state.counters.n_events].set(
+                entry_leaf
+            ),
+            log,
+            log_entry,
+        )
     return _EventLoopState(
-        state=end.state,
+        state=interval_end.state,
         contact_state=result.contact_state,
         guard=guard,
         outcome=outcome.astype(jnp.int32),
@@ -512,7 +539,7 @@ def _advance_to_event(
     )
 
 
-_embedded = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
+_embed_compiled = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
 
 
 @functools.cache
@@ -521,15 +548,15 @@ def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunc
     mode.
     """
 
-    def compute_step(tightens: bool, *leaves: Array) -> tuple:
+    def compute_step(tightens_tolerances: bool, *leaves: Array) -> tuple:
         wheel, params, x, options = jax.tree.unflatten(structure, leaves)
-        options = options.with_derivative_tolerances() if tightens else options
-        loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
+        options = options.with_derivative_tolerances() if tightens_tolerances else options
+        event_loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
         tilt = None if wheel.uneven is None else wheel.uneven.tilt
         outputs = (
-            _full_result(loop_state, engine, tilt)
+            _full_result(event_loop_state, engine, tilt)
             if is_detailed
-            else _minimal_result(loop_state, tilt)
+            else _minimal_result(event_loop_state, tilt)
         )
         return eqx.partition(outputs, eqx.is_inexact_array)
 
@@ -544,21 +571,21 @@ def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunc
     )
 
 
-def _minimal_result(loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
+def _minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
     """Return the minimal result: section state, durations, outcome, solver steps."""
-    counters = loop_state.counters
-    final_state = unpack_state(loop_state.state)[0], loop_state.contact_state
-    section_state = final_section_state(*final_state, loop_state.outcome, tilt)
-    return section_state, counters.durations, loop_state.outcome, counters.n_solver_steps
+    counters = event_loop_state.counters
+    final_state = unpack_state(event_loop_state.state)[0], event_loop_state.contact_state
+    section_state = final_section_state(*final_state, event_loop_state.outcome, tilt)
+    return section_state, counters.durations, event_loop_state.outcome, counters.n_solver_steps
 
 
 def _full_result(
-    loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
+    event_loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
 ) -> UnilateralStep:
     """Return the full result."""
-    motion, accumulators = unpack_state(loop_state.state)
-    assert loop_state.details is not None
-    records = loop_state.counters, loop_state.details, loop_state.outcome
+    motion, accumulators = unpack_state(event_loop_state.state)
+    assert event_loop_state.details is not None
+    records = event_loop_state.counters, event_loop_state.details, event_loop_state.outcome
     return make_unilateral_step(
-        motion, loop_state.contact_state, accumulators, *records, engine, tilt
+        motion, event_loop_state.contact_state, accumulators, *records, engine, tilt
     )

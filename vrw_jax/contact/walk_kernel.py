@@ -92,32 +92,34 @@ class BatchWalkResult(NamedTuple):
 
 def make_result_template(n: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
     """Return zeros in the structure of the result of one wheel with n legs."""
-    zero, zero_count = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    legs, no_contact = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
+    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    leg_zeros, off_modes = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
     final_state = (
-        WheelMotion(*(zero,) * 6, legs, legs),
-        ContactState(no_contact, *(no_contact > 0,) * 4),
+        WheelMotion(*(float_zero,) * 6, leg_zeros, leg_zeros),
+        ContactState(off_modes, *(off_modes > 0,) * 4),
     )
-    step_result: Any = StepSummary(pack_section_state(*final_state), jnp.zeros(3, dtype), zero)
+    step_result: Any = StepSummary(
+        pack_section_state(*final_state), jnp.zeros(3, dtype), float_zero
+    )
     if is_detailed:
-        accumulators = Accumulators(zero, zero, zero, zero)
+        accumulators = Accumulators(float_zero, float_zero, float_zero, float_zero)
         step_result = make_unilateral_step(
             *final_state,
             accumulators,
-            init_counters(zero),
+            init_counters(float_zero),
             init_details(dtype),
-            zero_count,
+            int_zero,
             "lanes",
         )
-    return BatchWalkResult(step_result, zero_count, zero_count, zero_count)
+    return BatchWalkResult(step_result, int_zero, int_zero, int_zero)
 
 
-class LaneTangents(NamedTuple):
+class DifferentiableLaneState(NamedTuple):
     """Differentiable part of a lane's state."""
 
     q: Array
     v: Array
-    accumulated: tuple[Array | None, Array | None]  # in this step, and since the last event
+    accumulators: tuple[Array | None, Array | None]  # in this step, and since the last event
     time: Array
     durations: Array
     details: Any  # their floats
@@ -129,37 +131,37 @@ class LaneState(NamedTuple):
     interval: IntervalState
     counters: StepCounters  # of this step; attempted solver steps count over the walk
     details: StepDetails | None  # of this step, if requested
-    accumulators: Array | None  # rows of `IntervalState.accumulated`, of this step
+    step_accumulators: Array | None  # rows of `IntervalState.accumulated`, of this step
     n_stepped: Array
     outcome: Array
 
-    def get_tangents(self) -> LaneTangents:
+    def get_differentiable(self) -> DifferentiableLaneState:
         """Return the differentiable part of the state."""
         point, details = self.interval.point, eqx.filter(self.details, eqx.is_inexact_array)
-        accumulated = self.accumulators, self.interval.accumulated
-        return LaneTangents(
-            point.q, point.v, accumulated, self.interval.time, self.counters.durations, details
+        accumulators = self.step_accumulators, self.interval.interval_accumulators
+        return DifferentiableLaneState(
+            point.q, point.v, accumulators, self.interval.time, self.counters.durations, details
         )
 
-    def replace_tangents(self, tangents: LaneTangents) -> "LaneState":
+    def replace_differentiable(self, differentiable: DifferentiableLaneState) -> "LaneState":
         """Return the state with another differentiable part."""
-        accumulators, accumulated = tangents.accumulated
-        point = self.interval.point._replace(q=tangents.q, v=tangents.v)
-        others = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
+        step_accumulators, interval_accumulators = differentiable.accumulators
+        point = self.interval.point._replace(q=differentiable.q, v=differentiable.v)
+        other_details = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
         return self._replace(
             interval=self.interval._replace(
-                point=point, accumulated=accumulated, time=tangents.time
+                point=point, interval_accumulators=interval_accumulators, time=differentiable.time
             ),
-            counters=self.counters._replace(durations=tangents.durations),
-            details=eqx.combine(tangents.details, others),
-            accumulators=accumulators,
+            counters=self.counters._replace(durations=differentiable.durations),
+            details=eqx.combine(differentiable.details, other_details),
+            step_accumulators=step_accumulators,
         )
 
 
-class BatchWalk(NamedTuple):
+class BatchWalkSettings(NamedTuple):
     """Settings common to all wheels of a batch."""
 
-    n: int
+    n_legs: int
     n_steps: Array | int
     max_events: int
     is_one_sided: bool
@@ -167,31 +169,38 @@ class BatchWalk(NamedTuple):
     is_detailed: bool  # whether full results of the step are requested
     options: StepOptions
     tableau: ButcherTableau
-    uneven: bool = False  # columns have `N_UNEVEN_COLUMNS` more, and a walk is one step
+    is_uneven: bool = False  # columns have `N_UNEVEN_COLUMNS` more, and a walk is one step
 
-    def make_dynamics(self, columns: Array, contact_state: ContactState) -> ModeDynamics:
+    def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of the lanes in this contact state."""
-        s, friction = self.unpack_columns(columns)
-        given = self.is_one_sided, contact_state, self.is_detailed, self.tilt(columns)
-        return make_mode_dynamics(s, friction, *given)
+        s, friction = self.unpack_columns(input_columns)
+        dynamics_arguments = (
+            self.is_one_sided,
+            contact_state,
+            self.is_detailed,
+            self.tilt(input_columns),
+        )
+        return make_mode_dynamics(s, friction, *dynamics_arguments)
 
-    def unpack_columns(self, columns: Array) -> tuple[Symbols, Friction]:
+    def unpack_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
         """Return symbols and friction from the columns of the lanes."""
-        s = compute_symbols(self.n, *columns[:N_PARAMETERS])
-        friction = apply_friction_rule(columns[N_PARAMETERS], self.uses_paper_rule)
-        if not self.uneven:
+        s = compute_symbols(self.n_legs, *input_columns[:N_PARAMETERS])
+        friction = apply_friction_rule(input_columns[N_PARAMETERS], self.uses_paper_rule)
+        if not self.is_uneven:
             return s, friction
-        previous_friction = apply_friction_rule(columns[N_PARAMETERS + 1], self.uses_paper_rule)
+        previous_friction = apply_friction_rule(
+            input_columns[N_PARAMETERS + 1], self.uses_paper_rule
+        )
         return s, (friction, previous_friction)
 
-    def tilt(self, columns: Array) -> Array | None:
+    def tilt(self, input_columns: Array) -> Array | None:
         """Return the angle by which the next line is steeper, rad; None on flat ground."""
-        return columns[N_PARAMETERS + 2] if self.uneven else None
+        return input_columns[N_PARAMETERS + 2] if self.is_uneven else None
 
-    def begin_walk(self, columns: Array, x: Array) -> LaneState:
+    def begin_walk(self, input_columns: Array, x: Array) -> LaneState:
         """Return the lanes at the first landing of their walk, before it is resolved."""
-        motion, contact_state = unpack_section_state(self.unpack_columns(columns)[0], x)
-        dynamics = self.make_dynamics(columns, contact_state)
+        motion, contact_state = unpack_section_state(self.unpack_columns(input_columns)[0], x)
+        dynamics = self.make_dynamics(input_columns, contact_state)
         interval = zeros_like_output(lambda: init_interval(dynamics, motion, self.options.dt0))
         q, v = pack_coordinates(motion)
         point = IntervalPoint(q, v, jnp.full_like(interval.point.dynamics_rows, jnp.inf))
@@ -206,45 +215,66 @@ class BatchWalk(NamedTuple):
         )
 
     def _init_records(
-        self, reference: Array
+        self, template: Array
     ) -> tuple[StepCounters, StepDetails | None, Array | None]:
         """Return counters, details and accumulators at the start of a step."""
         if not self.is_detailed:
-            return init_counters(reference), None, None
-        broadcast = lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, *reference.shape))
-        details = jax.tree.map(broadcast, init_details(reference.dtype))
+            return init_counters(template), None, None
+        broadcast_to_lanes = lambda leaf: jnp.broadcast_to(
+            leaf[..., None], (*leaf.shape, *template.shape)
+        )
+        details = jax.tree.map(broadcast_to_lanes, init_details(template.dtype))
         return (
-            init_counters(reference),
+            init_counters(template),
             details,
-            jnp.zeros((N_ACCUMULATOR_ROWS, *reference.shape), reference.dtype),
+            jnp.zeros((N_ACCUMULATOR_ROWS, *template.shape), template.dtype),
         )
 
-    def process_events(self, columns: Array, lane: LaneState) -> LaneState:
+    def process_events(self, input_columns: Array, lane_state: LaneState) -> LaneState:
         """Return the stopped lanes after their events, or at the end of their walk."""
-        interval, layout = lane.interval, make_guard_layout(self.n, self.is_one_sided)
-        s, friction = self.unpack_columns(columns)
-        dynamics_before = self.make_dynamics(columns, interval.contact_state)
+        interval, layout = lane_state.interval, make_guard_layout(self.n_legs, self.is_one_sided)
+        s, friction = self.unpack_columns(input_columns)
+        dynamics_before = self.make_dynamics(input_columns, interval.contact_state)
         rates = lax.stop_gradient(interval.point.v)
         accelerations = lax.stop_gradient(interval.point.dynamics_rows[: len(rates)])
         is_resting = is_wheel_at_rest(s, rates, accelerations, self.options.atol)
-        guard_arguments = layout, dynamics_before, rates, interval.guard, self.options.atol
-        interval = interval._replace(guard=choose_stopping_guard(*guard_arguments))
-        counters = add_interval(
-            lane.counters, interval.contact_state, interval.time, interval.n_solver_steps
+        guard_arguments = (
+            layout,
+            dynamics_before,
+            rates,
+            interval.triggered_guard,
+            self.options.atol,
         )
-        details, accumulators = lane.details, lane.accumulators
-        if details is not None and accumulators is not None and interval.accumulated is not None:
+        interval = interval._replace(triggered_guard=choose_stopping_guard(*guard_arguments))
+        counters = add_interval(
+            lane_state.counters, interval.contact_state, interval.time, interval.n_solver_steps
+        )
+        details, step_accumulators = lane_state.details, lane_state.step_accumulators
+        if (
+            details is not None
+            and step_accumulators is not None
+            and interval.interval_accumulators is not None
+        ):
             details = record_stopper_force(
                 details, dynamics_before, motion_from_point(interval.point), interval.time
             )
-            accumulators = accumulators + interval.accumulated
-        at_event = interval.status == LaneStatus.EVENT
-        has_landed = at_event & (interval.guard == layout.foremost_landing)
-        arguments = counters, layout, at_event, interval.guard, has_landed, interval.status
-        outcome = interval_outcome(*arguments, is_resting, self.max_events).astype(jnp.int32)
-        n_stepped = lane.n_stepped + has_landed
+            step_accumulators = step_accumulators + interval.interval_accumulators
+        is_at_event = interval.status == LaneStatus.EVENT
+        has_landed = is_at_event & (interval.triggered_guard == layout.foremost_landing)
+        outcome_arguments = (
+            counters,
+            layout,
+            is_at_event,
+            interval.triggered_guard,
+            has_landed,
+            interval.status,
+        )
+        outcome = interval_outcome(*outcome_arguments, is_resting, self.max_events).astype(
+            jnp.int32
+        )
+        n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
-        ended_lane = LaneState(interval, counters, details, accumulators, n_stepped, outcome)
+        ended_lane = LaneState(interval, counters, details, step_accumulators, n_stepped, outcome)
 
         # A landing of the foremost foot opens the next step; every event is processed.
         opens_step, motion = has_landed & ~has_ended, motion_from_point(interval.point)
@@ -254,17 +284,17 @@ class BatchWalk(NamedTuple):
         )
         new_counters, *new_records = self._init_records(motion.x)
         new_counters = new_counters._replace(n_solver_steps=counters.n_solver_steps)
-        counters, details, accumulators = tree_where(
-            opens_step, (new_counters, *new_records), (counters, details, accumulators)
+        counters, details, step_accumulators = tree_where(
+            opens_step, (new_counters, *new_records), (counters, details, step_accumulators)
         )
-        guard = jnp.where(opens_step, layout.landing, interval.guard)
-        given = s, friction, self.options, self.is_one_sided, self.is_detailed
-        law = make_contact_law(*given, tilt=self.tilt(columns))
+        guard = jnp.where(opens_step, layout.landing, interval.triggered_guard)
+        law_arguments = s, friction, self.options, self.is_one_sided, self.is_detailed
+        law = make_contact_law(*law_arguments, tilt=self.tilt(input_columns))
         event_arguments = guard, counters.n_events, self.max_events
         result, event, event_outcome = process_event(
             law, layout, motion, contact_state, *event_arguments
         )
-        dynamics = self.make_dynamics(columns, result.contact_state)
+        dynamics = self.make_dynamics(input_columns, result.contact_state)
         next_interval = init_interval(*stop_gradients((dynamics, result.motion, self.options.dt0)))
         q, v = pack_coordinates(result.motion)
         status = jnp.where(event_outcome != Outcome.STEPPED, event_outcome, next_interval.status)
@@ -273,27 +303,40 @@ class BatchWalk(NamedTuple):
         )
         if details is not None:
             details = record_event(details, counters.n_events == 0, result, event)
-            zero = jnp.zeros_like(motion.x)
-            details = record_stopper_force(details, dynamics, result.motion, zero)
+            zero_duration = jnp.zeros_like(motion.x)
+            details = record_stopper_force(details, dynamics, result.motion, zero_duration)
         counters = counters._replace(n_events=counters.n_events + 1)
         continued_lane = LaneState(
-            next_interval, counters, details, accumulators, n_stepped, lane.outcome
+            next_interval, counters, details, step_accumulators, n_stepped, lane_state.outcome
         )
-        is_at_end = (interval.status != LaneStatus.RUNNING) & (lane.outcome == STATUS_UNFINISHED)
-        return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane)
+        is_at_end = (interval.status != LaneStatus.RUNNING) & (
+            lane_state.outcome == STATUS_UNFINISHED
+        )
+        return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane_state)
 
-    def compute_result(self, lane: LaneState, tilt: Array | None) -> Any:
+    def compute_result(self, lane_state: LaneState, tilt: Array | None) -> Any:
         """Of the last step of lanes that go no further."""
-        final_state = (motion_from_point(lane.interval.point), lane.interval.contact_state)
-        outcome = lane.outcome
-        if lane.details is not None and lane.accumulators is not None:
-            accumulators = Accumulators(jnp.zeros_like(lane.accumulators[0]), *lane.accumulators)
-            return make_unilateral_step(
-                *final_state, accumulators, lane.counters, lane.details, outcome, "lanes", tilt
+        final_state = (
+            motion_from_point(lane_state.interval.point),
+            lane_state.interval.contact_state,
+        )
+        outcome = lane_state.outcome
+        if lane_state.details is not None and lane_state.step_accumulators is not None:
+            accumulators = Accumulators(
+                jnp.zeros_like(lane_state.step_accumulators[0]), *lane_state.step_accumulators
             )
-        return self.summarize(final_state, lane.counters, outcome, tilt)
+            return make_unilateral_step(
+                *final_state,
+                accumulators,
+                lane_state.counters,
+                lane_state.details,
+                outcome,
+                "lanes",
+                tilt,
+            )
+        return self.summarize_step(final_state, lane_state.counters, outcome, tilt)
 
-    def summarize(
+    def summarize_step(
         self,
         final_state: tuple[WheelMotion, ContactState],
         counters: StepCounters,
@@ -302,30 +345,35 @@ class BatchWalk(NamedTuple):
     ) -> StepSummary:
         """Return the summary of a step that has ended."""
         step_length = jnp.where(
-            outcome == Outcome.STEPPED, landing_position(self.n, final_state[0]), 0.0
+            outcome == Outcome.STEPPED, landing_position(self.n_legs, final_state[0]), 0.0
         )
         return StepSummary(
             final_section_state(*final_state, outcome, tilt), counters.durations, step_length
         )
 
-    def replace_invalid(self, columns: Array, x: Array) -> tuple[Array, Array, Array]:
+    def replace_invalid(self, input_columns: Array, x: Array) -> tuple[Array, Array, Array]:
         """Columns and states that a walk may begin with, and which were so before."""
-        given = (
-            wheel_from_parameters(columns[:N_PARAMETERS], self.n),
-            columns[N_PARAMETERS],
+        start_arguments = (
+            wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
+            input_columns[N_PARAMETERS],
             x,
-            self.tilt(columns),
+            self.tilt(input_columns),
         )
-        is_valid, params, friction, x = replace_invalid_start(*given)
-        rows = [*stack_parameters(params), friction]
-        if self.uneven:
-            others, tilt = columns[N_PARAMETERS + 1 :]
-            rows += [jnp.where(is_valid, others, 1.0), jnp.where(is_valid, tilt, 0.0)]
-        return jnp.stack(rows), x, is_valid
+        is_valid, params, friction, x = replace_invalid_start(*start_arguments)
+        column_rows = [*stack_parameters(params), friction]
+        if self.is_uneven:
+            previous_friction, tilt = input_columns[N_PARAMETERS + 1 :]
+            column_rows += [
+                jnp.where(is_valid, previous_friction, 1.0),
+                jnp.where(is_valid, tilt, 0.0),
+            ]
+        return jnp.stack(column_rows), x, is_valid
 
-    def deactivate(self, lane: LaneState, is_valid: Array) -> LaneState:
+    def deactivate_invalid(self, lane_state: LaneState, is_valid: Array) -> LaneState:
         """Return the lane state with invalid lanes deactivated."""
-        return lane._replace(outcome=jnp.where(is_valid, lane.outcome, Outcome.BAD_INPUT))
+        return lane_state._replace(
+            outcome=jnp.where(is_valid, lane_state.outcome, Outcome.BAD_INPUT)
+        )
 
 
 def record_stopper_force(
@@ -333,43 +381,57 @@ def record_stopper_force(
 ) -> StepDetails:
     """Return the details with the stopper forces at one end of an interval."""
     force = min_stopper_force(dynamics, compute_forces(dynamics, motion))
-    return record_interval(details, dynamics.contact, duration, force)
+    return record_interval(details, dynamics.slot_modes, duration, force)
 
 
-def init_lanes(walk: BatchWalk, columns: Array, x: Array) -> tuple[Array, LaneState]:
+def init_lane_states(
+    walk_settings: BatchWalkSettings, input_columns: Array, x: Array
+) -> tuple[Array, LaneState]:
     """Return valid columns, and the lanes before their first landing."""
-    columns, x, is_valid = walk.replace_invalid(columns, x)
-    return columns, walk.deactivate(walk.begin_walk(columns, x), is_valid)
+    input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
+    return input_columns, walk_settings.deactivate_invalid(
+        walk_settings.begin_walk(input_columns, x), is_valid
+    )
 
 
-def advance_round(
-    walk: BatchWalk, columns: Array, lane: LaneState, waits_for_events: bool = False
+def process_and_integrate(
+    walk_settings: BatchWalkSettings,
+    input_columns: Array,
+    lane_state: LaneState,
+    waits_for_events: bool = False,
 ) -> tuple[LaneState, LaneState]:
     """Return the lanes after their events, and the lanes integrated further.
 
     - `waits_for_events`: integrate every lane to its next event.
     """
-    processed = walk.process_events(columns, lane)
-    is_walking = processed.outcome == STATUS_UNFINISHED
-    dynamics_at = lambda columns_at: walk.make_dynamics(
-        columns_at, processed.interval.contact_state
+    state_after_events = walk_settings.process_events(input_columns, lane_state)
+    has_unfinished_walk = state_after_events.outcome == STATUS_UNFINISHED
+    dynamics_fn = lambda columns: walk_settings.make_dynamics(
+        columns, state_after_events.interval.contact_state
     )
-    is_walking = is_walking & (not waits_for_events)
+    has_unfinished_walk = has_unfinished_walk & (not waits_for_events)
     interval = integrate_interval(
-        dynamics_at, columns, processed.interval, is_walking, walk.options, walk.tableau
+        dynamics_fn,
+        input_columns,
+        state_after_events.interval,
+        has_unfinished_walk,
+        walk_settings.options,
+        walk_settings.tableau,
     )
-    return processed, processed._replace(interval=interval)
+    return state_after_events, state_after_events._replace(interval=interval)
 
 
-def run_walks(walk: BatchWalk, columns: Array, x: Array) -> BatchWalkResult:
+def run_walks(walk_settings: BatchWalkSettings, input_columns: Array, x: Array) -> BatchWalkResult:
     """Return every lane after `n_steps` landings of the foremost foot."""
-    columns, lane = init_lanes(walk, columns, x)
-    run_round = lambda lane: advance_round(walk, columns, lane)[1]
-    should_continue = lambda lane: jnp.any(lane.outcome == STATUS_UNFINISHED)
-    lane = lax.while_loop(should_continue, run_round, lane)
+    input_columns, lane_state = init_lane_states(walk_settings, input_columns, x)
+    run_iteration = lambda lane_state: process_and_integrate(
+        walk_settings, input_columns, lane_state
+    )[1]
+    should_continue = lambda lane_state: jnp.any(lane_state.outcome == STATUS_UNFINISHED)
+    lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
     return BatchWalkResult(
-        walk.compute_result(lane, walk.tilt(columns)),
-        lane.outcome,
-        lane.n_stepped,
-        lane.counters.n_solver_steps,
+        walk_settings.compute_result(lane_state, walk_settings.tilt(input_columns)),
+        lane_state.outcome,
+        lane_state.n_stepped,
+        lane_state.counters.n_solver_steps,
     )

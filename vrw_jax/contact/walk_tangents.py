@@ -23,23 +23,23 @@ from vrw_jax.contact.batch_integrator import (
     IntervalPoint,
     IntervalState,
     LaneStatus,
+    complete_attempt,
+    compute_stage_state,
     evaluate_dynamics,
-    finish_attempt,
-    guards_at_point,
+    evaluate_guards_at_point,
     integrator_step,
+    iterate_until_stopped,
     motion_from_point,
-    run_until_done,
-    stage_state,
 )
 from vrw_jax.contact.contact_modes import ContactMode
-from vrw_jax.contact.contact_state import ContactState, ModeDynamics, guard_scales
+from vrw_jax.contact.contact_state import ContactState, ModeDynamics, compute_guard_scales
 from vrw_jax.contact.tangent_basis import N_MOVING_LEGS, TangentBasis
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
-    BatchWalk,
     BatchWalkResult,
+    BatchWalkSettings,
+    DifferentiableLaneState,
     LaneState,
-    LaneTangents,
 )
 from vrw_jax.integrator import ButcherTableau, real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any, tree_where
@@ -51,7 +51,7 @@ class _IntervalTangent(NamedTuple):
 
     q: Array
     v: Array
-    accumulated: Array | None
+    interval_accumulators: Array | None
     dynamics_rows: Array  # of accelerations and, if requested, accumulators
     time: Array  # tangent of the time, s
 
@@ -60,30 +60,39 @@ class _Tangent(NamedTuple):
     """Tangent of all of a lane's state."""
 
     interval: _IntervalTangent
-    others: LaneTangents  # those not in the interval
+    other_tangents: DifferentiableLaneState  # those not in the interval
 
     @classmethod
-    def from_lane_tangents(cls, lane_tangents: LaneTangents, dynamics_rows: Array) -> "_Tangent":
+    def from_lane_tangents(
+        cls, lane_tangents: DifferentiableLaneState, dynamics_rows: Array
+    ) -> "_Tangent":
         """Return the tangent of these lane tangents and dynamics rows."""
-        accumulators, accumulated = lane_tangents.accumulated
-        others: Any = lane_tangents._asdict() | {
+        accumulators, interval_accumulators = lane_tangents.accumulators
+        other_tangents: Any = lane_tangents._asdict() | {
             "q": None,
             "v": None,
-            "accumulated": (accumulators, None),
+            "accumulators": (accumulators, None),
             "time": None,
         }
         return cls(
             _IntervalTangent(
-                lane_tangents.q, lane_tangents.v, accumulated, dynamics_rows, lane_tangents.time
+                lane_tangents.q,
+                lane_tangents.v,
+                interval_accumulators,
+                dynamics_rows,
+                lane_tangents.time,
             ),
-            LaneTangents(**others),
+            DifferentiableLaneState(**other_tangents),
         )
 
-    def lane_tangents(self) -> LaneTangents:
+    def to_lane_tangents(self) -> DifferentiableLaneState:
         """Return the lane tangents."""
-        q, v, accumulated, _, time = self.interval
-        return self.others._replace(
-            q=q, v=v, accumulated=(self.others.accumulated[0], accumulated), time=time
+        q, v, interval_accumulators, _, time = self.interval
+        return self.other_tangents._replace(
+            q=q,
+            v=v,
+            accumulators=(self.other_tangents.accumulators[0], interval_accumulators),
+            time=time,
         )
 
 
@@ -92,30 +101,39 @@ class TangentBatch(NamedTuple):
 
     n_tangents: Array  # number of tangents of a lane
     n_column_tangents: Array  # number of leading ones that may have column parts
-    columns: Array
-    rows: Array  # all numbers of a `_Tangent` in one array, for few loops and short compilation
+    column_tangents: Array
+    tangent_rows: (
+        Array  # all numbers of a `_Tangent` in one array, for few loops and short compilation
+    )
 
-    def allocate(self, size: int) -> Array:
+    def allocate(self, n_rows: int) -> Array:
         """Return uninitialized rows of each tangent, to be written."""
-        return lax.empty((len(self.columns), size, *self.n_tangents.shape), self.columns.dtype)
+        return lax.empty(
+            (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
+        )
 
     def map_tangents(
-        self, function: Callable[[Array, Array], Any], rows: Array, first_row: Array | int = 0
+        self,
+        function: Callable[[Array, Array], Any],
+        tangent_rows: Array,
+        first_row: Array | int = 0,
     ) -> Array:
         """Return the rows of each tangent, overwritten from row `first_row` on by `function(k,
         rows)`.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
-        def update_one(state: tuple[Array, Array]) -> tuple[Array, Array]:
-            k, rows = state
-            new_rows = _pack_rows(function(k, lax.dynamic_index_in_dim(rows, k, 0, False)))
+        def update_tangent(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            k, tangent_rows = state
+            new_rows = _pack_rows(function(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False)))
             # Stacking row by row keeps the rows in registers.
             new_rows = jnp.stack([new_rows[i] for i in range(len(new_rows))])
-            position = k, jnp.int32(first_row), jnp.int32(0)
-            return k + 1, lax.dynamic_update_slice(rows, new_rows[None], position)
+            start_indices = k, jnp.int32(first_row), jnp.int32(0)
+            return k + 1, lax.dynamic_update_slice(tangent_rows, new_rows[None], start_indices)
 
-        return lax.while_loop(should_continue, update_one, (jnp.zeros((), jnp.int32), rows))[1]
+        return lax.while_loop(
+            should_continue, update_tangent, (jnp.zeros((), jnp.int32), tangent_rows)
+        )[1]
 
 
 def _pack_rows(tree: Any) -> Array:
@@ -135,263 +153,336 @@ def _unpack_rows(rows: Array, template: Any) -> Any:
     return jax.tree.unflatten(structure, arrays)
 
 
-def _unpack_at(rows: Array, k: Array, template: Any) -> Any:
+def _unpack_tangent(tangent_rows: Array, k: Array, template: Any) -> Any:
     """Return tangent k as a tree of the template's structure."""
-    return _unpack_rows(lax.dynamic_index_in_dim(rows, k, 0, False), template)
+    return _unpack_rows(lax.dynamic_index_in_dim(tangent_rows, k, 0, False), template)
 
 
 def walk_with_tangents(
-    walk: BatchWalk, columns: Array, x: Array, d_columns: Array, d_x: Array, n_tangents: Array
+    walk_settings: BatchWalkSettings,
+    input_columns: Array,
+    x: Array,
+    d_columns: Array,
+    d_x: Array,
+    n_tangents: Array,
 ) -> tuple[BatchWalkResult, Any]:
     """Return the result of `run_walks`, and the tangents of its floats for each lane.
 
     Tangents are the first axis of `d_columns`, `d_x` and the returned tangents; a lane has
     `n_tangents` of them.
     """
-    columns, x, is_valid = walk.replace_invalid(columns, x)
-    n_rows = lambda tree: len(_pack_rows(tree))
+    input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
+    count_rows = lambda tree: len(_pack_rows(tree))
 
-    def begin_walk(columns: Array, x: Array) -> tuple[LaneTangents, LaneState]:
-        lane = walk.deactivate(walk.begin_walk(columns, x), is_valid)
-        return lane.get_tangents(), lane
+    def begin_walk(input_columns: Array, x: Array) -> tuple[DifferentiableLaneState, LaneState]:
+        lane_state = walk_settings.deactivate_invalid(
+            walk_settings.begin_walk(input_columns, x), is_valid
+        )
+        return lane_state.get_differentiable(), lane_state
 
-    lane_tangents, push, lane = jax.linearize(begin_walk, columns, x, has_aux=True)
-    dynamics_rows = jnp.zeros(
-        (len(lane_tangents.q) + N_ACCUMULATOR_ROWS * walk.is_detailed, *n_tangents.shape), x.dtype
+    lane_tangents, pushforward, lane_state = jax.linearize(
+        begin_walk, input_columns, x, has_aux=True
     )
-    template = _Tangent.from_lane_tangents(lane_tangents, dynamics_rows)
+    dynamics_rows = jnp.zeros(
+        (len(lane_tangents.q) + N_ACCUMULATOR_ROWS * walk_settings.is_detailed, *n_tangents.shape),
+        x.dtype,
+    )
+    tangent_template = _Tangent.from_lane_tangents(lane_tangents, dynamics_rows)
     n_column_tangents = jnp.zeros_like(n_tangents)
     for k in range(len(d_columns)):
         n_column_tangents = jnp.where(
             jnp.any(d_columns[k] != 0.0, axis=0), k + 1, n_column_tangents
         )
     tangents = TangentBatch(n_tangents, n_column_tangents, d_columns, d_columns)
-    start_tangent = lambda k, _: _Tangent.from_lane_tangents(
-        push(_unpack_at(d_columns, k, columns), _unpack_at(d_x, k, x)), dynamics_rows
+    make_start_tangent = lambda k, _: _Tangent.from_lane_tangents(
+        pushforward(_unpack_tangent(d_columns, k, input_columns), _unpack_tangent(d_x, k, x)),
+        dynamics_rows,
     )
     tangents = tangents._replace(
-        rows=tangents.map_tangents(start_tangent, tangents.allocate(n_rows(template)))
+        tangent_rows=tangents.map_tangents(
+            make_start_tangent, tangents.allocate(count_rows(tangent_template))
+        )
     )
 
-    def advance_round(state: tuple[LaneState, TangentBatch]) -> tuple[LaneState, TangentBatch]:
-        lane, tangents = state
+    def process_and_integrate(
+        state: tuple[LaneState, TangentBatch],
+    ) -> tuple[LaneState, TangentBatch]:
+        lane_state, tangents = state
 
-        def past_events(
-            columns: Array, lane_tangents: LaneTangents
-        ) -> tuple[LaneTangents, LaneState]:
-            next_lane = walk.process_events(columns, lane.replace_tangents(lane_tangents))
-            return next_lane.get_tangents(), next_lane
+        def process_events_from(
+            input_columns: Array, differentiable: DifferentiableLaneState
+        ) -> tuple[DifferentiableLaneState, LaneState]:
+            next_state = walk_settings.process_events(
+                input_columns, lane_state.replace_differentiable(differentiable)
+            )
+            return next_state.get_differentiable(), next_state
 
-        _, push, next_lane = jax.linearize(past_events, columns, lane.get_tangents(), has_aux=True)
+        _, pushforward, next_state = jax.linearize(
+            process_events_from, input_columns, lane_state.get_differentiable(), has_aux=True
+        )
 
-        def pass_event(k: Array, row: Array) -> _Tangent:
-            tangent = _unpack_rows(row, template)
+        def push_through_event(k: Array, tangent_row: Array) -> _Tangent:
+            tangent = _unpack_rows(tangent_row, tangent_template)
             return _Tangent.from_lane_tangents(
-                push(_unpack_at(d_columns, k, columns), tangent.lane_tangents()),
+                pushforward(
+                    _unpack_tangent(d_columns, k, input_columns), tangent.to_lane_tangents()
+                ),
                 tangent.interval.dynamics_rows,
             )
 
-        tangents = tangents._replace(rows=tangents.map_tangents(pass_event, tangents.rows))
-        is_unfinished = next_lane.outcome == STATUS_UNFINISHED
-        dynamics_at = lambda c: walk.make_dynamics(c, next_lane.interval.contact_state)
-        arguments = (
-            dynamics_at,
-            columns,
-            next_lane.interval,
-            tangents,
-            template.interval,
-            is_unfinished,
-            walk.options,
-            walk.tableau,
+        tangents = tangents._replace(
+            tangent_rows=tangents.map_tangents(push_through_event, tangents.tangent_rows)
         )
-        interval, rows = _integrate_with_tangents(*arguments)
-        return next_lane._replace(interval=interval), tangents._replace(rows=rows)
+        is_unfinished = next_state.outcome == STATUS_UNFINISHED
+        dynamics_fn = lambda c: walk_settings.make_dynamics(c, next_state.interval.contact_state)
+        integration_arguments = (
+            dynamics_fn,
+            input_columns,
+            next_state.interval,
+            tangents,
+            tangent_template.interval,
+            is_unfinished,
+            walk_settings.options,
+            walk_settings.tableau,
+        )
+        interval, tangent_rows = _integrate_with_tangents(*integration_arguments)
+        return next_state._replace(interval=interval), tangents._replace(tangent_rows=tangent_rows)
 
     should_continue = lambda state: jnp.any(state[0].outcome == STATUS_UNFINISHED)
-    lane, tangents = lax.while_loop(should_continue, advance_round, (lane, tangents))
+    lane_state, tangents = lax.while_loop(
+        should_continue, process_and_integrate, (lane_state, tangents)
+    )
 
-    def partition_result(lane_tangents: LaneTangents, tilt: Array | None) -> tuple[Any, Any]:
+    def partition_result(
+        differentiable: DifferentiableLaneState, tilt: Array | None
+    ) -> tuple[Any, Any]:
         return eqx.partition(
-            walk.compute_result(lane.replace_tangents(lane_tangents), tilt), eqx.is_inexact_array
+            walk_settings.compute_result(lane_state.replace_differentiable(differentiable), tilt),
+            eqx.is_inexact_array,
         )
 
-    floats, push, others = jax.linearize(
-        partition_result, lane.get_tangents(), walk.tilt(columns), has_aux=True
+    float_leaves, pushforward, other_leaves = jax.linearize(
+        partition_result,
+        lane_state.get_differentiable(),
+        walk_settings.tilt(input_columns),
+        has_aux=True,
     )
-    tilt_at = lambda k: walk.tilt(_unpack_at(d_columns, k, columns))
-    push_tangent = lambda k, _: push(
-        _unpack_at(tangents.rows, k, template).lane_tangents(), tilt_at(k)
+    tilt_tangent = lambda k: walk_settings.tilt(_unpack_tangent(d_columns, k, input_columns))
+    push_result_tangent = lambda k, _: pushforward(
+        _unpack_tangent(tangents.tangent_rows, k, tangent_template).to_lane_tangents(),
+        tilt_tangent(k),
     )
-    result_tangents = tangents.map_tangents(push_tangent, tangents.allocate(n_rows(floats)))
-    step_result = eqx.combine(floats, others)
+    result_tangents = tangents.map_tangents(
+        push_result_tangent, tangents.allocate(count_rows(float_leaves))
+    )
+    step_result = eqx.combine(float_leaves, other_leaves)
     walk_result = BatchWalkResult(
-        step_result, lane.outcome, lane.n_stepped, lane.counters.n_solver_steps
+        step_result, lane_state.outcome, lane_state.n_stepped, lane_state.counters.n_solver_steps
     )
-    return walk_result, _unpack_rows(result_tangents, floats)
+    return walk_result, _unpack_rows(result_tangents, float_leaves)
 
 
 def _integrate_with_tangents(
-    dynamics_at: DynamicsFn,
-    columns: Array,
-    initial: IntervalState,
+    dynamics_fn: DynamicsFn,
+    input_columns: Array,
+    initial_state: IntervalState,
     tangents: TangentBatch,
-    template: _IntervalTangent,
-    is_walking: Array,
+    tangent_template: _IntervalTangent,
+    has_unfinished_walk: Array,
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> tuple[IntervalState, Array]:
     """Return the result of `integrate_interval`, with the tangents propagated to the event."""
-    dynamics = dynamics_at(columns)
-    scales, last_stage = guard_scales(dynamics), len(tableau.nodes) - 1
+    dynamics = dynamics_fn(input_columns)
+    guard_scales, last_stage = compute_guard_scales(dynamics), len(tableau.nodes) - 1
     options = compute_own_units(dynamics.s).scale_times(options)
-    has_more_moving = _has_more_moving(tangents, template, initial.contact_state)
-    max_h = _max_stable_step(dynamics, tableau)
+    has_later_moving_legs = _has_later_moving_legs(
+        tangents, tangent_template, initial_state.contact_state
+    )
+    max_stable_h = _max_stable_step(dynamics, tableau)
 
     def try_step(state: tuple[IntervalState, Array]) -> tuple[IntervalState, Array]:
-        interval, rows = state
-        h = jnp.where(interval.search.is_active, interval.h, jnp.minimum(interval.h, max_h))
-        interval = interval._replace(h=h)
-        stage_rows, row_tangents = _evaluate_stages(
-            dynamics_at,
-            columns,
-            interval,
-            tangents._replace(rows=rows),
-            template,
-            tableau,
-            has_more_moving,
+        interval, tangent_rows = state
+        h = jnp.where(
+            interval.event_bracket.is_active, interval.h, jnp.minimum(interval.h, max_stable_h)
         )
-        attempt = finish_attempt(dynamics, tableau, options, interval, stage_rows)
-        next_interval = integrator_step(interval, attempt, scales, tableau, options)
-        is_taken, n = next_interval.time != interval.time, len(interval.point.q)
+        interval = interval._replace(h=h)
+        stage_rows, stage_row_tangents = _evaluate_stages(
+            dynamics_fn,
+            input_columns,
+            interval,
+            tangents._replace(tangent_rows=tangent_rows),
+            tangent_template,
+            tableau,
+            has_later_moving_legs,
+        )
+        attempt = complete_attempt(dynamics, tableau, options, interval, stage_rows)
+        next_interval = integrator_step(interval, attempt, guard_scales, tableau, options)
+        is_state_updated, n = next_interval.time != interval.time, len(interval.point.q)
 
-        def end_tangent(k: Array, row: Array) -> _IntervalTangent:
-            point = _unpack_rows(row, template)
-            stage_tangents = lax.dynamic_index_in_dim(row_tangents, k, 0, False).reshape(
-                -1, *template.dynamics_rows.shape
+        def propagate_to_end(k: Array, tangent_row: Array) -> _IntervalTangent:
+            start_tangent = _unpack_rows(tangent_row, tangent_template)
+            stage_tangents = lax.dynamic_index_in_dim(stage_row_tangents, k, 0, False).reshape(
+                -1, *tangent_template.dynamics_rows.shape
             )
-            stage_of = lambda leg_slice: stage_state(
+            combine_stages = lambda leg_slice: compute_stage_state(
                 tableau,
                 last_stage,
-                point.q[leg_slice],
-                point.v[leg_slice],
+                start_tangent.q[leg_slice],
+                start_tangent.v[leg_slice],
                 stage_tangents[:, :n][:, leg_slice],
                 interval.h,
             )
             first_coordinates = slice(0, 3 + N_MOVING_LEGS)
             other_coordinates = slice(3 + N_MOVING_LEGS, None)
-            unchanged = point.q[other_coordinates], point.v[other_coordinates]
-            ends = zip(
-                stage_of(first_coordinates),
-                run_if_any(has_more_moving, lambda _: stage_of(other_coordinates), unchanged),
+            unchanged_coordinates = (
+                start_tangent.q[other_coordinates],
+                start_tangent.v[other_coordinates],
+            )
+            end_coordinates = zip(
+                combine_stages(first_coordinates),
+                run_if_any(
+                    has_later_moving_legs,
+                    lambda _: combine_stages(other_coordinates),
+                    unchanged_coordinates,
+                ),
                 strict=True,
             )
-            q, v = map(jnp.concatenate, ends)
-            accumulated = point.accumulated
-            if accumulated is not None:
+            q, v = map(jnp.concatenate, end_coordinates)
+            interval_accumulators = start_tangent.accumulated
+            if interval_accumulators is not None:
                 weights = tableau.matrix[last_stage]
-                accumulated = accumulated + interval.h * sum(
+                interval_accumulators = interval_accumulators + interval.h * sum(
                     weights[j] * stage_tangents[j, n:] for j in range(last_stage)
                 )
-            end_point = _IntervalTangent(q, v, accumulated, stage_tangents[last_stage], point.time)
-            return tree_where(is_taken, end_point, point._replace(dynamics_rows=stage_tangents[0]))
+            end_tangent = _IntervalTangent(
+                q, v, interval_accumulators, stage_tangents[last_stage], start_tangent.time
+            )
+            return tree_where(
+                is_state_updated,
+                end_tangent,
+                start_tangent._replace(dynamics_rows=stage_tangents[0]),
+            )
 
-        return next_interval, tangents.map_tangents(end_tangent, rows)
+        return next_interval, tangents.map_tangents(propagate_to_end, tangent_rows)
 
     is_running = lambda state: state[0].status == LaneStatus.RUNNING
-    interval, rows = run_until_done(is_running, is_walking, try_step, (initial, tangents.rows))
+    interval, tangent_rows = iterate_until_stopped(
+        is_running, has_unfinished_walk, try_step, (initial_state, tangents.tangent_rows)
+    )
     return interval, tangents.map_tangents(
-        _shift_to_event(dynamics_at, columns, initial, interval, tangents, template), rows
+        _shift_to_event(
+            dynamics_fn, input_columns, initial_state, interval, tangents, tangent_template
+        ),
+        tangent_rows,
     )
 
 
 def _evaluate_stages(
-    dynamics_at: DynamicsFn,
-    columns: Array,
+    dynamics_fn: DynamicsFn,
+    input_columns: Array,
     interval: IntervalState,
     tangents: TangentBatch,
-    template: _IntervalTangent,
+    tangent_template: _IntervalTangent,
     tableau: ButcherTableau,
-    has_more_moving: Array,
+    has_later_moving_legs: Array,
 ) -> tuple[Array, Array]:
     """Return the dynamics rows at the stages of a step, and the tangents of these rows.
 
     The tangents are processed one after another.
     """
     point, h = interval.point, interval.h
-    size, last_stage = len(template.dynamics_rows), len(tableau.nodes) - 1
-    is_fresh = (interval.status == LaneStatus.RUNNING) & (interval.time == 0.0)
+    n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.nodes) - 1
+    is_at_interval_start = (interval.status == LaneStatus.RUNNING) & (interval.time == 0.0)
 
     def evaluate_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        i, stage_rows, row_tangents = state
+        i, stage_rows, stage_row_tangents = state
 
-        stage_coordinates = stage_state(tableau, i, point.q, point.v, stage_rows, h)
-        dynamics = dynamics_at(columns)
-        basis = TangentBasis.from_motion(
+        stage_coordinates = compute_stage_state(tableau, i, point.q, point.v, stage_rows, h)
+        dynamics = dynamics_fn(input_columns)
+        tangent_basis = TangentBasis.from_motion(
             dynamics,
             motion_from_point(IntervalPoint(*stage_coordinates, stage_coordinates[0])),
-            has_more_moving,
+            has_later_moving_legs,
         )
-        zero_response = basis.make_zero()
-        respond = lambda k, _: basis.respond_to_columns(
-            dynamics_at, columns, _unpack_at(tangents.columns, k, columns)
+        zero_response = tangent_basis.make_zero_response()
+        compute_column_response = lambda k, _: tangent_basis.compute_column_response(
+            dynamics_fn, input_columns, _unpack_tangent(tangents.column_tangents, k, input_columns)
         )
         column_responses = tangents._replace(n_tangents=tangents.n_column_tangents).map_tangents(
-            respond, tangents.allocate(len(_pack_rows(zero_response)))
+            compute_column_response, tangents.allocate(len(_pack_rows(zero_response)))
         )
 
-        def propagate_one(k: Array, known_rows: Array) -> Array:
-            tangent = _unpack_at(tangents.rows, k, template)
-            previous_rows = known_rows.reshape(-1, *template.dynamics_rows.shape)
-            coordinates = lambda leg_slice: _stage_tangent(
+        def propagate_tangent(k: Array, known_rows: Array) -> Array:
+            tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
+            previous_rows = known_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
+            coordinate_tangent_fn = lambda leg_slice: _stage_tangent(
                 tableau, i, tangent, previous_rows, h, leg_slice
             )
             column_response = run_if_any(
                 jnp.any(k < tangents.n_column_tangents),
-                lambda _: _unpack_at(column_responses, k, zero_response),
+                lambda _: _unpack_tangent(column_responses, k, zero_response),
                 zero_response,
             )
-            new_row = basis.propagate_tangent(coordinates, column_response, has_more_moving)
-            return jnp.where((i > 0) | is_fresh, new_row, known_rows[:size])
+            row_tangent = tangent_basis.propagate_tangent(
+                coordinate_tangent_fn, column_response, has_later_moving_legs
+            )
+            return jnp.where(
+                (i > 0) | is_at_interval_start, row_tangent, known_rows[:n_dynamics_rows]
+            )
 
-        row = jnp.where(i > 0, evaluate_dynamics(dynamics, *stage_coordinates), point.dynamics_rows)
-        stage_rows = lax.dynamic_update_index_in_dim(stage_rows, row, i, 0)
-        return i + 1, stage_rows, tangents.map_tangents(propagate_one, row_tangents, i * size)
+        stage_row = jnp.where(
+            i > 0, evaluate_dynamics(dynamics, *stage_coordinates), point.dynamics_rows
+        )
+        stage_rows = lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
+        return (
+            i + 1,
+            stage_rows,
+            tangents.map_tangents(propagate_tangent, stage_row_tangents, i * n_dynamics_rows),
+        )
 
-    other_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
-    stage_rows = jnp.concatenate([point.dynamics_rows[None], other_rows])
-    row_tangents = tangents.map_tangents(
-        lambda k, _: _unpack_at(tangents.rows, k, template).dynamics_rows,
-        tangents.allocate((last_stage + 1) * size),
+    later_stage_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([point.dynamics_rows[None], later_stage_rows])
+    stage_row_tangents = tangents.map_tangents(
+        lambda k, _: _unpack_tangent(tangents.tangent_rows, k, tangent_template).dynamics_rows,
+        tangents.allocate((last_stage + 1) * n_dynamics_rows),
     )
     # The first stage is the last one of the previous step, except after an event.
-    first_stage = jnp.where(jnp.any(is_fresh), 0, 1).astype(jnp.int32)
+    first_stage = jnp.where(jnp.any(is_at_interval_start), 0, 1).astype(jnp.int32)
     should_continue = lambda state: state[0] <= last_stage
-    return lax.while_loop(should_continue, evaluate_stage, (first_stage, stage_rows, row_tangents))[
-        1:
-    ]
+    return lax.while_loop(
+        should_continue, evaluate_stage, (first_stage, stage_rows, stage_row_tangents)
+    )[1:]
 
 
 def _stage_tangent(
     tableau: ButcherTableau,
     i: Array,
     tangent: _IntervalTangent,
-    known_rows: Array,
+    known_row_tangents: Array,
     h: Array,
     leg_slice: slice,
 ) -> tuple[Array, Array]:
     """Return the tangent of `stage_state` for some coordinates, from the earlier stages."""
-    rows = [jnp.asarray(np.reshape(x, -1)) for x in (tableau.matrix, tableau.matrix_squared)]
-    width, node = len(tableau.matrix[0]), jnp.asarray(tableau.nodes)[i]
+    flat_matrices = [
+        jnp.asarray(np.reshape(x, -1)) for x in (tableau.matrix, tableau.matrix_squared)
+    ]
+    n_stages, node = len(tableau.matrix[0]), jnp.asarray(tableau.nodes)[i]
 
     def add_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         j, first_sum, second_sum = state
-        a, b = (lax.dynamic_index_in_dim(weights, i * width + j, 0, False) for weights in rows)
-        row = lax.dynamic_index_in_dim(known_rows, j, 0, False)[: len(tangent.q)][leg_slice]
-        return j + 1, first_sum + a * row, second_sum + b * row
+        a, b = (
+            lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
+            for flat_matrix in flat_matrices
+        )
+        row_tangent = lax.dynamic_index_in_dim(known_row_tangents, j, 0, False)[: len(tangent.q)][
+            leg_slice
+        ]
+        return j + 1, first_sum + a * row_tangent, second_sum + b * row_tangent
 
     q, v = tangent.q[leg_slice], tangent.v[leg_slice]
-    initial = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
-    _, first_sum, second_sum = lax.while_loop(lambda state: state[0] < i, add_stage, initial)
+    initial_state = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
+    _, first_sum, second_sum = lax.while_loop(lambda state: state[0] < i, add_stage, initial_state)
     return q + h * (node * v + h * second_sum), v + h * first_sum
 
 
@@ -404,64 +495,80 @@ def _max_stable_step(
     in which such a leg may be almost at rest.
     """
     has_swing_leg = jnp.any(
-        ~dynamics.contact_state.locked & (dynamics.contact_state.contact == ContactMode.OFF), axis=0
+        ~dynamics.contact_state.locked & (dynamics.contact_state.contact_modes == ContactMode.OFF),
+        axis=0,
     )
     step_factor = safety_factor * real_stability_limit(tableau)
     return jnp.where(has_swing_leg, step_factor * dynamics.s.m / dynamics.s.c, jnp.inf)
 
 
-def _has_more_moving(
-    tangents: TangentBatch, template: _IntervalTangent, contact_state: ContactState
+def _has_later_moving_legs(
+    tangents: TangentBatch, tangent_template: _IntervalTangent, contact_state: ContactState
 ) -> Array:
     """Return whether any leg after the first ones moves, in any lane and along any tangent."""
 
-    def check_one(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        k, has_moving = state
-        tangent = _unpack_at(tangents.rows, k, template)
-        lengths = jnp.concatenate([tangent.q[3 + N_MOVING_LEGS :], tangent.v[3 + N_MOVING_LEGS :]])
-        return k + 1, has_moving | jnp.any(lengths != 0.0, axis=0)
+    def check_tangent(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        k, has_moving_leg = state
+        tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
+        length_tangents = jnp.concatenate(
+            [tangent.q[3 + N_MOVING_LEGS :], tangent.v[3 + N_MOVING_LEGS :]]
+        )
+        return k + 1, has_moving_leg | jnp.any(length_tangents != 0.0, axis=0)
 
-    initial = jnp.zeros((), jnp.int32), jnp.any(~contact_state.locked[N_MOVING_LEGS:], axis=0)
+    initial_state = jnp.zeros((), jnp.int32), jnp.any(~contact_state.locked[N_MOVING_LEGS:], axis=0)
     should_continue = lambda state: jnp.any(state[0] < tangents.n_tangents)
-    return jnp.any(lax.while_loop(should_continue, check_one, initial)[1])
+    return jnp.any(lax.while_loop(should_continue, check_tangent, initial_state)[1])
 
 
 def _shift_to_event(
-    dynamics_at: DynamicsFn,
-    columns: Array,
-    initial: IntervalState,
+    dynamics_fn: DynamicsFn,
+    input_columns: Array,
+    initial_state: IntervalState,
     interval: IntervalState,
     tangents: TangentBatch,
-    template: _IntervalTangent,
+    tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
     """Return the function that shifts tangents by the tangent of the event time."""
     point, n = interval.point, len(interval.point.q)
 
-    def compute_guards(columns: Array, q: Array, v: Array) -> Array:
-        dynamics = dynamics_at(columns)
-        return guards_at_point(dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v)))
+    def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
+        dynamics = dynamics_fn(input_columns)
+        return evaluate_guards_at_point(
+            dynamics, IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
+        )
 
-    _, push_guards = jax.linearize(compute_guards, columns, point.q, point.v)
-    rates = push_guards(jnp.zeros_like(columns), point.v, point.dynamics_rows[:n])
-    has_arrived = (initial.status == LaneStatus.RUNNING) & (interval.status == LaneStatus.EVENT)
+    _, guard_pushforward = jax.linearize(compute_guards, input_columns, point.q, point.v)
+    guard_rates = guard_pushforward(jnp.zeros_like(input_columns), point.v, point.dynamics_rows[:n])
+    has_reached_event = (initial_state.status == LaneStatus.RUNNING) & (
+        interval.status == LaneStatus.EVENT
+    )
 
-    def shift_tangent(k: Array, row: Array) -> _IntervalTangent:
-        tangent, time_tangent = _unpack_rows(row, template), jnp.zeros_like(interval.time)
-        guard_tangents = push_guards(_unpack_at(tangents.columns, k, columns), tangent.q, tangent.v)
+    def shift_tangent(k: Array, tangent_row: Array) -> _IntervalTangent:
+        tangent, time_tangent = (
+            _unpack_rows(tangent_row, tangent_template),
+            jnp.zeros_like(interval.time),
+        )
+        guard_tangents = guard_pushforward(
+            _unpack_tangent(tangents.column_tangents, k, input_columns), tangent.q, tangent.v
+        )
         for index in range(len(guard_tangents)):
-            is_at_guard = has_arrived & (interval.guard == index) & (rates[index] < 0.0)
+            is_at_guard = (
+                has_reached_event & (interval.triggered_guard == index) & (guard_rates[index] < 0.0)
+            )
             time_tangent = jnp.where(
                 is_at_guard,
-                -guard_tangents[index] / jnp.where(is_at_guard, rates[index], -1.0),
+                -guard_tangents[index] / jnp.where(is_at_guard, guard_rates[index], -1.0),
                 time_tangent,
             )
-        accumulated = tangent.accumulated
-        if accumulated is not None:
-            accumulated = accumulated + time_tangent * point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+        interval_accumulators = tangent.accumulated
+        if interval_accumulators is not None:
+            interval_accumulators = (
+                interval_accumulators + time_tangent * point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
+            )
         return _IntervalTangent(
             q=tangent.q + time_tangent * point.v,
             v=tangent.v + time_tangent * point.dynamics_rows[:n],
-            accumulated=accumulated,
+            interval_accumulators=interval_accumulators,
             dynamics_rows=tangent.dynamics_rows,
             time=time_tangent,
         )

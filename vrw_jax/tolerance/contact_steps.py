@@ -11,7 +11,7 @@ from vrw_jax.contact import (
     ContactMode,
     UnilateralWheel,
     embed_section_states,
-    min_dip_depth,
+    min_bounce_height,
     walk_batch,
 )
 from vrw_jax.numerics import StepOptions
@@ -116,8 +116,9 @@ class GroundBatch:
     def min_dip_duration(self, indices: np.ndarray) -> np.ndarray:
         """Return the time that a foot is off the ground in the smallest resolved dip, s."""
         parameter = lambda name: self.parameter_columns[PARAMETER_NAMES.index(name)]
-        dip_depth = np.asarray(min_dip_depth(jnp.asarray(parameter("locked_length")), self.options))
-        return np.sqrt(8.0 * dip_depth / parameter("gravity"))[indices]
+        leg_length = jnp.asarray(parameter("locked_length"))
+        bounce_height = np.asarray(min_bounce_height(leg_length, self.options))
+        return np.sqrt(8.0 * bounce_height / parameter("gravity"))[indices]
 
     def free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
         """Return for each number of section states whether it is free, (elements, 4 + 2 n).
