@@ -1,5 +1,6 @@
-"""The wheel with unilateral contact: mechanics, contact laws, impacts, batched walks and their
-tangents."""
+"""Wheel with unilateral contact: mechanics, contact laws, impacts, batched walks and their
+tangents.
+"""
 
 from vrw_jax.contact import batch_walks
 from vrw_jax.contact.batch_walks import embed_section_states, step_batch_with_jacobian, walk_batch

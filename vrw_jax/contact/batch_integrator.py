@@ -1,8 +1,11 @@
 """Batched integration between events: each lane has its own step size and contact state.
 
 Arrays have lanes on the last axis. One Runge-Kutta step serves integration and event search: a lane
-whose step crosses a guard repeats it with smaller steps until the step ends at the earliest event.
-No computation in this module combines values of different lanes.
+whose step crosses a guard repeats the step with smaller sizes until the step ends at the earliest
+event. No computation in this module combines values of different lanes.
+
+The *initiating guard* of a contact state is the guard whose zero is the event that started this
+state. The guard of a foot that has just lifted off is an example.
 """
 
 from collections.abc import Callable
@@ -39,15 +42,15 @@ from vrw_jax.numerics import StepOptions, tree_where
 from vrw_jax.wheel import Outcome, Symbols, compute_own_units
 
 N_CONTACT_ROWS = 9
-"""Number of rows after the accelerations that hold the contact quantities of the guards. They are
-followed by those of legs in the air, if stoppers are one-sided, and by `N_ACCUMULATOR_ROWS` rows
-if these are requested."""
+"""Number of dynamics rows that hold the contact quantities of the guards. They follow the
+accelerations. Stopper forces of legs in the air follow if stoppers are one-sided, then
+`N_ACCUMULATOR_ROWS` rows if these are requested."""
 N_ACCUMULATOR_ROWS = 3
-"""Number of accumulated rows: energy lost in dampers and by sliding, slip."""
+"""Number of rows of accumulators: energy lost in dampers, energy lost by sliding, slip."""
 
 
 class LaneStatus(IntEnum):
-    """Status of a lane between two events; a non-negative status is its `Outcome`."""
+    """Status of a lane between two events; a non-negative status is an `Outcome`."""
 
     RUNNING = -1
     EVENT = -2
@@ -55,61 +58,57 @@ class LaneStatus(IntEnum):
 
 @dataclass(frozen=True)
 class IntervalOptions:
-    """Search for events with unilateral contact, and the loop over lanes."""
+    """Options of the search for events with unilateral contact, and of the loop over lanes."""
 
     max_wait_attempts: int = 8
-    """Number of solver-step attempts after which a lane at an event ends the loop for all lanes."""
-    painleve_atol: float = 1e-8
-    """Determinant below which it counts as zero at Painlevé's singularity.
-
-    Forces there are a ratio of two vanishing numbers, resolved neither by round-off nor by
-    integration.
+    """Number of attempted solver steps after which a lane at an event ends the loop for all lanes.
     """
+    painleve_atol: float = 1e-8
+    """Absolute value below which the determinant counts as zero at Painlevé's singularity.
+
+    There, forces are a ratio of two vanishing numbers, which neither round-off nor integration
+    resolves."""
     painleve_rtol_factor: float = 1e2
     """Factor of the relative tolerance that is added to `painleve_atol`.
 
-    It is chosen because with a factor of 18 one singularity was missed.
-    """
+    The value is chosen because one singularity was missed with a factor of 18."""
     n_parabola_iterations: int = 3
-    """Number of event iterations by parabolas; the later ones use secants, which converge better in
-    stiff dips."""
+    """Number of event iterations with parabolas. The later ones use secants, which converge better
+    if a guard is below zero for a short time."""
     min_iterations_of_initiating_guard: int = 15
-    """Number of event iterations after which a guard that starts at its own event may be the
-    event."""
+    """Number of event iterations after which an initiating guard can be the event."""
     max_roundoff_fall_time: float = 1e-3
-    """Time within which a guard must fall by its own round-off to count as falling, in the wheel's
-    own unit: seconds for a wheel of Table 1's size."""
+    """Time in which a guard that counts as falling falls by its own round-off. The unit is the
+    wheel's own: seconds for a wheel of Table 1's size."""
     event_time_tolerance_factor: float = 30.0
     """Largest last correction to the time of an event, in tolerances of the step.
 
-    It is chosen because the error of a parabola's proposal is about a hundredth of the correction.
-    """
+    The value is chosen because the error of a parabola's root is about a hundredth of the
+    correction."""
 
 
 INTERVAL_OPTIONS = IntervalOptions()
 
 
 class IntervalPoint(NamedTuple):
-    """Coordinates (hub x, z, theta, lengths), their rates, and the rows of the dynamics at a
-    point.
-    """
+    """Coordinates (hub x, z, theta, lengths), rates and dynamics rows of all lanes at one time."""
 
     q: Array  # (3 + n, lanes)
     v: Array
-    dynamics_rows: Array  # accelerations, then contact rows: (3 + n + N_CONTACT_ROWS [+ n], lanes)
+    dynamics_rows: Array  # accelerations, contact rows: (3 + n + 9 [+ n] [+ 3], lanes)
 
 
 class EventBracket(NamedTuple):
-    """Bracket of the earliest event inside a step."""
+    """Bracket of the earliest event inside a step, and the last attempt of the search."""
 
     is_active: Array
-    is_crossing: Array  # (guards, lanes)
+    is_crossing: Array  # whether a guard crosses zero in the bracket, (guards, lanes)
     low_h: Array  # bracket of the event, s from the start of the step
     high_h: Array
     time_tolerance: Array  # s
     n_iterations: Array
-    previous_h: Array  # previously attempted step, s
-    guard_values: Array  # guards at its end, (guards, lanes)
+    previous_h: Array  # size of the previous attempt, s
+    guard_values: Array  # at the end of the previous attempt, (guards, lanes)
 
 
 class IntervalState(NamedTuple):
@@ -117,40 +116,42 @@ class IntervalState(NamedTuple):
 
     point: IntervalPoint
     contact_state: ContactState
-    guard_values: Array  # guards at the point, (guards, lanes)
-    guard_offset: Array  # value at the own event of a guard that starts there, minus rounding
+    guard_values: Array  # at the point, (guards, lanes)
+    guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
     interval_accumulators: (
         Array | None
     )  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
     h: Array  # of the next attempt, s
     time: Array  # since the last event, s
     event_bracket: EventBracket
-    status: Array  # a LaneStatus or an Outcome
+    status: Array  # `LaneStatus` or `Outcome`
     triggered_guard: Array  # index of the guard that has triggered
-    n_solver_steps: Array  # attempted since the last event
+    n_solver_steps: Array  # number of attempts since the last event
 
 
 def motion_from_point(point: IntervalPoint) -> WheelMotion:
-    """Return the motion at a point."""
+    """Return the motion at a point of an interval."""
     x, z, theta, L = point.q[0], point.q[1], point.q[2], point.q[3:]
     return WheelMotion(x, z, theta, point.v[0], point.v[1], point.v[2], L, point.v[3:])
 
 
 def make_point(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalPoint:
-    """Return the point of a motion, with its dynamics: the inverse of `motion_from_point`."""
+    """Return the point of a motion, with its dynamics rows: the inverse of `motion_from_point`."""
     q, v = pack_coordinates(motion)
     return IntervalPoint(q, v, evaluate_dynamics(dynamics, q, v))
 
 
 def pack_coordinates(motion: WheelMotion) -> tuple[Array, Array]:
-    """Return the coordinates of a motion, and their rates, as two arrays."""
+    """Return the coordinates of a motion and their rates, as two arrays (3 + n, ...)."""
     q = jnp.concatenate([jnp.stack([motion.x, motion.z, motion.theta]), motion.L])
     return q, jnp.concatenate([jnp.stack([motion.vx, motion.vz, motion.dtheta]), motion.dL])
 
 
 def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
-    """Return the accelerations of all coordinates, then `ContactQuantities` without the
-    directions.
+    """Return the dynamics rows: accelerations, contact quantities, and accumulator rates if
+    requested.
+
+    The axes are (rows, lanes). Leg directions are not among the contact quantities.
     """
     motion = motion_from_point(IntervalPoint(q, v, q))
     forces = compute_forces(dynamics, motion)
@@ -182,8 +183,9 @@ def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
 
 
 def evaluate_guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
-    """Return all guards in the order of `GuardLayout`, as long after the start of the contact
-    state.
+    """Return all guards in the order of `GuardLayout`, (guards, lanes).
+
+    The point is after the start of the contact state, so that all guards are evaluated.
     """
     motion = motion_from_point(point)
     contact_rows = point.dynamics_rows[len(point.q) :]
@@ -203,7 +205,7 @@ def evaluate_guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Ar
 
 
 def compute_guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
-    """Return the time derivatives of the guards along the motion."""
+    """Return the time derivatives of the guards along the motion, (guards, lanes)."""
 
     def evaluate_guards_at(q: Array, v: Array) -> Array:
         return evaluate_guards_at_point(
@@ -216,7 +218,7 @@ def compute_guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
 
 
 def find_initiating_guards(dynamics: ModeDynamics) -> Array:
-    """Return which guards are at the event that has just started the contact state."""
+    """Return whether each guard is the initiating guard of the contact state, (guards, lanes)."""
     contact_state = dynamics.contact_state
     has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
     no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
@@ -236,7 +238,7 @@ def find_initiating_guards(dynamics: ModeDynamics) -> Array:
     )
 
 
-@eqx.filter_jit  # traced once for all call sites
+@eqx.filter_jit  # This function is traced once for all call sites.
 def init_interval(
     dynamics: ModeDynamics,
     motion: WheelMotion,
@@ -246,14 +248,17 @@ def init_interval(
     """Return the lanes at the start of a contact state.
 
     A lane is at an event again if one of its guards falls immediately.
+
+    - `h`: size of the first attempt in the wheel's own unit of time.
     """
     point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
     guard_values, guard_rates = (
         evaluate_guards_at_point(dynamics, point),
         compute_guard_rates(dynamics, point),
     )
-    # A contact released from rest has a guard within rounding for 1e-8 s and longer. One that
-    # rises from below has no event before it falls; events without duration leave several such.
+    # The guard of a contact released from rest is within round-off for 1e-8 s and longer. A guard
+    # that rises from below zero has no event before it falls. Several events at one time leave
+    # several such guards.
     roundoff = compute_guard_scales(dynamics) * (
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
@@ -297,7 +302,7 @@ def init_interval(
 
 
 DynamicsFn = Callable[[Array], ModeDynamics]
-"""Function of the lanes' columns: parameters and friction."""
+"""Function from the input columns of the lanes to the dynamics of their contact states."""
 
 
 def integrate_interval(
@@ -310,8 +315,10 @@ def integrate_interval(
 ) -> IntervalState:
     """Return the lanes integrated until none is running.
 
-    After `max_wait_tries` attempts, the loop ends as soon as a lane with `is_walking` is at an
-    event.
+    After `max_wait_attempts` attempts, the loop ends as soon as a lane with an unfinished walk is
+    at an event.
+
+    - `input_columns`: parameters, friction and uneven ground, (columns, lanes).
     """
     dynamics = dynamics_fn(input_columns)
     guard_scales, options = (
@@ -339,9 +346,10 @@ def iterate_until_stopped(
     initial_state: Any,
     max_wait_attempts: int = INTERVAL_OPTIONS.max_wait_attempts,
 ) -> Any:
-    """Return the state after repeated `iterate`, until no lane is running.
+    """Return the state after `advance_state` has been applied until no lane is running.
 
-    After `max_wait_tries` attempts, the loop ends as soon as a lane with `is_walking` has stopped.
+    After `max_wait_attempts` attempts, the loop ends as soon as a lane with an unfinished walk has
+    stopped.
     """
 
     def should_continue(loop_state: tuple) -> Array:
@@ -356,21 +364,24 @@ def iterate_until_stopped(
 
 
 class AttemptedStep(NamedTuple):
-    """An attempted solver step."""
+    """Result of one attempted solver step of every lane."""
 
     end_point: IntervalPoint
-    squared_error: Array  # of the error over the tolerance
-    guard_values: Array  # at the end
-    parabola_curvature: Array  # of the guards' parabolas
+    squared_error: Array  # mean square of the error over the tolerance
+    guard_values: Array  # at the end of the step, (guards, lanes)
+    parabola_curvature: Array  # of the parabola through each guard, (guards, lanes)
     parabola_linear_term: Array
-    dip_fraction: Array  # fraction of the step to a possible guard dip below zero, else 1
-    accumulator_increments: Array | None  # increment of `IntervalState.accumulated`
+    dip_fraction: Array  # fraction of the step to a possible zero of a guard inside, else 1
+    accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
 
 
 def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return coordinates and rates at a stage, from the accelerations of the stages before it."""
+    """Return coordinates and rates at stage i, from the accelerations of the stages before it.
+
+    - `h`: step size, s.
+    """
     a, b, node = (
         jnp.asarray(x)[i] for x in (tableau.matrix, tableau.matrix_squared, tableau.nodes)
     )
@@ -383,7 +394,7 @@ def compute_stage_state(
 def attempt_step(
     dynamics: ModeDynamics, tableau: ButcherTableau, options: StepOptions, state: IntervalState
 ) -> AttemptedStep:
-    """Return an attempted step of every lane."""
+    """Return one attempted step of every lane."""
     h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
 
     def evaluate_stage(i: Array, stage_rows: Array) -> Array:
@@ -405,7 +416,7 @@ def complete_attempt(
     state: IntervalState,
     stage_rows: Array,
 ) -> AttemptedStep:
-    """Return the attempted step with these rows of the dynamics at its stages."""
+    """Return the attempted step whose dynamics rows at all stages are `stage_rows`."""
     h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
     n = len(point.q)
     end_point = IntervalPoint(
@@ -463,8 +474,9 @@ def is_at_singularity(
     options: StepOptions,
     interval_options: IntervalOptions = INTERVAL_OPTIONS,
 ) -> Array:
-    """Return whether the determinant has vanished at Painlevé's singularity, from its values at
-    both ends.
+    """Return whether a determinant vanishes between two times, which is Painlevé's singularity.
+
+    - `value_before`, `value_after`: the determinant at the two times.
     """
     atol, rtol_factor = interval_options.painleve_atol, interval_options.painleve_rtol_factor
     is_zero = jnp.abs(value_after) <= atol + rtol_factor * options.rtol
@@ -504,7 +516,7 @@ def integrator_step(
     step_size_ratio = jnp.where(
         needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
     )
-    # The last step ends at the time limit.
+    # The last step ends exactly at the time limit.
     time_limit = options.max_phase_time
     end_time = jnp.where(is_accepted & (h == time_limit - state.time), time_limit, state.time + h)
     reached_time = jnp.where(is_accepted, end_time, state.time)
@@ -557,7 +569,7 @@ class _LocatedEvent(NamedTuple):
     """Result of one iteration of the search for the earliest event inside a step."""
 
     next_h: Array  # step size of the next attempt, s
-    time_shift: Array  # from this step size to the event's, s
+    time_shift: Array  # correction from this step size to that of the event, s
     has_reached_event: Array  # whether the event is within tolerance
     guard: Array
 
@@ -570,8 +582,9 @@ def _search_event(
     options: StepOptions,
     interval_options: IntervalOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
-    """Return one more iteration of the search, from the zeros of the guards' parabolas or
-    secants.
+    """Return the bracket after one more iteration, and the event if the iteration has located it.
+
+    The proposed step size is a zero of the guards' parabolas or secants.
     """
     h, bracket = state.h, state.event_bracket
     is_below_zero = attempt.guard_values <= 0.0
@@ -594,17 +607,19 @@ def _search_event(
     )
     time_tolerance = jnp.where(bracket.is_active, bracket.time_tolerance, time_tolerance)
     is_in_bracket = (proposed_h >= low_h - time_tolerance) & (proposed_h <= high_h + time_tolerance)
-    # In a dip of microseconds, round-off moves proposals out of the bracket: it is bisected.
+    # If a guard is below zero for microseconds only, round-off moves proposals out of the bracket.
+    # The bracket is then bisected.
     needs_bisection = ~is_in_bracket | (uses_secant & ((bracket.n_iterations & 3) == 3))
-    # A guard that starts at its own event falls again soon, or not at all.
+    # An initiating guard falls again soon, or not at all.
     bisection_h = jnp.where(
         (low_h == 0.0) & jnp.isinf(proposed_h), 0.125 * high_h, 0.5 * (low_h + high_h)
     )
     next_h = jnp.where(needs_bisection, bisection_h, proposed_h)
     time_shift = next_h - h
-    # If a guard is within its rounding, no other step size is better than this one.
+    # If a guard is within its round-off, no other step size is better than this one.
     lowest_guard, lowest_value = _lowest_guard(attempt.guard_values / guard_scales, is_crossing)
-    # A guard at its own event is within twice its rounding; without another event, it is the event.
+    # An initiating guard is within twice its round-off. Without another event, the guard is the
+    # event.
     guard_roundoff = (
         GUARD_ROUNDOFF_IN_EPS
         * jnp.where(
@@ -650,17 +665,19 @@ def _squared_error(
 
 
 def _is_initiating(state: IntervalState) -> Array:
-    """Return the guards at their own event, for lanes at the start of the contact state."""
+    """Return whether each guard is an initiating guard and the lane is at the start of its
+    interval.
+    """
     return (state.time == 0.0) & (state.guard_offset != 0.0)
 
 
 def _earliest_dip_fraction(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
-    """Return the fraction of the step before a guard that may dip below zero in it; 1 if there is
-    none.
+    """Return the fraction of the step to the earliest possible guard zero inside it, or 1.
 
-    See `integrator.find_guard_minimum`. A guard that starts at its own event is not considered.
+    A guard that is positive at both ends may be negative between them: see `integrator.find_dip`.
+    Initiating guards are not considered.
     """
     has_dip, dip_fraction = find_dip(tableau, guard_values)
     return jnp.min(
@@ -669,7 +686,7 @@ def _earliest_dip_fraction(
 
 
 def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
-    """Return the lowest of the crossing guards, and its value; infinite if none crosses."""
+    """Return the index of the lowest crossing guard, and its value; infinite if none crosses."""
     lowest_value, guard = (
         jnp.full_like(guard_values[0], jnp.inf),
         jnp.zeros(guard_values.shape[1:], jnp.int32),
@@ -684,11 +701,12 @@ def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array
 def _earliest_secant(
     bracket: EventBracket, guard_values: Array, h: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
-    """Return the earliest zero of the crossing guards' secants through the last two attempts.
+    """Return the step size (s) at the earliest zero of the crossing guards' secants, and the
+    guard's index.
 
-    It also returns the guard. The zero is infinite if no guard falls, and minus infinity if a guard
-    is below zero and no longer falls, because it fell before. The ends of attempts are as accurate
-    as the integration; the inner stage is not.
+    The secants go through the last two attempts, because their ends are as accurate as the
+    integration and inner stages are not. The step size is infinite if no guard falls. The step size
+    is minus infinity if a guard is below zero and no longer falls, because the guard fell before.
     """
     secant_slope = (guard_values - bracket.guard_values) / jnp.where(
         h == bracket.previous_h, jnp.inf, h - bracket.previous_h
@@ -708,11 +726,12 @@ def _earliest_secant(
 def _earliest_root(
     g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_initiating: Array
 ) -> tuple[Array, Array]:
-    """Return the earliest zero of the crossing guards' parabolas, in step lengths, and the guard.
+    """Return the earliest zero of the crossing guards' parabolas, as a fraction of the step, and
+    the guard's index.
 
-    The zero is infinite if no parabola falls ahead. A guard that starts at its own event rises: if
-    its parabola falls at once, the step is too long for parabolas. The zero is minus infinity if
-    such a parabola ends below zero.
+    The zero is infinite if no parabola falls ahead. An initiating guard rises first: if its
+    parabola falls at once, the step is too long for parabolas. The zero is minus infinity if such a
+    parabola ends below zero.
     """
     discriminant = linear_term * linear_term - 4.0 * curvature * g0
     sqrt_discriminant = jnp.sqrt(jnp.maximum(discriminant, 0.0))

@@ -49,11 +49,15 @@ def walk_batch(
     options: StepOptions,
     n: int,
 ) -> tuple[np.ndarray, ...]:
-    """Return the results of `n_steps` steps of many wheels with `n` legs.
+    """Return the results of `n_steps` steps of many wheels with `n` legs, with wheels on the
+    leading axis.
 
-    `columns` are the parameters in their order and friction, shape (10, wheels); `states` full
-    section states, shape (wheels, 4 + 3 n). On uneven ground, one step at a time, two columns
-    more: see `N_UNEVEN_COLUMNS`.
+    The results are section states, durations (s), outcomes, numbers of completed steps and of
+    solver steps, and lengths (m) of the last step.
+
+    - `input_columns`: parameters in their order and friction, shape (10, wheels). On uneven ground,
+      with one step at a time, two more columns follow: see `N_UNEVEN_COLUMNS`;
+    - `states`: full section states, shape (wheels, 4 + 3 n).
     """
     config = _WalkConfig.from_model(model, options, n, False, len(input_columns))
     walk_result = _run_walk(config, [input_columns, states.T], n_steps, options)
@@ -70,16 +74,16 @@ def step_batch_with_jacobian(
     n: int,
     input_indices: Sequence[int] | None = None,
 ) -> tuple[UnilateralStep, UnilateralStep]:
-    """Return one step of many wheels, as `walk_batch` takes them, and the Jacobian of its results.
+    """Return one step of many wheels, with input as in `walk_batch`, and the Jacobian of its
+    results.
 
-    The leading axis is over wheels. Derivatives have a last axis over the columns, then the section
-    state. Tangents are integrated beside the wheel's motion. Entries that are not in
-    `input_indices` or cannot vary (lengths of legs on their stoppers or with loaded feet, and
-    codes) have zero derivatives. The number of rate tangents is the number that loaded feet leave
-    independent (see `_IndependentRates`).
+    The leading axis is over wheels. Derivatives have a last axis over the input columns, then the
+    section state. Entries that are not in `input_indices` or cannot vary have zero derivatives.
+    Lengths of legs on their stoppers or with loaded feet, and codes, cannot vary. The number of
+    rate tangents is the number that loaded feet leave independent (see `_IndependentRates`).
     """
     config = _WalkConfig.from_model(model, options, n, True, len(input_columns))
-    if len(states):  # before others are asked for: it is long in coming
+    if len(states):  # The longest compilation starts first.
         _compile_walk(
             config, input_columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array))
         )
@@ -98,7 +102,7 @@ def step_batch_with_jacobian(
     rate_indices = len(input_columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
     section_units = compute_section_units(compute_own_units_of_rows(input_columns.T, n), n)
     rate_units = np.stack(section_units, -1)[:, rate_indices - len(input_columns)]
-    projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n)]]  # in the order of `coordinates`
+    projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n)]]  # as in `pack_coordinates`
     projection = _project_rates(input_columns, states, n) * (
         rate_units[:, None] / projected_units[:, :, None]
     )
@@ -130,12 +134,13 @@ def step_batch_with_jacobian(
 
 
 MAX_TANGENTS_PER_LANE = 16
-"""Largest number of tangents in one lane: more tangents are distributed over several lanes."""
+"""Largest number of tangents in one lane. More tangents are distributed over several lanes."""
 
 
 def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lane and position of each wheel's tangents, one after another, and the lanes'
-    owners.
+    """Return the lane and the position in the lane of each tangent, and the wheel of each lane.
+
+    Tangents are ordered by wheel.
     """
     n_lanes_by_wheel = np.maximum(-(-n_tangents_by_wheel // MAX_TANGENTS_PER_LANE), 1)
     first_lane = np.cumsum(n_lanes_by_wheel) - n_lanes_by_wheel
@@ -151,19 +156,20 @@ def _pack_tangents(n_tangents_by_wheel: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 RANK_TOLERANCE = 1e-10
-"""Remainder of a dependent rate that counts as rounding, as a fraction of the largest: an
+"""Remainder of a dependent rate that counts as round-off, as a fraction of the largest. An
 independent rate has a remainder of order one, like the projection."""
 
 
 class _IndependentRates(NamedTuple):
     """Independent rates of section states, and the other rates as combinations of these.
 
-    A loaded foot constrains the wheel: a resting foot leaves two of the four rates of hub and leg.
+    A loaded foot constrains the wheel: a resting foot leaves two of the four rates of hub and leg
+    independent.
     """
 
-    indices: np.ndarray  # of the independent rates, (wheels, independent)
-    is_used: np.ndarray  # which of these exist
-    combination_weights: np.ndarray  # of all rates by these, (wheels, independent, rates)
+    indices: np.ndarray  # index of each independent rate, (wheels, independent)
+    is_used: np.ndarray  # whether each of these exists
+    combination_weights: np.ndarray  # of each in all rates, (wheels, independent, rates)
 
     @classmethod
     def from_projection(
@@ -217,7 +223,7 @@ class _IndependentRates(NamedTuple):
             1,
         )
         combination_weights = np.zeros_like(components)
-        for i in reversed(range(len(indices))):  # each direction is the remainder of one rate
+        for i in reversed(range(len(indices))):  # Each direction is the remainder of one rate.
             remaining_component = components[:, i].copy()
             for j in range(i + 1, len(indices)):
                 remaining_component -= (
@@ -232,7 +238,7 @@ class _IndependentRates(NamedTuple):
         return cls(index_array, is_significant, combination_weights)
 
     def convert_to_si(self, units: np.ndarray) -> "_IndependentRates":
-        """Return the same for rates in SI, given rates in `units`, (wheels, rates)."""
+        """Return the independent rates in SI units, given rates in `units`, (wheels, rates)."""
         own_units = np.take_along_axis(units, self.indices, 1)
         return self._replace(
             combination_weights=self.combination_weights * own_units[:, :, None] / units[:, None]
@@ -247,7 +253,7 @@ class _IndependentRates(NamedTuple):
 
     def expand_to_all_rates(self, tangents: np.ndarray) -> np.ndarray:
         """Return the tangents of all rates, (wheels, rates, ...), from those of the independent
-        ones.
+        rates.
         """
         wheel_indices, trailing_axes = np.arange(len(tangents)), (1,) * (tangents.ndim - 2)
         all_tangents = np.zeros_like(tangents)
@@ -262,9 +268,9 @@ class _IndependentRates(NamedTuple):
 
 
 def _project_rates(input_columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
-    """Return the effect of each rate of the section state on the start of a step, which is linear.
+    """Return the effect of each rate of the section state on the projected start of a step.
 
-    The axes are (wheels, rates after, rates).
+    The effect is linear. The axes are (wheels, rates after, rates).
     """
     unit_rates = np.eye(3 + n)
     repeated_states = np.repeat(states, 3 + n, 0)
@@ -288,13 +294,13 @@ SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
     "full states": embed_section_state,
     "rates at a start": lambda s, x: pack_coordinates(_project_landing(s, x))[1],
 }
-"""Functions of section states alone, with lanes on the last axis."""
+"""Functions of symbols and section states, with lanes on the last axis."""
 
 
 def _apply_to_rows(n: int, function_name: str, lane_rows: list[np.ndarray]) -> np.ndarray:
-    """Return one of `SECTION_STATE_FUNCTIONS` of rows of parameters and section states.
+    """Return one of `SECTION_STATE_FUNCTIONS`, evaluated at rows of parameters and section states.
 
-    One program serves any number of wheels; JAX alone would compile a new one for each number.
+    One program serves any number of wheels. JAX alone would compile a new one for each number.
     """
     program = _compile_for_rows(n, function_name, len(lane_rows), lane_rows[0].dtype)
     return np.stack(program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
@@ -304,7 +310,7 @@ def _apply_to_rows(n: int, function_name: str, lane_rows: list[np.ndarray]) -> n
 def _compile_for_rows(
     n: int, function_name: str, n_rows: int, dtype: np.dtype
 ) -> Callable[..., Any]:
-    """Return the compiled function of rows."""
+    """Return the compiled function of rows with this name."""
 
     def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
         parameter_values, x = (
@@ -323,9 +329,9 @@ def _compile_for_rows(
 
 
 def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
-    """Return the function of numbers and rows, compiled by XLA in blocks of lanes.
+    """Return a function of lane-independent numbers and rows, compiled by XLA in blocks of lanes.
 
-    It is used without machine code.
+    The function serves platforms without machine code.
     """
     move_axis = lambda results, source, destination: tuple(
         jnp.moveaxis(x, source, destination) for x in results
@@ -365,7 +371,10 @@ class _WalkConfig(NamedTuple):
         has_tangents: bool,
         n_columns: int,
     ) -> "_WalkConfig":
-        """Return the configuration of a model and these options."""
+        """Return the configuration for a model and these options.
+
+        Raises `ValueError` for a model with restitution.
+        """
         if model.restitution is not None:
             raise ValueError(
                 "restitution is given, but batches do not support it: walk wheels one by one with "
@@ -384,10 +393,10 @@ class _WalkConfig(NamedTuple):
         )
 
     def make_walk(self, traced_options: StepOptions, n_steps: Array) -> BatchWalkSettings:
-        """Return the walk settings with traced options and number of steps."""
+        """Return the walk settings with traced options and a traced number of steps."""
         options = eqx.combine(traced_options, self.static_options)
         tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # the caller looked
+        assert tableau is not None  # The caller has checked the solver.
         rules = (
             self.is_one_sided,
             self.uses_paper_rule,
@@ -399,7 +408,9 @@ class _WalkConfig(NamedTuple):
         return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *rules)
 
     def input_row_counts(self) -> tuple[int, ...]:
-        """Of the arrays that are given: columns, states, and which of these directions are."""
+        """Return the number of rows of each input: columns, states and, if requested, tangent
+        inputs.
+        """
         row_counts = (
             N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.is_uneven,
             full_section_size(self.n_legs),
@@ -407,7 +418,7 @@ class _WalkConfig(NamedTuple):
         return (*row_counts, MAX_TANGENTS_PER_LANE) if self.has_tangents else row_counts
 
     def result_structure(self, dtype: Any) -> Any:
-        """Return shapes and dtypes of the results."""
+        """Return shapes and dtypes of the results of one lane."""
         result = _result_shapes(self.n_legs, dtype, self.has_tangents)
         if not self.has_tangents:
             return result
@@ -422,18 +433,20 @@ class _WalkConfig(NamedTuple):
 
 @functools.cache
 def _result_shapes(n_legs: int, dtype: Any, has_tangents: bool) -> Any:
-    """Return shapes and dtypes of one lane's results."""
+    """Return shapes and dtypes of one lane's results, without tangents."""
     return jax.eval_shape(lambda: make_result_template(n_legs, dtype, has_tangents))
 
 
 def _run_walk(
     config: _WalkConfig, input_arrays: list[np.ndarray], n_steps: int, options: StepOptions
 ) -> Any:
-    """Return the results of lanes with the lane axis, last in the input arrays, as the leading
-    one.
+    """Return the results of lanes, with the lanes on the leading axis.
+
+    The input arrays have the lanes on their last axis.
     """
     dtype = input_arrays[0].dtype
-    # Neighboring lanes run as long as the slowest; high damping bounds the step by stability.
+    # Neighboring lanes run as long as the slowest of them. Lanes are sorted by damping, because
+    # high damping limits the step size by stability.
     lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
     traced_options, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
     lane_independent = [np.int32(n_steps), *(np.asarray(leaf, dtype) for leaf in traced_options)]
@@ -458,12 +471,14 @@ def _run_walk(
 
 @functools.cache
 def _result_structure(config: _WalkConfig, dtype: np.dtype) -> tuple[list[Any], Any]:
-    """Return the leaves and the tree structure of the results."""
+    """Return the leaves and the tree structure of the results of one lane."""
     return jax.tree.flatten(config.result_structure(dtype))
 
 
 def embed_section_states(input_columns: np.ndarray, states: np.ndarray, n: int) -> np.ndarray:
-    """Return the full section states of three-number ones; others are returned unchanged."""
+    """Return the full section states of states with three entries; others are returned
+    unchanged.
+    """
     if states.shape[1] != 3:
         return states
     return _apply_to_rows(n, "full states", [*input_columns[:N_PARAMETERS], *states.T]).T
@@ -473,7 +488,9 @@ def embed_section_states(input_columns: np.ndarray, states: np.ndarray, n: int) 
 def _compile_walk(
     config: _WalkConfig, dtype: np.dtype, options_structure: Any
 ) -> Callable[..., Any]:
-    """Return the compiled walk over numbers and rows of lanes, for any number of steps."""
+    """Return the compiled walk over lane-independent numbers and rows of lanes, for any number of
+    steps.
+    """
 
     def run_compiled_walk(lane_independent: tuple, lane_rows: tuple) -> tuple:
         n_steps, *traced_options = lane_independent

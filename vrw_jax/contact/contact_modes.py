@@ -5,11 +5,12 @@ normal forces push, friction lies in Coulomb's cone and opposes the slip, and op
 not close. Of several, the one with the most sticking feet is chosen. The same table serves impacts
 (impulses and the velocities after them) and motion (forces and accelerations).
 
-Infinite friction is the limit of large friction. In Coulomb's |t| = mu n, a finite t leaves n = 0.
-So a sliding foot is carried by friction alone, against its slip, and a resting foot begins to slide
-where its normal force vanishes. The paper's rule (A1)-(A4) is a different one, selected by a
-friction of minus infinity (`PAPER_RULE_SENTINEL`). A foot sticks if that requires no pull, and
-lifts otherwise. Only if neither is possible, it slides without friction.
+Infinite friction is the limit of large friction. In Coulomb's law |t| = mu n, a finite t requires n
+= 0. So a sliding foot is carried by friction alone, which acts against the slip. A resting foot
+begins to slide when its normal force vanishes. The paper's rule (A1)-(A4) is a different one,
+selected by a friction of minus infinity (`PAPER_RULE_SENTINEL`). With this rule, a foot sticks if
+that requires no pull, and lifts otherwise. Only if neither is possible, the foot slides without
+friction.
 """
 
 import functools
@@ -37,7 +38,7 @@ from vrw_jax.numerics import Elementwise, tree_where
 from vrw_jax.wheel import Symbols
 
 Friction = Elementwise | SlotPair
-"""Friction of all feet, or of each slot's foot."""
+"""Friction coefficient of all feet, or of each slot's foot."""
 
 
 class ContactMode(IntEnum):
@@ -50,29 +51,29 @@ class ContactMode(IntEnum):
 
 
 PAPER_RULE_SENTINEL = -np.inf
-"""Friction that selects the paper's rule instead of the limit of large friction."""
+"""Value of friction that selects the paper's rule instead of the limit of large friction."""
 
 
 class ContactSolution(NamedTuple):
-    """Forces (N) and resulting accelerations, or impulses (N s) and the velocities after them."""
+    """Forces (N) and resulting accelerations, or impulses (N s) and velocities after them."""
 
     tangential: SlotPair  # on each slot's foot, downhill positive
     normal: SlotPair  # pushing positive
-    stopper: SlotPair  # of each slot's leg, pushing positive
-    pull: SlotPair  # sum of stopper and foot force along u, acting on the leg's mass
+    stopper: SlotPair  # of the stopper of each slot's leg, pushing positive
+    pull: SlotPair  # force of stopper and foot along u on the leg's mass
     hub: HubVector
-    length_motion: SlotPair  # of each slot's leg
+    length_motion: SlotPair  # of the length of each slot's leg
     foot_motion_x: SlotPair  # of each slot's foot
     foot_motion_z: SlotPair
-    painleve_determinant: Any  # 1; zero if no force holds a sliding foot: Painlevé's singularity
+    painleve_determinant: Any  # of order 1; zero at Painlevé's singularity
 
 
 Matrix2x2 = tuple[tuple[Any, Any], tuple[Any, Any]]
-"""Matrix of two rows and two columns."""
+"""Matrix of two rows and two columns, as nested tuples."""
 
 
 def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
-    """Return the solution of a 2 x 2 system; NaN if the matrix is singular."""
+    """Return the solution of a linear system of two equations; NaN if the matrix is singular."""
     determinant = A[0][0] * A[1][1] - A[0][1] * A[1][0]
     inverse_determinant = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
     return (
@@ -82,52 +83,53 @@ def _solve_2x2(A: Matrix2x2, b: SlotPair) -> SlotPair:
 
 
 def _make_matrix(entry_fn: Any) -> Matrix2x2:
-    """Return the 2 x 2 matrix of the entries `entry(i, j)`."""
+    """Return the 2 x 2 matrix of the entries `entry_fn(i, j)`."""
     return ((entry_fn(0, 0), entry_fn(0, 1)), (entry_fn(1, 0), entry_fn(1, 1)))
 
 
 def _make_pair(entry_fn: Any) -> SlotPair:
-    """Return the entries `entry(0)` and `entry(1)`."""
+    """Return the pair of the entries `entry_fn(0)` and `entry_fn(1)`."""
     return entry_fn(0), entry_fn(1)
 
 
 def map_friction(function: Callable[[Any], Any], friction: Friction) -> Any:
-    """Return the function of the friction of all feet, or of each slot's."""
+    """Return `function` applied to the friction of all feet, or to that of each slot's foot."""
     is_pair = isinstance(friction, tuple)
     return (function(friction[0]), function(friction[1])) if is_pair else function(friction)
 
 
 def _friction_of_slot(i: int, friction: Any) -> Any:
-    """Return the friction of slot i."""
+    """Return the friction of slot i, from a pair or a common number."""
     return friction[i] if isinstance(friction, tuple) else friction
 
 
 def finite_friction(friction: Friction) -> Any:
-    """Return Coulomb's coefficient; 0 for infinite friction, which exerts none on a sliding
-    foot.
+    """Return Coulomb's coefficient of friction; 0 if friction is infinite.
+
+    A foot that slides under infinite friction receives no friction by Coulomb's law.
     """
     return map_friction(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), friction)
 
 
 class _FootEquations(NamedTuple):
-    """Conditions of a combination at each slot's foot.
+    """Equations of a combination at each slot's foot.
 
-    The unknown c is the force along e for a sticking foot. For a sliding foot it is the normal
+    The unknown c is the transverse force for a sticking foot. For a sliding foot, c is the normal
     force, or the friction force in the limit of infinite friction. An unloaded foot has c = 0.
     """
 
     is_sticking: SlotPair
     is_loaded: SlotPair
-    unit_force_transverse: SlotPair  # force along e for c = 1
-    unit_force_radial: SlotPair  # along u, except for the own leg's part of a sticking foot
-    weight_transverse: SlotPair  # weight of the foot's motion along e in the zero condition
-    weight_radial: SlotPair  # weight of the foot's force on the leg's mass in it
+    unit_force_transverse: SlotPair  # transverse force for c = 1
+    unit_force_radial: SlotPair  # force along the leg for c = 1; 0 for a sticking foot
+    weight_transverse: SlotPair  # weight of the foot's transverse motion in the condition
+    weight_radial: SlotPair  # weight of the force on the leg's mass in the condition
 
 
 def _make_foot_equations(
     s: Symbols, inertia: ContactInverseInertia, slot_modes: Array, friction: Friction
 ) -> _FootEquations:
-    """Return the conditions of these contact modes."""
+    """Return the equations at the feet for these contact modes and friction."""
     sin, cos = inertia.sin, inertia.cos
     sliding_coefficient = map_friction(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
@@ -167,7 +169,7 @@ def _make_foot_equations(
 
 
 def _identity_entry(i: int, j: int) -> float:
-    """Return an entry of the identity matrix."""
+    """Return the entry (i, j) of the identity matrix."""
     return 1.0 if i == j else 0.0
 
 
@@ -179,10 +181,10 @@ def _eliminate_stoppers(
     foot_equations: _FootEquations,
     unit_divisor: Array,
 ) -> tuple[SlotPair, Matrix2x2]:
-    """Return the stopper forces without the feet, and the effect of each foot's c, [foot][stopper].
+    """Return the stopper forces without foot forces, and their change for c = 1 of each foot.
 
-    They solve N s = p + P c, where the row of an open stopper is s = 0: the system is always
-    regular.
+    The second result has the indices [foot][stopper]. The forces solve N s = p + P c, in which the
+    row of an open stopper is s = 0. So the system is always regular.
     """
     sin, cos, inverse_leg_mass = inertia.sin, inertia.cos, 1.0 / s.m
     H = ((inertia.H[0], inertia.H[1]), (inertia.H[2], inertia.H[3]))
@@ -222,7 +224,8 @@ def _eliminate_stoppers(
 
 REFERENCE_MASS_RATIO = 18.0
 """Ratio of total mass to leg mass at which feet at rest and sliding feet have the same scale in the
-determinant. It is that of Table 1's wheel, chosen because `PAINLEVE_ATOL` is measured there."""
+determinant. This is the ratio of Table 1's wheel, chosen because `painleve_atol` is measured there.
+"""
 
 
 def _solve_feet(
@@ -234,9 +237,10 @@ def _solve_feet(
     stopper_response: Matrix2x2,
     unit_divisor: Array,
 ) -> tuple[SlotPair, SlotPair, SlotPair, Any]:
-    """Return the forces of the stoppers, of the feet along e and along u, and the determinant.
+    """Return the forces of stoppers, of feet transverse to and along their legs, and the
+    determinant.
 
-    The feet's equations are solved with the stoppers of `_eliminate_stoppers` inserted.
+    The stopper forces of `_eliminate_stoppers` are inserted into the equations of the feet.
     """
     weight_transverse = foot_equations.weight_transverse
     weight_radial = foot_equations.weight_radial
@@ -301,7 +305,7 @@ def _solve_feet(
     )
 
 
-@eqx.filter_jit  # traced once for all call sites
+@eqx.filter_jit  # This function is traced once for all call sites.
 def solve_combination(
     s: Symbols,
     inertia: ContactInverseInertia,
@@ -310,8 +314,9 @@ def solve_combination(
     is_held: Array,
     friction: Friction,
 ) -> ContactSolution:
-    """Return the solution of one combination of contact modes and stoppers of the two slots, shape
-    (2,).
+    """Return the solution of one combination of contact modes and stoppers of the two slots.
+
+    - `slot_modes`, `is_held`: contact mode and stopper of each slot, shape (2, ...).
 
     A sticking foot is at rest, a sliding foot keeps its height with friction against the slip, and
     a held leg keeps its length. The stoppers are eliminated first.
@@ -362,11 +367,11 @@ def solve_combination(
 
 
 def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
-    """Return all combinations of modes and stoppers, most sticking feet first, then most sliding
-    ones.
+    """Return all combinations of modes and of stoppers, two arrays of shape (63, 2).
 
-    Two sticking feet on two held legs are excluded: they constrain the hub twice, so that their
-    forces are not determined.
+    Combinations with the most sticking feet come first, then those with the most sliding feet. Two
+    sticking feet on two held legs are excluded: they constrain the hub twice, so that their forces
+    are not determined.
     """
     mode_rank = {
         ContactMode.STICK: 0,
@@ -393,7 +398,8 @@ def _enumerate_combinations() -> tuple[np.ndarray, np.ndarray]:
 
 
 CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_combinations()
-"""Combinations in order of preference: contact modes and held stoppers, shape (63, 2) each."""
+"""Contact modes of all combinations in order of preference, shape (63, 2). `HELD_STOPPER_TABLE` has
+the same shape and marks the held stoppers."""
 PAPER_RULE_ORDER = np.argsort(
     [
         sum({ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(m), 5) for m in row)
@@ -401,26 +407,28 @@ PAPER_RULE_ORDER = np.argsort(
     ],
     kind="stable",
 )
-"""Order of the combinations by the paper's rule: sliding comes last."""
+"""Order of the combinations by the paper's rule, in which sliding comes last."""
 N_CONCURRENT_COMBINATIONS = 8
 """Number of combinations that XLA solves together, chosen because most events allow no more.
-Machine code solves them one after the other."""
+Machine code solves combinations one after the other."""
 ALL_MODES_MASK = sum(1 << mode for mode in ContactMode)
-"""Set of all modes, one bit per mode."""
+"""Set of all contact modes, as one bit per mode."""
 
 CombinationMask = tuple[Any, Any]
-"""A set of rows of the table: the bits of two words."""
+"""Set of combinations, one bit each in two 32-bit integers."""
 
 
 class _OrderedTable(NamedTuple):
-    """The table in one order, as sets of rows with a property in common."""
+    """Table of combinations in one order, as masks of combinations with a common mode or
+    stopper.
+    """
 
-    mode_masks: list[list[CombinationMask]]  # by slot and mode
-    held_masks: list[CombinationMask]  # by slot
+    mode_masks: list[list[CombinationMask]]  # indexed by slot and mode
+    held_masks: list[CombinationMask]  # indexed by slot
 
     @classmethod
     def from_indices(cls, indices: np.ndarray) -> "_OrderedTable":
-        """Return the table with its rows in this order."""
+        """Return the table whose combinations are in the order of these indices."""
 
         def pack_bits(flags: np.ndarray) -> CombinationMask:
             masks = np.packbits(np.append(flags, False), bitorder="little").view("<i4")
@@ -440,16 +448,19 @@ _ORDERED_TABLES = (
 
 
 class AllowedModes(NamedTuple):
-    """Allowed combinations, and conditions that need no test. Sets of modes are bits."""
+    """Allowed modes and stoppers at an event, and conditions that need no test.
 
-    allowed_modes: Int[Array, "2 ..."]  # modes of each slot's foot
-    can_hold_stopper: Bool[Array, "2 ..."]  # the stopper may hold; it may always be open
-    has_fixed_mode: Bool[Array, "2 ..."]  # the foot keeps its mode whatever the force
-    untested_modes: Int[Array, "2 ..."]  # modes that need no test
-    is_open_untested: Bool[Array, "2 ..."]  # an open stopper needs no test: the leg is away from it
+    Sets of modes have one bit per mode.
+    """
+
+    allowed_modes: Int[Array, "2 ..."]  # set of allowed modes of each slot's foot
+    can_hold_stopper: Bool[Array, "2 ..."]  # whether the stopper may hold, not only be open
+    has_fixed_mode: Bool[Array, "2 ..."]  # whether the foot keeps its mode for any force
+    untested_modes: Int[Array, "2 ..."]  # set of modes that need no test
+    is_open_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
 
     def select_allowed(self, ordered_table: _OrderedTable) -> CombinationMask:
-        """Return the allowed rows of the table."""
+        """Return the mask of the allowed combinations of the table."""
 
         def combine_masks(mask_index: int) -> Array:
             allowed_mask = jnp.full_like(self.allowed_modes[0], -1, jnp.int32)
@@ -480,21 +491,21 @@ class AllowedModes(NamedTuple):
 
 
 def contains_mode(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
-    """Return whether the set contains the mode."""
+    """Return whether a set of modes contains a mode."""
     return ((modes >> mode) & 1) > 0
 
 
 class ChosenCombination(NamedTuple):
-    """The chosen combination."""
+    """Combination of contact modes and stoppers that an event selects."""
 
     slot_modes: Int[Array, "2 ..."]
     is_held: Bool[Array, "2 ..."]
-    violation: Elementwise  # worst sign violation, see `SignTolerances`; 0 if admissible
-    n_solutions: Int[Array, "..."]  # admissible ones; at least 1 if the violation is small
+    violation: Elementwise  # largest sign violation in `SignTolerances`; 0 if admissible
+    n_solutions: Int[Array, "..."]  # at least 1 if the violation is small
 
 
 class SignTolerances(NamedTuple):
-    """Units in which sign violations are measured where rounding decides."""
+    """Units of sign violations, within which round-off decides the sign."""
 
     force_tolerance: Elementwise  # N, or N s in an impact
     motion_tolerance: Elementwise  # m/s^2, or m/s
@@ -508,8 +519,8 @@ correct."""
 class _EnumerationState(NamedTuple):
     """State of the enumeration of the table."""
 
-    remaining_mask: CombinationMask  # allowed rows not yet examined
-    best_combination: CombinationMask  # first admissible row, else the least violating one
+    remaining_mask: CombinationMask  # allowed combinations that are not yet examined
+    best_combination: CombinationMask  # first admissible combination, else the least violating one
     violation: Elementwise
     n_solutions: Int[Array, "..."]
 
@@ -524,7 +535,7 @@ def _evaluate_violation(
     slot_modes: Array,
     is_held: Array,
 ) -> Array:
-    """Return the largest sign violation of a combination, in units of the tolerances."""
+    """Return the largest sign violation of a combination, in units of `tolerances`."""
     is_infinite = map_friction(lambda value: ~jnp.isfinite(value), friction)
     uses_friction_limit = map_friction(lambda value: value == jnp.inf, friction)
     coefficient = finite_friction(friction)
@@ -588,18 +599,19 @@ def _evaluate_violation(
             ),
         )
         max_violation = jnp.where(jnp.isfinite(n) & jnp.isfinite(t), max_violation, jnp.inf)
-    # The tangential forces of both feet are not separately determined on a rigid wheel.
+    # If both legs are held and both feet resist motion along the slope, the hub is rigid. The
+    # tangential forces of the feet are then not separately determined.
     return jnp.where(holds_along_slope[0] & holds_along_slope[1], jnp.inf, max_violation)
 
 
 def _least_violating(
     violation_of: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
 ) -> tuple[CombinationMask, Array, Array]:
-    """Return the first of the least violating rows, its violation, and the number of admissible
-    rows.
+    """Return the first of the least violating combinations, its violation, and the number of
+    admissible ones.
 
-    Several rows are compared by one reduction. Read row by row, XLA on a CPU would duplicate the
-    code of `violation_of` for each use, eightfold.
+    Several combinations are compared by one reduction. If they were read one by one, XLA on a CPU
+    would duplicate the code of `violation_of` for each use.
     """
     if len(combinations) == 1:
         violation = violation_of(combinations[0])
@@ -632,9 +644,11 @@ def choose_combination(
 ) -> ChosenCombination:
     """Return the first admissible combination of the table; `n_solutions` is 0 if there is none.
 
-    With `counts_all` all admissible combinations are counted; otherwise the search ends at the
-    first. If there is none, the least violating combination is taken, provided that its violation
-    is small: two contacts close by rounding, or open by it.
+    - `counts_all_solutions`: whether all admissible combinations are counted; otherwise the search
+      ends at the first.
+
+    If there is none, the least violating combination is returned. It counts as a solution if its
+    violation is at most `MAX_VIOLATION`: round-off may close or open two contacts.
     """
     evaluate_modes = functools.partial(
         _evaluate_violation,
@@ -654,10 +668,10 @@ def choose_combination(
         is_in_mask = lambda mask: ((combination[0] & mask[0]) | (combination[1] & mask[1])) != 0
         slot_modes = [
             sum(jnp.where(is_in_mask(masks_by_mode[mode]), mode, 0) for mode in range(1, 4))
-            for masks_by_mode in ordered_table.contact
+            for masks_by_mode in ordered_table.mode_masks
         ]
         return jnp.stack(slot_modes).astype(jnp.int32), jnp.stack(
-            [is_in_mask(masks_by_mode) for masks_by_mode in ordered_table.held]
+            [is_in_mask(masks_by_mode) for masks_by_mode in ordered_table.held_masks]
         )
 
     def evaluate_combination(combination: CombinationMask) -> Array:
@@ -673,7 +687,7 @@ def choose_combination(
         )
 
     def evaluate_next_combinations(state: _EnumerationState) -> _EnumerationState:
-        """Return the state after the next few allowed combinations."""
+        """Return the state after evaluation of the next few allowed combinations."""
         (remaining_mask, best_combination, lowest_violation, n_solutions), combinations = state, []
         for _ in range(1 if simd.targets_machine_code() else N_CONCURRENT_COMBINATIONS):
             combination = (
@@ -725,14 +739,15 @@ def is_release_consistent(
     is_second_slot: Bool[Array, "..."],
     release_direction: Int[Array, "..."],
 ) -> Bool[Array, "..."]:
-    """Return whether a slot's foot, just released by its mode, would move in the direction of
+    """Return whether a slot's foot, just released from its mode, would move in the direction of
     release.
 
-    - `is_second`: which slot is meant;
-    - `direction`: 0 off the ground, 1 downhill, -1 uphill.
+    - `slot_state`: contact modes and stoppers of both slots;
+    - `is_second_slot`: whether the foot is that of the second slot;
+    - `release_direction`: 0 off the ground, 1 downhill, -1 uphill.
 
-    The margin of the mode must grow with the acceleration in that direction. If it shrinks, the
-    following mode would end before it begins, and the forces jump instead (Painlevé).
+    The margin of the mode must grow with the acceleration in that direction. If the margin shrinks,
+    the following mode would end before it begins, and the forces jump instead (Painlevé).
     """
     slot_modes, is_held = slot_state
     slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inertia.sin[0].dtype)

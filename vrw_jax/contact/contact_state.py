@@ -1,4 +1,8 @@
-"""Motion of the wheel between events, and the guards of the next event."""
+"""Dynamics of the wheel between two events, and the guards that detect the next event.
+
+A *contact state* is the set of contact modes of all feet and of stopper flags of all legs. It is
+constant between two events.
+"""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -36,12 +40,12 @@ from vrw_jax.numerics import Elementwise, Scalar
 from vrw_jax.wheel import Symbols, compute_own_units, is_at_rest, is_still
 
 PackedState = Float[Array, "dim ..."]
-"""Hub (x, z, theta) and rates, lengths, rates of lengths, then the accumulators: see
+"""Hub (x, z, theta), their rates, leg lengths, their rates, then the accumulators: see
 `Accumulators`."""
 
 
 class Accumulators(NamedTuple):
-    """Integrals along the motion, besides the motion itself."""
+    """Integrals along the motion, integrated beside the state."""
 
     time_since_event: Scalar  # time since the last event, s
     damping_loss: Scalar  # energy lost in the dampers, J
@@ -50,12 +54,12 @@ class Accumulators(NamedTuple):
 
 
 def pack_state(motion: WheelMotion, accumulators: Accumulators) -> PackedState:
-    """Return everything that is integrated as one vector of 10 + 2 n entries."""
+    """Return motion and accumulators as one vector of 10 + 2 n entries."""
     return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(accumulators)])
 
 
 def unpack_state(state: PackedState) -> tuple[WheelMotion, Accumulators]:
-    """Return motion and accumulators of a vector: the inverse of `pack_state`."""
+    """Return motion and accumulators of a packed state: the inverse of `pack_state`."""
     n = (state.shape[0] - 10) // 2
     L, dL, accumulators = state[6 : 6 + n], state[6 + n : 6 + 2 * n], state[6 + 2 * n :]
     motion = WheelMotion(state[0], state[1], state[2], state[3], state[4], state[5], L, dL)
@@ -63,31 +67,31 @@ def unpack_state(state: PackedState) -> tuple[WheelMotion, Accumulators]:
 
 
 class ContactState(NamedTuple):
-    """Contact modes of the feet, stopper states of the legs, and what has just changed."""
+    """Contact modes of the feet, stopper flags of the legs, and the changes at the last event."""
 
-    contact_modes: Int[Array, " n_legs"]  # mode of every foot
-    locked: Bool[Array, " n_legs"]  # legs on their stoppers
-    has_just_lifted: Bool[Array, " n_legs"]  # feet that have just left the ground
-    has_just_unlocked: Bool[Array, " n_legs"]  # legs that have just left their stoppers
-    has_just_slid: Bool[Array, " n_legs"]  # feet that have just begun to slide, from rest
+    contact_modes: Int[Array, " n_legs"]  # `ContactMode` of every foot
+    locked: Bool[Array, " n_legs"]  # whether a leg is on its stopper
+    has_just_lifted: Bool[Array, " n_legs"]  # whether a foot has left the ground at the last event
+    has_just_unlocked: Bool[Array, " n_legs"]  # whether a leg has left its stopper then
+    has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
 
 
 class ModeDynamics(NamedTuple):
-    """The wheel in one contact state, with everything that the motion between two events needs."""
+    """Dynamics of the wheel in one contact state, from the last event to the next."""
 
     s: Symbols
-    friction: Friction  # of the slots' feet
-    is_one_sided: bool  # airborne legs may leave their stoppers
+    friction: Friction  # friction coefficient of the slots' feet
+    is_one_sided: bool  # whether legs in the air may leave their stoppers
     contact_state: ContactState
     slots: Slots
-    slot_modes: Int[Array, "2"]  # of the slots
-    is_held: Bool[Array, "2"]  # the slots' legs on their stoppers
-    is_airborne_locked: Bool[Array, " n_legs"]  # other legs on their stoppers
-    has_accumulators: bool  # in batches: the accumulators are integrated as well
-    tilt: Elementwise | None = None  # by which the next line is steeper, rad
+    slot_modes: Int[Array, "2"]  # `ContactMode` of each slot's foot
+    is_held: Bool[Array, "2"]  # whether the leg of each slot is on its stopper
+    is_airborne_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
+    has_accumulators: bool  # whether a batch integrates the accumulators
+    tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
     def configure(self, motion: WheelMotion) -> ContactConfiguration:
-        """Return the contact configuration at this motion."""
+        """Return the contact configuration at this motion, for the solution of its forces."""
         slots = self.slots, self.slot_modes, self.is_held, self.is_airborne_locked
         return ContactConfiguration(self.s, motion, self.friction, *slots)
 
@@ -100,7 +104,11 @@ def make_mode_dynamics(
     has_accumulators: bool = False,
     tilt: Elementwise | None = None,
 ) -> ModeDynamics:
-    """Return the dynamics of the wheel in this contact state."""
+    """Return the dynamics of the wheel in this contact state.
+
+    - `friction`: of all feet, or of the foot that landed last and of the others;
+    - `tilt`: angle by which the next line is steeper, rad.
+    """
     slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
     slot_modes = slots.gather_codes(contact_state.contact_modes)
     is_held = slots.gather_flags(contact_state.locked)
@@ -121,16 +129,16 @@ def make_mode_dynamics(
 
 
 class ContactForces(NamedTuple):
-    """Contact forces with the leg directions and foot velocities that they depend on."""
+    """Contact forces, and the leg directions and foot velocities that they depend on."""
 
     legs: LegDirections
-    free_leg_acceleration: LegArray  # see `free_legs`
+    free_leg_acceleration: LegArray  # see `free_leg_motion`, m/s^2
     solution: ForceSolution
     foot_velocity: FootVelocity
 
 
 def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces:
-    """Return contact and stopper forces with the resulting accelerations."""
+    """Return the forces of ground and stoppers (N), with the resulting accelerations."""
     unit_divisor, posture = opaque_one(motion), make_posture(dynamics.s, motion, dynamics.slots)
     leg_acceleration = prevent_fusion(
         free_leg_motion(dynamics.s, motion, posture.legs), unit_divisor
@@ -142,16 +150,19 @@ def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces
 
 
 def airborne_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> LegArray:
-    """Return the stopper force of locked legs in the air, N; 0 for the other legs."""
+    """Return the stopper force of each locked leg in the air, N; 0 for the other legs."""
     sin, cos = forces.legs
     ax, az, _ = forces.solution.hub
-    # Acceleration of each leg's length without forces of slots and stoppers, m/s^2.
+    # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.
     free_acceleration = forces.free_leg_acceleration + sin * ax + cos * az
     return jnp.where(dynamics.is_airborne_locked, dynamics.s.m * free_acceleration, 0.0)
 
 
 def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementwise:
-    """Return the minimum of `airborne_stopper_force`; infinite if no leg in the air is locked."""
+    """Return the minimum of `airborne_stopper_force` over the legs, N.
+
+    The minimum is infinite if no leg in the air is locked.
+    """
     return jnp.min(
         jnp.where(dynamics.is_airborne_locked, airborne_stopper_force(dynamics, forces), jnp.inf),
         axis=0,
@@ -161,7 +172,7 @@ def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementw
 def accumulator_rates(
     dynamics: ModeDynamics, motion: WheelMotion, forces: ContactForces
 ) -> Accumulators:
-    """Return the rates of the accumulators."""
+    """Return the time derivatives of the accumulators: 1, W, W, m/s."""
     slip_signs = slip_sign(dynamics.slot_modes)
     slip_speeds = [slip_signs[i] * forces.foot_velocity.x[i] for i in range(2)]
     friction_forces = [-forces.solution.tangential[i] * slip_signs[i] for i in range(2)]
@@ -174,7 +185,7 @@ def accumulator_rates(
 
 
 def vector_field(dynamics: ModeDynamics, state: PackedState) -> PackedState:
-    """Return the time derivative of the packed state."""
+    """Return the time derivative of the packed state in this contact state."""
     motion, _ = unpack_state(state)
     forces = compute_forces(dynamics, motion)
     rates = WheelMotion(
@@ -191,18 +202,18 @@ def vector_field(dynamics: ModeDynamics, state: PackedState) -> PackedState:
 
 
 class GuardLayout(NamedTuple):
-    """Index at which each kind of guard begins in the list of `guard_values`."""
+    """Index of the first guard of each kind in the vector of `compute_guard_values`."""
 
-    landing: int  # heights of airborne feet, one per leg: zero at a landing
+    landing: int  # height of a foot in the air, one per leg: zero at a landing
     stopper: int  # distance to the stopper, one per leg
     liftoff: int  # normal force, one per slot
     slip_up: int  # friction margin before the foot slides uphill, one per slot
-    slip_down: int  # the same before it slides downhill
+    slip_down: int  # friction margin before the foot slides downhill, one per slot
     slip_stop: int  # speed of a sliding foot, one per slot
     stopper_release: int  # stopper force of a loaded leg, one per slot
-    rolling_rate: int  # dtheta
-    collapse: int  # shortest leg minus a
-    airborne_release: int  # stopper force of airborne legs, one per leg, if one-sided
+    rolling_rate: int  # rate of rolling, dtheta
+    collapse: int  # length of the shortest leg minus a
+    airborne_release: int  # stopper force in the air, one per leg, if one-sided
     n_guards: int
 
     @property
@@ -212,25 +223,28 @@ class GuardLayout(NamedTuple):
 
     @property
     def foremost_landing(self) -> int:
-        """Guard of the foremost foot, whose landing ends a step."""
+        """Index of the guard of the foremost foot, whose landing ends a step."""
         return self.stopper - 1
 
 
 def make_guard_layout(n: int, is_one_sided: bool) -> GuardLayout:
-    """Return the guard layout of a wheel with `n` legs."""
+    """Return the guard layout of a wheel with `n` legs.
+
+    - `is_one_sided`: whether legs in the air may leave their stoppers.
+    """
     sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if is_one_sided else 0)
     offsets = np.concatenate([[0], np.cumsum(sizes)])
     return GuardLayout(*(int(offset) for offset in offsets))
 
 
 class ContactQuantities(NamedTuple):
-    """Quantities that determine the duration of a contact state, besides the motion itself."""
+    """Forces and foot speeds that the guards depend on, besides the motion."""
 
     legs: LegDirections
     normal: SlotPair
     tangential: SlotPair
     stopper: SlotPair
-    slip_speed: SlotPair  # of the slots' feet along the slope
+    slip_speed: SlotPair  # speed of the slots' feet along the slope, m/s
     painleve_determinant: Array  # see `contact_modes.ContactSolution`
     airborne_stopper: LegArray | None  # stopper force of legs in the air, if stoppers are one-sided
 
@@ -250,7 +264,7 @@ def collect_contact_quantities(dynamics: ModeDynamics, forces: ContactForces) ->
 
 
 def stack_friction(friction: Friction) -> Array:
-    """Return the slots' friction as one array, if it differs between slots."""
+    """Return the friction of the slots as one array (2, ...), or the common friction unchanged."""
     return jnp.stack(friction) if isinstance(friction, tuple) else friction
 
 
@@ -260,12 +274,13 @@ def evaluate_guards(
     quantities: ContactQuantities,
     is_after_start: Array,
 ) -> list[Array]:
-    """Return the guards in the order of `GuardLayout`.
+    """Return the guards in the order of `GuardLayout`, one array for each kind.
 
-    - `has_begun`: False at the start of the contact state.
+    - `is_after_start`: False at the start of the contact state.
 
-    The last event leaves its own guard at zero: of a foot off the ground, a leg off its stopper, or
-    a sliding foot. That guard is not evaluated at that instant.
+    The event that starts a contact state leaves a guard at zero: the guard of a foot off the
+    ground, of a leg off its stopper, or of a sliding foot. That guard is not evaluated at that
+    instant; its value is 1.
     """
     s, contact_state = dynamics.s, dynamics.contact_state
     ones = jnp.ones_like(motion.L)
@@ -276,8 +291,8 @@ def evaluate_guards(
     has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
     coefficient = stack_friction(finite_friction(dynamics.friction))
     normal, tangential = jnp.stack(quantities.normal), jnp.stack(quantities.tangential)
-    # In the limit of large friction a resting foot begins to slide where its normal force
-    # vanishes, see `impacts.resolve_event`; a sliding foot lifts where its friction vanishes.
+    # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
+    # (see `impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
     uses_friction_limit = stack_friction(dynamics.friction) == jnp.inf
     slip_signs = jnp.stack(slip_sign(dynamics.slot_modes))
     supporting_force = jnp.where(
@@ -308,7 +323,7 @@ def evaluate_guards(
 
 
 def compute_guard_scales(dynamics: ModeDynamics) -> Array:
-    """Return the scale of each guard, in the order of `GuardLayout`: m, N, m/s, rad/s."""
+    """Return the scale of each guard in the order of `GuardLayout`: m, N, m/s or rad/s."""
     s = dynamics.s
     force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
     guard_scales = (
@@ -332,7 +347,10 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
 def is_wheel_at_rest(
     s: Symbols, rates: Array, accelerations: Iterable[Array], atol: Elementwise
 ) -> Bool[Array, "..."]:
-    """Return whether the wheel is at rest, from the rates and accelerations of all coordinates."""
+    """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
+
+    - `atol`: absolute tolerance in the wheel's own units.
+    """
     rate_units, time_unit = compute_state_units(s)[1], compute_own_units(s).time
     return is_at_rest(rates, accelerations, rate_units, time_unit, atol)
 
@@ -344,10 +362,11 @@ def choose_stopping_guard(
     guard: Int[Array, "..."],
     atol: Elementwise,
 ) -> Int[Array, "..."]:
-    """Return the end of a foot's slide instead of the end of rolling if both end together.
+    """Return the guard that has triggered, with the end of rolling replaced by that of a foot's
+    slide.
 
-    Rounding decides which of the two vanishes first. The friction of the stopped foot then decides
-    whether the wheel rests or falls back.
+    The guard is replaced if both end together, because rounding decides which of the two vanishes
+    first. The friction of the stopped foot then decides whether the wheel rests or falls back.
     """
     slip_signs = slip_sign(dynamics.slot_modes)
     has_just_slid = dynamics.slots.gather_flags(dynamics.contact_state.has_just_slid)
@@ -360,7 +379,7 @@ def choose_stopping_guard(
 
 
 def compute_packed_units(s: Symbols) -> PackedState:
-    """Return the wheel's own units of the numbers of `pack_state`."""
+    """Return the wheel's own unit of each entry of `pack_state`."""
     units, (position_units, rate_units) = compute_own_units(s), compute_state_units(s)
     accumulator_units = Accumulators(units.time, units.energy, units.energy, units.length)
     packed_units = (
@@ -374,7 +393,10 @@ def compute_packed_units(s: Symbols) -> PackedState:
 
 
 def compute_guard_values(dynamics: ModeDynamics, state: PackedState) -> Float[Array, " n_guards"]:
-    """Return all guards: positive inside the contact state, zero at its end, 1 if not evaluated."""
+    """Return all guards at a packed state: positive inside the contact state, zero at its end.
+
+    A guard that is not evaluated is 1.
+    """
     motion, accumulators = unpack_state(state)
     quantities = collect_contact_quantities(dynamics, compute_forces(dynamics, motion))
     guard_parts = evaluate_guards(dynamics, motion, quantities, accumulators.time_since_event > 0.0)

@@ -1,8 +1,8 @@
 """Forces or impulses of a contact configuration, and their derivatives.
 
 The equations are linear in accelerations and forces, or in impulses and the velocities after an
-impact. So the tangents of these solve the same equations with the tangent of the residual on the
-right-hand side. Only that residual is differentiated.
+impact. The tangents of these unknowns solve the same equations, with the tangent of the residual on
+the right-hand side. Only that residual is differentiated.
 """
 
 from collections.abc import Callable
@@ -35,25 +35,26 @@ from vrw_jax.wheel import Symbols
 
 
 class ContactConfiguration(NamedTuple):
-    """A wheel with known contact modes and stopper states."""
+    """Motion of a wheel together with known contact modes and stopper states."""
 
     s: Symbols
     motion: WheelMotion
-    friction: Friction  # of the slots' feet
+    friction: Friction  # friction coefficient of the slots' feet
     slots: Slots
-    slot_modes: Array  # of the slots
-    is_held: Array  # the slots' legs on their stoppers
-    is_airborne_locked: Array  # other legs on their stoppers
+    slot_modes: Array  # `ContactMode` of each slot's foot
+    is_held: Array  # whether the leg of each slot is on its stopper
+    is_airborne_locked: Array  # whether a leg is in the air on its stopper
 
     @property
     def has_fixed_length(self) -> Array:
-        """Whether the length of a leg is fixed."""
+        """Whether the length of each leg is fixed by a stopper."""
         return self.is_airborne_locked | (self.slots.scatter(self.is_held) > 0)
 
 
 class ForceSolution(NamedTuple):
-    """Forces of ground and slots' stoppers and the hub's motion: see
-    `contact_modes.ContactSolution`."""
+    """Forces of ground and stoppers, and the resulting motion of hub and legs: see
+    `contact_modes.ContactSolution`.
+    """
 
     tangential: SlotPair
     normal: SlotPair
@@ -65,7 +66,7 @@ class ForceSolution(NamedTuple):
 
 
 def slip_sign(slot_modes: Array) -> SlotPair:
-    """Return 1 for a slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
+    """Return 1 for each slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
     sign = lambda mode: jnp.where(
         mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
     )
@@ -73,17 +74,15 @@ def slip_sign(slot_modes: Array) -> SlotPair:
 
 
 class _FrozenTerms(NamedTuple):
-    """Quantities that are frozen for a tangent of the residual: accelerations, or velocity
-    jumps.
-    """
+    """Accelerations, or velocity jumps, that are constant for a tangent of the residual."""
 
-    radial: LegArray  # of leg masses, beyond the hub's: along the legs
-    transverse: LegArray  # and transverse to them
-    hub: SlotPair  # beyond gravity's
+    radial: LegArray  # of leg masses relative to the hub, along the legs
+    transverse: LegArray  # of leg masses relative to the hub, transverse to the legs
+    hub: SlotPair  # of the hub, without gravity
 
 
 class _EquationTangents(NamedTuple):
-    """Tangents of the equations' rows with the frozen terms fixed."""
+    """Tangents of the equations of motion, or of impact, with the frozen terms constant."""
 
     radial: LegArray
     transverse: LegArray
@@ -99,22 +98,26 @@ _EquationTangentFn = Callable[
 ]
 
 
-@eqx.filter_jit  # traced once for all call sites
+@eqx.filter_jit  # This function is traced once for all call sites.
 def solve_contact_forces(configuration: ContactConfiguration) -> ForceSolution:
-    """Return the forces, and the resulting accelerations."""
+    """Return the contact forces (N), and the resulting accelerations."""
     return _differentiable_solution(free_acceleration, motion_equation_tangents, configuration)
 
 
 @eqx.filter_jit
 def solve_impact(configuration: ContactConfiguration) -> ForceSolution:
-    """Return the impulses, and the velocities after them."""
+    """Return the impulses of an impact (N s), and the velocities after them."""
     return _differentiable_solution(free_velocity, _impact_equation_tangents, configuration)
 
 
 def solve_configuration(
     configuration: ContactConfiguration, inertia: ContactInverseInertia, free_motion: FreeMotion
 ) -> ForceSolution:
-    """Return the forces of a configuration for this free motion."""
+    """Return the forces of a configuration, given its motion without contact forces.
+
+    - `inertia`: inverse inertia at this posture;
+    - `free_motion`: accelerations without contact forces, or velocities without impulses.
+    """
     s, _, friction, slots, slot_modes, is_held, _ = configuration
     solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
     outward_motion = (
@@ -132,7 +135,7 @@ def solve_configuration(
 def _solve_with_free_motion(
     free_motion_fn: Callable[..., FreeMotion], configuration: ContactConfiguration
 ) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
-    """Return inertia, free motion and forces of a configuration."""
+    """Return inertia, motion without contact forces, and forces of a configuration."""
     s, motion, unit_divisor = (
         configuration.s,
         configuration.motion,
@@ -155,7 +158,7 @@ def _solve_with_free_motion(
 def solve_forces_with_free_motion(
     configuration: ContactConfiguration,
 ) -> tuple[ContactInverseInertia, FreeMotion, ForceSolution]:
-    """Return the inertia, the motion free of contact forces, and the forces."""
+    """Return inertia, accelerations without contact forces, and contact forces (N)."""
     return _solve_with_free_motion(free_acceleration, configuration)
 
 
@@ -164,7 +167,10 @@ def _differentiable_solution(
     equation_tangent_fn: _EquationTangentFn,
     configuration: ContactConfiguration,
 ) -> ForceSolution:
-    """Return the forces, with a derivative rule by the tangent of the residual."""
+    """Return the forces of a configuration.
+
+    Their JVP rule solves the equations of the forces for the tangent of the residual.
+    """
     float_leaves, static_leaves = eqx.partition(configuration, eqx.is_inexact_array)
     other_arrays, static_leaves = eqx.partition(static_leaves, eqx.is_array)
     assemble = lambda float_leaves, other_arrays: eqx.combine(
@@ -204,15 +210,15 @@ def _differentiable_solution(
 
 
 class ResidualTangent(NamedTuple):
-    """Tangent of the residual, in the form of its effect on the unknowns."""
+    """Tangent of the residual, expressed by its effect on the unknowns."""
 
-    leg_lengths: LegArray  # their lengths
-    hub_by_leg: tuple[LegArray, LegArray, LegArray]  # each leg's part of the forces there
-    hub_without_legs: HubVector  # the forces there without the legs' part
+    leg_lengths: LegArray  # effect on each leg's length
+    hub_by_leg: tuple[LegArray, LegArray, LegArray]  # effect of each leg on the hub's equations
+    hub_without_legs: HubVector  # effect on the hub's equations without the legs
     foot_transverse: SlotPair
     foot_radial: SlotPair
-    friction_force: SlotPair  # tangent of friction by its coefficient
-    pull: SlotPair  # tangent of the slots' pulls by that, and by their legs' rotation
+    friction_force: SlotPair  # tangent of the friction force by its coefficient
+    pull: SlotPair  # tangent by friction and rotation of the slots' legs
 
 
 def residual_jvp(
@@ -223,7 +229,11 @@ def residual_jvp(
     frozen: _FrozenTerms,
     equation_tangents: _EquationTangents,
 ) -> ResidualTangent:
-    """Return the tangent of the residual along a tangent of the configuration."""
+    """Return the tangent of the residual along a tangent of the configuration.
+
+    - `frozen`: terms that are constant;
+    - `equation_tangents`: tangents of the equations with these terms constant.
+    """
     s, ds, slots, (sin, cos), slot_indices = (
         configuration.s,
         tangent.s,
@@ -305,7 +315,7 @@ class TotalTangent(NamedTuple):
 
 
 def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
-    """Return the residual tangent summed over the legs."""
+    """Return the tangent of the residual, summed over all legs and gathered for the slots."""
     x, z, rotation = (
         sum_over_legs(leg_forces) + other_force
         for leg_forces, other_force in zip(
@@ -324,7 +334,10 @@ def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
 def free_motion_tangent(
     inertia: ContactInverseInertia, leg_motion: LegArray, total_tangent: TotalTangent
 ) -> FreeMotion:
-    """Return the tangent of the free motion that the residual tangent is equivalent to."""
+    """Return the tangent of the motion without contact forces, from that of the residual.
+
+    Both have the same effect on the forces.
+    """
     hub_tangent, slot_lengths, (u, v) = (
         apply_inverse(inertia.inverse_inertia, total_tangent.hub),
         total_tangent.slot_lengths,
@@ -352,7 +365,7 @@ def motion_equation_tangents(
     inertia: ContactInverseInertia,
     solution: ForceSolution,
 ) -> tuple[_FrozenTerms, _EquationTangents]:
-    """Return the frozen terms and the tangents of the rows of the equations of motion."""
+    """Return the frozen terms, and the tangents of the equations of motion."""
     s, motion, slots = configuration.s, configuration.motion, configuration.slots
     ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
     b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
@@ -402,7 +415,7 @@ def _impact_equation_tangents(
     inertia: ContactInverseInertia,
     solution: ForceSolution,
 ) -> tuple[_FrozenTerms, _EquationTangents]:
-    """Return the frozen terms and the tangents of the rows of the impact equations."""
+    """Return the frozen terms, and the tangents of the impact equations."""
     s = configuration.s
     motion = configuration.motion
     motion_tangent = tangent.motion

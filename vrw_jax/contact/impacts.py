@@ -1,6 +1,7 @@
-"""Effects of an event: impacts by momentum, then the contact modes that carry the motion.
+"""Effects of an event: impacts at the velocity level, then the contact modes of the following
+motion.
 
-Everything is elementwise: for one wheel or a batch.
+All functions work elementwise, for one wheel or a batch.
 """
 
 from collections.abc import Callable
@@ -57,30 +58,30 @@ from vrw_jax.wheel import Symbols
 
 
 class Event(NamedTuple):
-    """Kind of an event: one flag is set."""
+    """Kind of an event, with the leg or slot that it concerns: one flag is set."""
 
-    lands: Bool[Array, "n_legs ..."]  # the foot meets the ground
-    meets_stopper: Bool[Array, "n_legs ..."]  # the leg meets its stopper
-    leaves_stopper: Bool[Array, "n_legs ..."]  # in the air, the stopper force vanishes
-    lifts_off: Bool[Array, "2 ..."]  # the slot's normal force vanishes
-    slides_up: Bool[Array, "2 ..."]  # friction no longer holds the slot's foot
+    lands: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
+    meets_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
+    leaves_stopper: Bool[Array, "n_legs ..."]  # whether the stopper force in the air vanishes
+    lifts_off: Bool[Array, "2 ..."]  # whether the normal force of the slot vanishes
+    slides_up: Bool[Array, "2 ..."]  # whether the slot's foot begins to slide uphill
     slides_down: Bool[Array, "2 ..."]
-    stops_sliding: Bool[Array, "2 ..."]  # the slot's foot stops sliding
-    releases_stopper: Bool[Array, "2 ..."]  # the stopper force of the slot's leg vanishes
+    stops_sliding: Bool[Array, "2 ..."]  # whether the slot's foot stops sliding
+    releases_stopper: Bool[Array, "2 ..."]  # whether the stopper force of the slot's leg vanishes
 
     @property
     def is_impact(self) -> Bool[Array, "..."]:
-        """Whether velocities jump."""
+        """Whether velocities jump at the event."""
         return jnp.any(self.lands, axis=0) | jnp.any(self.meets_stopper, axis=0)
 
 
 def _leg_indices(n: int, reference: Array) -> np.ndarray:
-    """Return 0 ... n - 1 on the first axis, for arrays of this shape."""
+    """Return 0 ... n - 1 on the first axis, with as many further axes as `reference`."""
     return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(reference))
 
 
 def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
-    """Return the event of a guard."""
+    """Return the event of a guard, from the guard's index in `layout`."""
     n = layout.n_legs
     select_flags = lambda start, count: guard == start + _leg_indices(count, guard)
     leaves_stopper = (
@@ -101,27 +102,28 @@ def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
 
 
 class ContactLaw(NamedTuple):
-    """The wheel on its ground, with the settings that all events share."""
+    """Wheel, ground and contact options that all events of a walk share."""
 
     s: Symbols
-    friction: Friction  # of all feet; or (of the last landed foot, of the others)
-    is_one_sided: bool  # stoppers of legs in the air only push
+    friction: Friction  # of all feet; or of the last landed foot and of the others
+    is_one_sided: bool  # whether stoppers of legs in the air only push
     counts_solutions: bool  # whether all admissible solutions are counted
-    rest_speed: Elementwise  # contacts slower than this after an impact are at rest, m/s
-    restitution: Elementwise | None = None  # of the feet: speed ratio
-    tilt: Elementwise | None = None  # by which the next line is steeper, rad
+    rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
+    restitution: Elementwise | None = None  # Newton's coefficient of the feet
+    tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
 
 
 @dataclass(frozen=True)
 class PivotOptions:
-    """Search for the stoppers that hold their legs; few pivots suffice unless friction couples
-    legs.
+    """Options of the search for the stoppers that hold their legs.
+
+    Few pivots suffice unless friction couples legs.
     """
 
     max_block_pivots: int = 8
     """Number of pivots that switch all legs of the wrong sign."""
     max_single_pivots: int = 16
-    """Number of pivots after them that switch one leg."""
+    """Number of later pivots that switch one leg each."""
     max_enumerated_legs: int = 8
     """Largest number of legs whose combinations are enumerated if pivoting fails."""
 
@@ -130,17 +132,17 @@ PIVOT_OPTIONS = PivotOptions()
 
 
 class _LevelSolution(NamedTuple):
-    """Solution for an assumed set of held legs in the air."""
+    """Solution at velocity or acceleration level for an assumed set of held legs in the air."""
 
     chosen_combination: ChosenCombination
     solution: ForceSolution
-    stopper_push: LegArray  # of the stoppers, N or N s
-    outward_motion: LegArray  # of the legs, m/s^2 or m/s
-    motion: WheelMotion  # of an impact: after it
+    stopper_push: LegArray  # force or impulse of the stoppers, N or N s
+    outward_motion: LegArray  # of the leg lengths, m/s^2 or m/s
+    motion: WheelMotion  # motion after the impact
 
 
 _LevelSolver = Callable[[ContactLaw, WheelMotion, Array, ChosenCombination | None], _LevelSolution]
-"""Function of the held legs in the air and, if known, of the chosen combination."""
+"""Function of contact law, motion, held legs in the air and, if known, the chosen combination."""
 
 
 def _solve_stopper_lcp(
@@ -152,13 +154,14 @@ def _solve_stopper_lcp(
     tolerances: SignTolerances,
     pivot_options: PivotOptions = PIVOT_OPTIONS,
 ) -> tuple[_LevelSolution, Array]:
-    """Return the solution for the legs in the air that are held, and which legs are held.
+    """Return the solution for the legs in the air that are held, and whether each leg is held.
 
-    Of the legs `at_stopper`, those in `is_tested` are held if their stopper pushes; otherwise they
-    move inwards. All legs of the wrong sign switch together. Then, against cycling, only the last
-    one switches. This is principal pivoting, which is finite if no friction couples the legs (Murty
-    1974, Kostreva 1978). After that, all combinations are enumerated. The least violating solution
-    is taken; it is admissible if its violation is at most `MAX_VIOLATION`.
+    Legs `is_at_stopper` that are `is_tested` are held if their stopper pushes; otherwise they move
+    inwards. Pivots first switch all legs of the wrong sign together. Later pivots switch only the
+    last of these legs, which prevents cycles. This is principal pivoting, which is finite if no
+    friction couples the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are
+    enumerated. The least violating solution is returned. It is admissible if its violation is at
+    most `MAX_VIOLATION`.
     """
     constant_inputs = stop_gradients((law, motion))
     tested_rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
@@ -235,18 +238,18 @@ def _solve_stopper_lcp(
 
 
 class EventResult(NamedTuple):
-    """Result of an event."""
+    """Motion and contact state after an event, with impulses and lost energy."""
 
     motion: WheelMotion
     contact_state: ContactState
     energy_lost: Elementwise  # J
-    normal_impulse: SlotPair  # on the slots' feet, N s
+    normal_impulse: SlotPair  # impulse on the slots' feet, N s
     tangential_impulse: SlotPair
-    stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without an impact
-    n_solutions: Int[Array, "..."]  # admissible combinations: the minimum of both levels
-    is_paradox: Bool[Array, "..."]  # no forces can continue the motion
+    stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
+    n_solutions: Int[Array, "..."]  # number of admissible combinations: minimum of both levels
+    is_paradox: Bool[Array, "..."]  # whether no forces can continue the motion
     most_solutions: Int[Array, "..."]
-    has_third_foot: Bool[Array, "..."]  # a third foot would have to be loaded
+    has_third_foot: Bool[Array, "..."]  # whether a third foot would have to be loaded
 
 
 def _motion_after_impact(motion: WheelMotion, solution: ForceSolution) -> WheelMotion:
@@ -262,11 +265,13 @@ def _apply_restitution(
     inertia: ContactInverseInertia,
     free: FreeMotion,
 ) -> FreeMotion:
-    """Return the free velocities with the rebound of striking feet by Newton's law."""
+    """Return the velocities without impulses, changed by the rebound of striking feet by Newton's
+    law.
+    """
     if law.restitution is None:
         return free
     rebound_speeds = [law.restitution * z for z in foot_velocity(motion, slots, inertia).z]
-    # A rebound slower than the rest speed is at rest.
+    # A foot whose rebound is slower than the rest speed is at rest.
     rebound_speeds = [jnp.where(z < -law.rest_speed, z, 0.0) for z in rebound_speeds]
     return free._replace(
         foot_transverse=(
@@ -288,9 +293,10 @@ def _limit_energy_gain(
 ) -> _LevelSolution:
     """Return the part of Newton's rebound that energy allows.
 
-    With Coulomb's friction the law can create energy (Kane 1984). Energy is a parabola between the
-    inelastic impact, which cannot create any, and Newton's. The result is the largest part without
-    a gain. Impulses stay in the cone, because it is convex.
+    With Coulomb's friction, Newton's law can create energy (Kane 1984). Along the line from the
+    inelastic impact to Newton's, energy is a quadratic function. The inelastic impact never creates
+    energy. The result is the largest part of the rebound without an energy gain. Impulses stay in
+    the cone of friction, because the cone is convex.
     """
     compute_energy = lambda state: kinetic_energy(law.s, state)
     energy_inelastic, energy_newton = (
@@ -326,11 +332,11 @@ def _limit_energy_gain(
 def _solve_velocity_level(
     law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> tuple[_LevelSolution, Slots, Bool[Array, "n ..."]]:
-    """Return the velocity-level solution: simultaneous and inelastic, with Coulomb's law for
-    impulses.
+    """Return the solution of a simultaneous inelastic impact, with Coulomb's law for impulses.
 
-    It also returns the held legs in the air: with one-sided stoppers, those that need not pull. The
-    paper's rule keeps resting feet planted when a leg meets its stopper.
+    The result is (solution, slots, held legs in the air). With one-sided stoppers, held legs are
+    those whose stoppers need not pull. The paper's rule keeps resting feet planted when a leg meets
+    its stopper.
     """
     s, slots = law.s, find_slots((contact_state.contact_modes != ContactMode.OFF) | event.lands)
     friction = slot_friction(law.friction, slots)
@@ -349,7 +355,7 @@ def _solve_velocity_level(
     allowed = AllowedModes(
         allowed_modes=jnp.where(
             event.is_impact, modes, 0
-        ),  # without an impact, no mode is examined
+        ),  # Without an impact, no mode is examined.
         can_hold_stopper=slot_locked,
         has_fixed_mode=is_planted,
         untested_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
@@ -406,7 +412,7 @@ def _following_modes(
 ) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
     """Return the modes that may follow an event in each slot, and those that need no test, as bits.
 
-    - `is_consistent`: the next mode of a slot's foot has the direction of release (see
+    - `is_consistent`: whether the next mode of a slot's foot has the direction of release (see
       `is_release_consistent`).
     """
     current_bit, off_bit = 1 << slot_modes, 1 << ContactMode.OFF
@@ -443,7 +449,7 @@ def _following_modes(
 
 FORCE_ROUNDOFF_FRACTION = 1e-9
 """Fraction of the wheel's weight, and of gravity, that counts as zero, chosen because forces are
-accurate to rounding."""
+accurate to round-off."""
 
 
 def _solve_acceleration_level(
@@ -453,19 +459,19 @@ def _solve_acceleration_level(
     is_at_stopper: Array,
     event: Event,
 ) -> tuple[ChosenCombination, Slots, Array, Bool[Array, "n ..."]]:
-    """Return the acceleration-level solution: the contacts that carry the following motion.
+    """Return the contact modes and stoppers of the following motion, at the acceleration level.
 
-    It also returns the feet that were at rest, and the held legs in the air. The contact that an
-    event has just ended is not tested again: its force is zero up to rounding. It is followed by
-    the mode of its release, if that is consistent (see `is_release_consistent`). The result has no
-    derivatives.
+    The result is (combination, slots, feet that were at rest, held legs in the air). The contact
+    that an event has just ended is not tested again: its force is zero up to round-off. The contact
+    is followed by the mode of its release, if that is consistent (see `is_release_consistent`). The
+    result has no derivatives.
     """
     law, motion = stop_gradients((law, motion))
     s, slots = law.s, find_slots(contact_modes != ContactMode.OFF)
     friction = slot_friction(law.friction, slots)
     slot_modes, slot_locked = slots.gather_codes(contact_modes), slots.gather_flags(is_at_stopper)
     was_resting = (slot_modes == ContactMode.STICK) | event.stops_sliding
-    # At the release of such a foot, its tangential force jumps to zero.
+    # When such a foot is released, its tangential force jumps to zero.
     follows_paper_rule = (slot_modes == ContactMode.STICK) & (
         stack_friction(friction) == PAPER_RULE_SENTINEL
     )
@@ -531,12 +537,12 @@ def _bring_to_rest(
     is_at_stopper: Array,
     was_locked: Array,
 ) -> tuple[WheelMotion, Array, Array]:
-    """Return the motion after an impact, the modes of the touching feet, and the legs on their
+    """Return the motion after an impact, the modes of the touching feet, and whether legs are on
     stoppers.
 
-    A contact slower than `ContactLaw.rest_speed` after the impact is at rest. Otherwise it would
-    return after a dip too small to follow, and separate again at a lower speed, without end. The
-    forces decide the contacts of the following motion.
+    A contact slower than `ContactLaw.rest_speed` after the impact is brought to rest. Otherwise the
+    contact would return after a bounce too small to resolve, and separate again at a lower speed,
+    without end. The forces decide the contacts of the following motion.
 
     - `was_locked`: legs that were at their stoppers.
     """
@@ -555,7 +561,9 @@ def _bring_to_rest(
     s, frozen_motion, friction = stop_gradients((law.s, motion, law.friction))
 
     def find_reversed_slip(_: Array) -> Array:
-        """Return the feet whose slip would be reversed by this: they come to rest as well."""
+        """Return the feet whose slip would be reversed by the projection. These feet also come to
+        rest.
+        """
         speed_after, _ = foot_speeds(
             project_motion(s, frozen_motion, rest_modes, is_locked, friction), directions
         )
@@ -579,10 +587,11 @@ def _bring_to_rest(
 def _merge_touching(
     law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> Event:
-    """Return the event extended to everything that touches, whether or not its own guard is zero.
+    """Return the event extended to all contacts that touch, whether or not their own guards are
+    zero.
 
-    A contact touches if it is closer than the smallest followed dip and does not separate. Resolved
-    one by one, such contacts would throw each other off forever.
+    A contact touches if it is closer than the smallest resolved bounce and does not separate. If
+    such contacts were resolved one by one, they would push each other off forever.
     """
     s, legs = law.s, leg_directions(law.s, motion.theta)
     bounce_height = law.rest_speed**2 / (2.0 * s.g)
@@ -640,7 +649,7 @@ def _liftoff_to_slip(
 def resolve_event(
     law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> EventResult:
-    """Return the result of an event."""
+    """Return motion, contact state, impulses and lost energy after an event."""
     event = _merge_touching(
         law, motion, contact_state, _liftoff_to_slip(law, motion, contact_state, event)
     )
@@ -659,7 +668,7 @@ def resolve_event(
         slots.scatter(velocity_solution.chosen_combination.is_held) > 0,
         was_locked & is_held,
     )
-    if law.restitution is not None:  # only a part of the impulse may act
+    if law.restitution is not None:  # Only a part of the impulse may act.
         stays_locked = stays_locked & (jnp.abs(velocity_solution.motion.dL) < law.rest_speed)
     rest_result = _bring_to_rest(
         law, velocity_solution.motion, slots, impact_modes, stays_locked, was_locked
@@ -726,11 +735,13 @@ def project_motion(
     is_locked: Bool[Array, "n ..."],
     friction: Any = None,
 ) -> WheelMotion:
-    """Return the motion projected onto its contacts: loaded feet on the slope, sticking ones at
+    """Return the motion projected onto its contacts: loaded feet on the slope, sticking feet at
     rest.
 
-    Velocities are projected by bilateral, frictionless impulses. A motion that already satisfies
-    its contacts is unchanged up to round-off.
+    Bilateral, frictionless impulses project the velocities. A motion that already satisfies its
+    contacts is unchanged up to round-off.
+
+    - `friction`: coefficient of sliding feet during the projection; None means 0.
     """
     legs = leg_directions(s, motion.theta)
     L = jnp.where((contact_modes != ContactMode.OFF) & ~is_locked, motion.z / legs.cos, motion.L)

@@ -1,11 +1,12 @@
 """Mechanics of the free wheel: hub and legs as coordinates, and the response to contact forces.
 
 The coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengths. A leg couples
-with the hub alone, so the mass matrix is an arrow. Eliminating the legs of free length leaves a 3 x
-3 system. Up to two *slots* hold the legs whose feet may be loaded. A foot's force acts in the leg's
-own directions u (foot to hub) and e = du/dtheta, and only its e part reaches the hub. The same
-equations serve accelerations and, with momenta in place of forces, impacts. Everything works
-elementwise over a batch, on one more axis behind that of the legs.
+with the hub alone, so the mass matrix is an arrow matrix. Eliminating the legs of free length
+leaves a 3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded. The force on a foot
+has a radial part along u (foot to hub) and a transverse part along e = du/dtheta. Only the
+transverse part acts on the hub. The same equations serve accelerations and, with momenta in place
+of forces, impacts. All functions work elementwise over a batch, on one more axis behind that of the
+legs.
 """
 
 import math
@@ -22,15 +23,15 @@ from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
 from vrw_jax.wheel import Symbols
 
 LegArray = Float[Array, "n_legs ..."]
-"""One quantity of every leg."""
+"""Quantity of every leg, on the first axis."""
 HubVector = tuple[Any, Any, Any]
-"""Components along hub x, hub z and theta."""
+"""Components of a vector along hub x, hub z and theta."""
 SlotPair = tuple[Any, Any]
-"""One quantity of each slot."""
+"""Quantity of each of the two slots."""
 
 
 class WheelMotion(NamedTuple):
-    """Posture and rates of the free wheel in the slope's frame."""
+    """Coordinates and rates of the free wheel in the frame of the slope."""
 
     x: Scalar  # of the hub, m, downhill
     z: Scalar  # of the hub above the slope, m
@@ -43,14 +44,17 @@ class WheelMotion(NamedTuple):
 
 
 class LegDirections(NamedTuple):
-    """Directions of all legs, u = (sin, cos) and e = (cos, -sin)."""
+    """Directions of all legs: radial u = (sin, cos) and transverse e = (cos, -sin)."""
 
     sin: LegArray
     cos: LegArray
 
 
 def leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
-    """Return the directions of all legs, for any number of turns of the wheel."""
+    """Return the directions of all legs at the angle `theta` (rad) of Leg 1.
+
+    The angle may have any number of turns.
+    """
     leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
     is_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
@@ -60,15 +64,14 @@ def leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
 
 
 def sum_over_legs(values: Array) -> Array:
-    """Return the sum over the legs, the first axis."""
+    """Return the sum over the legs, which are on the first axis."""
     return jnp.sum(values, axis=0)
 
 
 def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
-    """Return the same numbers, each divided by a `unit` that equals 1 but is known only at run
-    time.
+    """Return the tree with every float divided by `unit_divisor`, which is 1 at run time.
 
-    XLA's fusions on a CPU repeat chains of cheap operations for each use, which multiplies their
+    Fusions of XLA on a CPU repeat chains of cheap operations for each use, which multiplies their
     number by a hundred here. A division is computed only once.
     """
     is_float = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
@@ -76,37 +79,46 @@ def prevent_fusion(tree: Any, unit_divisor: Array) -> Any:
 
 
 def opaque_one(motion: "WheelMotion") -> Array:
-    """Return 1 in a form that no compiler can simplify."""
+    """Return 1 as an array that no compiler can simplify."""
     return lax.stop_gradient(1.0 + 0.0 * motion.theta)
 
 
 def stop_gradients(tree: Any) -> Any:
-    """Return the same tree without its derivatives."""
+    """Return the tree with its floats constant for differentiation."""
     floats, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(floats), rest)
 
 
 class Slots(NamedTuple):
-    """The two legs whose feet may be loaded, fore first; an empty slot holds no leg."""
+    """Masks of the two legs whose feet may be loaded, fore first.
+
+    The mask of an empty slot is False for all legs.
+    """
 
     first_mask: Bool[Array, "n_legs ..."]
     second_mask: Bool[Array, "n_legs ..."]
 
     @property
     def is_filled(self) -> Bool[Array, "n_legs ..."]:
-        """Whether a leg is in a slot."""
+        """Whether each leg is in a slot."""
         return self.first_mask | self.second_mask
 
     def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
-        """Return the slots' entries of an integer per leg, as one array."""
+        """Return the entries of an integer per leg for both slots, as one array (2, ...).
+
+        The entry of an empty slot is 0.
+        """
         return jnp.stack(self.gather(values))
 
     def gather_flags(self, values: Array) -> Bool[Array, "2 ..."]:
-        """Return the slots' entries of a flag per leg; False for an empty slot."""
+        """Return the entries of a flag per leg for both slots, as one array (2, ...).
+
+        The entry of an empty slot is False.
+        """
         return self.gather_codes(values.astype(jnp.int32)) > 0
 
     def gather(self, values: Array) -> SlotPair:
-        """Return the slots' entries of a quantity per leg; 0 for an empty slot."""
+        """Return the entries of a quantity per leg for both slots; 0 for an empty slot."""
         zero = jnp.zeros_like(values)
         return (
             sum_over_legs(jnp.where(self.first_mask, values, zero)),
@@ -114,21 +126,24 @@ class Slots(NamedTuple):
         )
 
     def scatter(self, pair: Any) -> LegArray:
-        """Return the quantity per leg, zero for legs in no slot: the inverse of `gather`."""
+        """Return a quantity per leg from that of both slots; 0 for legs in no slot.
+
+        This is the inverse of `gather`.
+        """
         return jnp.where(self.first_mask, pair[0], 0.0) + jnp.where(self.second_mask, pair[1], 0.0)
 
 
 def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> Slots:
-    """Return the slots of the first two touching legs."""
+    """Return the slots of the first two legs whose feet touch the ground."""
     touching_rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
     return Slots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
 
 
 def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise | SlotPair:
-    """Return the friction of each slot's foot.
+    """Return the friction coefficient of each slot's foot, or the common one.
 
-    A pair holds the friction of the foot that landed last, Leg 1's, and that of all others; a
-    single number is the friction of all feet.
+    A pair `friction` holds the coefficient of the foot that landed last, Leg 1's, and that of all
+    others. A single number is the coefficient of all feet.
     """
     if not isinstance(friction, tuple):
         return friction
@@ -137,21 +152,19 @@ def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise
 
 
 class ContactInverseInertia(NamedTuple):
-    """Inverse inertia at the slots' forces, and their mutual responses."""
+    """Inverse inertia of the hub, and responses of hub and slots to the slots' forces."""
 
     legs: LegDirections
-    is_released: Bool[Array, " n_legs"]  # legs eliminated: free in length, or in a slot
+    is_released: Bool[Array, " n_legs"]  # whether a leg is eliminated: free in length, or in a slot
     inverse_inertia: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
     sin: SlotPair
     cos: SlotPair
     L: SlotPair
-    response_transverse: tuple[
-        HubVector, HubVector
-    ]  # hub's response to a unit force along e of each foot
-    response_radial: tuple[HubVector, HubVector]  # to a unit pull of each stopper
-    G: tuple[Any, Any, Any]  # 11, 12, 22: e to e
-    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: stopper to e
-    K: tuple[Any, Any, Any]  # 11, 12, 22: stopper to stopper
+    response_transverse: tuple[HubVector, HubVector]  # of the hub to a unit transverse force
+    response_radial: tuple[HubVector, HubVector]  # of the hub to a unit stopper force
+    G: tuple[Any, Any, Any]  # 11, 12, 22: of feet to transverse forces
+    H: tuple[Any, Any, Any, Any]  # 11, 12, 21, 22: of feet to stopper forces
+    K: tuple[Any, Any, Any]  # 11, 12, 22: of legs to stopper forces
 
 
 def apply_inverse(inverse_inertia: tuple[Any, ...], force: HubVector) -> HubVector:
@@ -167,8 +180,9 @@ def apply_inverse(inverse_inertia: tuple[Any, ...], force: HubVector) -> HubVect
 def _invert_inertia(
     s: Symbols, legs: LegDirections, b: LegArray, is_released: Array
 ) -> tuple[Any, ...]:
-    """Return the inverse of the 3 x 3 inertia that is left after the elimination of the released
-    legs.
+    """Return the inverse of the hub's 3 x 3 inertia after elimination of the released legs.
+
+    The entries are xx, xz, x theta, zz, z theta, theta theta.
     """
     sin = jnp.where(is_released, legs.sin, 0.0)
     cos = jnp.where(is_released, legs.cos, 0.0)
@@ -200,7 +214,7 @@ class Posture(NamedTuple):
 
 
 def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
-    """Return the directions of all legs, and the slots' directions and lengths."""
+    """Return the directions of all legs, and the directions and lengths of the slots' legs."""
     legs = leg_directions(s, motion.theta)
     return Posture(legs, slots.gather(legs.sin), slots.gather(legs.cos), slots.gather(motion.L))
 
@@ -208,9 +222,9 @@ def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
 def make_inverse_inertia(
     s: Symbols, motion: WheelMotion, slots: Slots, is_airborne_locked: Array
 ) -> ContactInverseInertia:
-    """Return the response of hub and slots to forces at this posture.
+    """Return the responses of hub and slots to contact forces at this posture.
 
-    - `airborne`: legs in the air on their stoppers.
+    - `is_airborne_locked`: whether a leg is in the air on its stopper.
     """
     legs, sin, cos, L = make_posture(s, motion, slots)
     is_released = slots.is_filled | ~is_airborne_locked
@@ -242,18 +256,19 @@ def make_inverse_inertia(
 
 
 class FreeMotion(NamedTuple):
-    """Motion without the slots' forces: accelerations, or velocities in an impact."""
+    """Motion without contact forces: accelerations, or velocities in an impact."""
 
     hub: HubVector
-    leg_motion: LegArray  # of a released leg's length, minus the hub's share u . hub
+    leg_motion: LegArray  # of a released leg's length, minus the part u . hub
     slot_leg_motion: SlotPair  # the same for the slots' legs
-    foot_transverse: SlotPair  # of the slots' feet along e
-    foot_radial: SlotPair  # along u
+    foot_transverse: SlotPair  # of the slots' feet, transverse to the leg
+    foot_radial: SlotPair  # of the slots' feet, along the leg
 
 
 def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> LegArray:
-    """Return the acceleration of a leg's length without a holding force, minus the hub's share,
-    m/s^2.
+    """Return the acceleration of each leg's length without contact force, m/s^2.
+
+    The hub's acceleration along the leg is not included.
     """
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
@@ -264,7 +279,7 @@ def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> Leg
 def free_acceleration(
     s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
 ) -> FreeMotion:
-    """Return the accelerations by gravity, springs, dampers and rotation alone.
+    """Return the accelerations due to gravity, springs, dampers and rotation alone.
 
     The slots' feet and stoppers exert no force.
     """
@@ -311,8 +326,7 @@ def free_acceleration(
 def free_velocity(
     s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
 ) -> FreeMotion:
-    """Return the velocities by the wheel's momentum alone, with no impulse at feet or slots'
-    stoppers.
+    """Return the velocities after an impact without impulses at feet or slots' stoppers.
 
     An airborne leg on its stopper whose length still changes meets the stopper, inelastically.
     """
@@ -345,7 +359,7 @@ def free_velocity(
 
 
 class FootVelocity(NamedTuple):
-    """Velocity of the slots' feet, m/s."""
+    """Velocity of the slots' feet along the slope and normal to it, m/s."""
 
     x: SlotPair
     z: SlotPair
@@ -354,7 +368,7 @@ class FootVelocity(NamedTuple):
 def foot_velocity(
     motion: WheelMotion, slots: Slots, posture: ContactInverseInertia | Posture
 ) -> FootVelocity:
-    """Return the velocity of the slots' feet along the slope and normal to it."""
+    """Return the velocity of the slots' feet along the slope and normal to it, m/s."""
     dL = slots.gather(motion.dL)
     x = [
         motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
@@ -413,7 +427,7 @@ def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
 
 
 def potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
-    """Return the gravitational energy from the slope's origin and the elastic energy of all
+    """Return the gravitational energy relative to the origin, and the elastic energy of all
     springs, J.
     """
     legs = leg_directions(s, motion.theta)

@@ -1,6 +1,4 @@
-"""Full section state of the unilateral model as one vector, and the embedding of the paper's
-state.
-"""
+"""Full section state of the unilateral model as one vector, and conversions to and from motions."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -13,32 +11,36 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import OwnUnits, Symbols, WheelParams, length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
-"""(theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
-foremost foot lands, in the leg labels of the ending step: rad, rad/s, hub m/s, m, m/s.
+"""State (theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
+foremost foot lands, in the leg labels of the ending step. Units: rad, rad/s, hub m/s, m, m/s.
 
-A leg's code is its foot's mode (0 in the air, 1 at rest, 2 sliding downhill, 3 uphill), plus 4 on
-its stopper. The hub's height follows from the landing foot's.
-"""
+The code of a leg is the contact mode of its foot: 0 in the air, 1 at rest, 2 sliding downhill, 3
+sliding uphill. A leg on its stopper has 4 more. The height of the hub follows from the landing
+foot."""
 
 LOCKED_CODE_OFFSET = 4
-"""Offset of a leg's code on its stopper."""
+"""Number that the code of a leg on its stopper exceeds the contact mode of its foot by."""
 
 
 def full_section_size(n: int) -> int:
-    """Return the length of a full section state of a wheel with `n` legs."""
+    """Return the number of entries of a full section state of a wheel with `n` legs."""
     return 4 + 3 * n
 
 
 def compute_section_units(units: OwnUnits, n: int) -> list[Elementwise]:
-    """Return the wheel's own units of each number of a full section state; 1 for the codes."""
+    """Return the wheel's own unit of each entry of a full section state, as a list.
+
+    Angles and codes have the unit 1.
+    """
     dimensionless = units.length / units.length
     hub_units = [dimensionless, units.rate, units.speed, units.speed]
     return [*hub_units, *[units.length] * n, *[units.speed] * n, *[dimensionless] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
-    """Return the full section state of the paper's one: Leg 1 planted, all other legs on their
-    stoppers.
+    """Return the full section state of the paper's state `x`, (theta-, dtheta-, dL1-).
+
+    Leg 1 is at rest on the ground, and all other legs are in the air on their stoppers.
     """
     theta, dtheta, dL1 = x
     sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
@@ -61,9 +63,14 @@ def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
 def replace_invalid_start(
     params: WheelParams, friction: Elementwise, x: FullState, tilt: Elementwise | None = None
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
-    """Return whether a step may begin at this input, and the input or, if not, a valid substitute.
+    """Return whether a step can start from this input, and the input with invalid elements
+    replaced.
 
-    - `tilt`: angle by which the next line is steeper, rad. On such uneven ground feet may be below
+    Invalid elements are replaced by the start of Table 1's wheel with a friction of 1. The result
+    is (is_valid, parameters, friction, section state).
+
+    - `friction`: coefficient of the ground, invalid if it is negative;
+    - `tilt`: angle by which the next line is steeper, rad. On such uneven ground, feet may be below
       the line that continues the one of the last foothold.
     """
     safe_state = embed_section_state(
@@ -81,18 +88,19 @@ def replace_invalid_start(
 
 
 PENETRATION_TOLERANCE = 1e-3
-"""Largest accepted error of a start, as a fraction of the leg length: larger than the errors of
-integration and Newton's method, and small enough for the first events to correct it."""
+"""Largest accepted position error of a start, as a fraction of the leg length. It is larger than
+the errors of integration and of Newton's method, and small enough for the first events to correct
+it."""
 
 
 def _unpack_posture(
     s: Symbols, x: FullState
 ) -> tuple[Elementwise, tuple, Array, Array, Array, Array]:
-    """Return angle, hub position, lengths, length rates, contact modes and stoppers of a section
-    state.
+    """Return angle (rad), hub position, lengths (m), length rates (m/s), contact modes and stopper
+    flags.
 
-    Leg labels are those of the starting step. Loaded feet are on the slope, and the landing foot is
-    the origin.
+    Leg labels are those of the starting step. The landing foot is the origin, and the lengths of
+    loaded legs are replaced so that their feet are on the slope.
     """
     n = s.n
     theta = x[0] - s.alpha
@@ -113,7 +121,10 @@ def _unpack_posture(
 
 
 def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
-    """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long."""
+    """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long.
+
+    The tolerance is `PENETRATION_TOLERANCE`.
+    """
     theta, (_, z), L, _, contact_modes, _ = _unpack_posture(s, x)
     foot_height, height_tolerance = (
         z - L * leg_directions(s, theta).cos,
@@ -127,11 +138,11 @@ def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
 
 
 def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, ContactState]:
-    """Return motion and contact state just before the landing, in the leg labels of the starting
-    step.
+    """Return the motion and the contact state just before the landing that starts a step.
 
-    The landing foot is the origin. Loaded feet are placed on the slope, so that every vector near a
-    section state is one. The landing brings sticking feet to rest.
+    Leg labels are those of the starting step, and the landing foot is the origin. Loaded feet are
+    placed on the slope, so every vector near a section state is valid. The landing brings sticking
+    feet to rest.
     """
     theta, (hub_x, hub_z), L, dL, contact_modes, is_locked = _unpack_posture(s, x)
     dtheta, vx, vz = x[1], x[2], x[3]
@@ -143,7 +154,8 @@ def unpack_section_state(s: Symbols, x: FullState) -> tuple[WheelMotion, Contact
 def pack_section_state(
     motion: WheelMotion, contact_state: ContactState, tilt: Elementwise | None = None
 ) -> FullState:
-    """Return the section state of a motion just before the next landing, in the frame of its line.
+    """Return the section state of a motion just before the next landing, in the frame of that
+    landing's line.
 
     - `tilt`: angle by which that line is steeper, rad; None on flat ground.
     """

@@ -1,4 +1,5 @@
-"""One wheel with unilateral contact, by the machine code of the batch kernel within JAX programs.
+"""Steps of one wheel with unilateral contact, by the machine code of the batch kernel in JAX
+programs.
 
 `build_contact_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes. For
 derivatives, each tangent is a lane of its own beside the wheel's motion. For samples of a step, a
@@ -51,23 +52,23 @@ from vrw_jax.wheel import stack_parameters
 
 
 class ContactStepConfig(NamedTuple):
-    """Static configuration of a step."""
+    """Static configuration of a step, and the functions of its array leaves."""
 
-    structure: Any  # of (wheel, params, x, options), whose leaves are the arrays
+    structure: Any  # tree structure of (wheel, params, x, options)
     is_detailed: bool
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
-        """Return columns and section states of lanes, and the other settings."""
+        """Return the lanes' input columns and section states, and (wheel, params, options)."""
         wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
         uneven_columns = () if wheel.uneven is None else wheel.uneven
         input_columns = jnp.stack([*stack_parameters(params), wheel.friction, *uneven_columns])
         return input_columns, x, (wheel, params, options)
 
     def make_walk_settings(self, settings: Any) -> BatchWalkSettings:
-        """Return the batch settings of a walk of one step."""
+        """Return the settings of a batch of walks of one step each."""
         wheel, params, options = settings
         tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # checked by the caller
+        assert tableau is not None  # The caller has checked the solver.
         contact_rules = (
             wheel.max_events,
             wheel.has_one_sided_stoppers,
@@ -79,20 +80,24 @@ class ContactStepConfig(NamedTuple):
         )
 
     def make_template(self, *leaves: Array) -> tuple:
-        """Return arrays in the structure of `compute_outputs`."""
+        """Return zero arrays in the structure and shapes of `compute_outputs` for one wheel."""
         params = self.unpack_leaves(leaves)[2][1]
         return _partition_result(
             make_result_template(params.n_legs, leaves[0].dtype, self.is_detailed)
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the result over lanes, which the leaves have on their last axis."""
+        """Return the floats and the other arrays of the result.
+
+        The leaves have the lanes on their last axis.
+        """
         input_columns, x, settings = self.unpack_leaves(leaves)
         return _partition_result(run_walks(self.make_walk_settings(settings), input_columns, x))
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
-        """Return the tangents of the result's floats for one tangent of each lane, the floats, and
-        the rest.
+        """Return the tangents of the result's floats, the floats, and the other arrays.
+
+        Each lane has one tangent of its leaves.
         """
         input_columns, x, settings = self.unpack_leaves(leaves)
         d_columns, d_x = (tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2])
@@ -107,7 +112,11 @@ class ContactStepConfig(NamedTuple):
 
 
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
-    """Return floats and other parts of a step: of the full result, or of the four minimal ones."""
+    """Return the floats and the other arrays of a step.
+
+    A detailed walk gives all results of the step. Any other walk gives section state, durations,
+    outcome and number of solver steps.
+    """
     step_result = walk_result.step_result
     if isinstance(step_result, StepSummary):
         step_result = (
@@ -120,8 +129,10 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
 
 
 def build_contact_step_function(structure: Any, is_detailed: bool) -> ForwardFunction:
-    """Return the step over the leaves of (wheel, params, x, options), as a forward rule for any AD
-    mode.
+    """Return a function from the leaves of (wheel, params, x, options) to the floats and others of
+    a step.
+
+    The function is a forward rule from which all AD modes are built.
     """
     config = ContactStepConfig(structure, is_detailed)
     cache_key = "step on real ground", str(structure), is_detailed
@@ -131,9 +142,10 @@ def build_contact_step_function(structure: Any, is_detailed: bool) -> ForwardFun
 def build_contact_step_jacobian(
     structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
-    """Return the Jacobian of `build_contact_step_function`.
+    """Return a function that computes the Jacobian of `build_contact_step_function`.
 
-    It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
+    The function returns (Jacobian with respect to the leaves at `input_indices`, floats) and the
+    other outputs.
     """
     config = ContactStepConfig(structure, is_detailed)
 
@@ -169,22 +181,22 @@ def build_contact_step_jacobian(
 
 
 class IntervalLog(NamedTuple):
-    """Start and duration of each interval of a step between two events."""
+    """Start state and duration of each interval of a step, between two events."""
 
-    state: Array  # (intervals, dim), see `contact_state.PackedState`
-    contact: Array  # (intervals, legs)
+    state: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
+    contact: Array  # contact mode of every foot, (intervals, legs)
     locked: Array
     duration: Array  # s
 
 
 class SampledIntervals(NamedTuple):
-    """Intervals at equal times, both ends included."""
+    """Intervals of a step, each sampled at equal times with both ends."""
 
     log: IntervalLog
     summary: StepSummary
     outcome: Array
-    state: Array  # (intervals, samples, dim)
-    tangential: Array  # on every foot, N, (intervals, samples, legs)
+    state: Array  # `contact_state.PackedState`, (intervals, samples, dim)
+    tangential: Array  # force on every foot, N, (intervals, samples, legs)
     normal: Array
 
 
@@ -197,10 +209,13 @@ def sample_interval(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> Array:
-    """Return one interval at equal times, ends included, with axes (sample, ., lanes).
+    """Return samples of one interval at equal times, both ends included, with axes (sample, row,
+    lanes).
 
-    The rows are coordinates, rates, accumulators starting at `accumulated`, and normal and
-    tangential forces of the slots.
+    The rows are coordinates, rates, accumulators that start at `initial_accumulators`, and normal
+    and tangential forces of the slots.
+
+    - `duration`: length of the interval, s.
     """
     initial_interval = init_interval(dynamics, motion, options.dt0)
 
@@ -234,9 +249,10 @@ def sample_interval(
 
 @functools.cache
 def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., SampledIntervals]:
-    """Return the sampled motion of a step over the leaves of (wheel, params, x, options).
+    """Return a function from the leaves of (wheel, params, x, options) to the sampled motion of a
+    step.
 
-    It has no derivatives.
+    The function has no derivatives.
     """
     config = ContactStepConfig(structure, True)
     cache_key = str(structure)
@@ -346,8 +362,10 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
 
 
 def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[Array, Array, Array]:
-    """Return rows of `sample_interval` as packed states, and tangential and normal forces of all
-    legs.
+    """Return the rows of `sample_interval` as packed states, and tangential and normal forces of
+    all legs.
+
+    The axes are (intervals, samples, entries), with forces in N.
     """
     n_samples, n_coordinates = sample_rows.shape[1], 3 + n
     time_since_event = jnp.linspace(0.0, 1.0, n_samples) * log.duration[:, None]

@@ -1,7 +1,7 @@
-"""Record of a step with unilateral contact, for one wheel or, elementwise, for a batch.
+"""Record of a step with unilateral contact, for one wheel or elementwise for a batch.
 
-A step is a sequence of events, each followed by an interval in which no contact changes. Its first
-event is the opening landing; the step is complete when the foremost foot lands.
+A step is a sequence of events, each followed by an interval in which no contact changes. The first
+event is the opening landing. The step is complete when the foremost foot lands.
 """
 
 from dataclasses import dataclass
@@ -33,19 +33,19 @@ from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 
 @dataclass(frozen=True)
 class RestOptions:
-    """Rules by which a foot that dips ever less comes to rest."""
+    """Options that decide when a foot that bounces ever less comes to rest."""
 
     bounce_height_per_atol: float = 1e-2
-    """Smallest depth of a dip that a step follows, as a fraction of the absolute tolerance."""
+    """Smallest height of a bounce that a step resolves, as a fraction of the absolute tolerance."""
     bounce_height_eps: float = 4e2
-    """The same in units of round-off of a leg's length: 1e-13 m in float64."""
+    """Smallest height of a resolved bounce in units of round-off of a leg's length: 1e-13 m in
+    float64."""
     n_events_before_ramp: int = 100
     """Number of events of a step after which each event raises the rest speed by its initial value.
 
-    A quarter of the allowed events replaces it if that is more. It is chosen because walks have 4
-    to 60 events, and chains of ever smaller dips have hundreds. Of 400 events, the last dip is as
-    large as a tolerance of 1e-6 leaves from the first.
-    """
+    A quarter of the allowed events replaces this number if that is more. It is chosen because walks
+    have 4 to 60 events, and chains of ever smaller bounces have hundreds. After 400 events, the
+    last bounce is as large as a tolerance of 1e-6 leaves from the first."""
 
 
 REST_OPTIONS = RestOptions()
@@ -54,13 +54,17 @@ REST_OPTIONS = RestOptions()
 def min_bounce_height(
     L0: Elementwise, options: StepOptions, rest_options: RestOptions = REST_OPTIONS
 ) -> Array:
-    """Return the smallest depth of a dip that a step follows, m."""
+    """Return the smallest height of a foot's bounce that a step resolves, m.
+
+    - `L0`: leg length, m;
+    - `options`: options whose absolute tolerance determines the height.
+    """
     roundoff_height = rest_options.bounce_height_eps * jnp.finfo(L0.dtype).eps
     return jnp.maximum(rest_options.bounce_height_per_atol * options.atol, roundoff_height) * L0
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
-    """Return friction with `PAPER_RULE_SENTINEL` in place of infinity under the paper's rule."""
+    """Return friction with `PAPER_RULE_SENTINEL` for infinity if the paper's rule applies."""
     return (
         jnp.where(friction == jnp.inf, PAPER_RULE_SENTINEL, friction)
         if uses_paper_rule
@@ -77,8 +81,12 @@ def make_contact_law(
     restitution: Elementwise | None = None,
     tilt: Elementwise | None = None,
 ) -> ContactLaw:
-    """Return the contact law of a walk; the rest speed is that of the smallest dip under
-    gravity.
+    """Return the contact law of a walk.
+
+    The rest speed is the landing speed after the smallest resolved bounce.
+
+    - `counts_solutions`: whether all admissible solutions of an event are counted;
+    - `tilt`: angle by which the next line is steeper, rad.
     """
     rest_speed = jnp.sqrt(2.0 * s.g * min_bounce_height(s.L0, options))
     return ContactLaw(s, friction, is_one_sided, counts_solutions, rest_speed, restitution, tilt)
@@ -94,13 +102,14 @@ def process_event(
     max_events: int,
     rest_options: RestOptions = REST_OPTIONS,
 ) -> tuple[EventResult, Event, Int[Array, "..."]]:
-    """Return the result of a guard's event, the event, and STEPPED if it was resolved.
+    """Return the result of a guard's event, the event, and the outcome (STEPPED if it was
+    resolved).
 
     - `n_events`: number of earlier events in this step, of at most `max_events`.
 
-    The motion is projected onto its contacts first, because feet drift by the integrator's error. A
-    foot that lifts off rises from the slope like the third power of time; without the projection it
-    would land again immediately.
+    The motion is projected onto its contacts first, because the integrator's error moves feet off
+    them. A foot that lifts off rises from the slope like the third power of time. Without the
+    projection, the foot would land again immediately.
     """
     ramp_start = max(rest_options.n_events_before_ramp, max_events // 4)
     law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
@@ -116,7 +125,7 @@ def process_event(
 class UnilateralMargins(eqx.Module):
     """Margins of bilateral stoppers over one step.
 
-    Negative where a one-sided stopper would have released a leg in the air.
+    A margin is negative if a one-sided stopper would have released a leg in the air.
     """
 
     stopper_force: Elementwise  # minimum over locked legs in the air, N
@@ -124,17 +133,15 @@ class UnilateralMargins(eqx.Module):
 
 
 class StepCounters(NamedTuple):
-    """Counters and durations of a step."""
+    """Numbers of events and solver steps of a step, and durations by the number of loaded feet."""
 
-    n_events: Int[Array, "..."]  # contacts and stoppers that changed
-    durations: Float[Array, "3 ..."]  # with two loaded feet, one, none, s
-    n_solver_steps: Int[Array, "..."]  # attempted
+    n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
+    durations: Float[Array, "3 ..."]  # with two loaded feet, with one, with none, s
+    n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
 
 
 def init_counters(template: Array) -> StepCounters:
-    """Return the counters at the start of a step, for wheels of the shape and dtype of the
-    argument.
-    """
+    """Return the counters at the start of a step, zeros in the shape and dtype of `template`."""
     int_zeros = jnp.zeros(template.shape, jnp.int32)
     return StepCounters(int_zeros, jnp.zeros((3, *template.shape), template.dtype), int_zeros)
 
@@ -145,7 +152,10 @@ def add_interval(
     duration: Elementwise,
     n_solver_steps: Array,
 ) -> StepCounters:
-    """Return the counters after one more interval in this contact state."""
+    """Return the counters after one more interval in this contact state.
+
+    - `duration`: length of the interval, s.
+    """
     n_loaded = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
     is_foot_count = jnp.stack([n_loaded == n_feet for n_feet in (2, 1, 0)])
     durations = counters.durations + jnp.where(is_foot_count, duration, 0.0)
@@ -164,10 +174,11 @@ def interval_outcome(
     is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
-    """Return STEPPED if the walk continues from the guard or the foremost foot `has_landed`.
+    """Return the outcome after an interval, STEPPED if the walk continues or the foremost foot
+    `has_landed`.
 
-    If the interval ended at no event, the result is `failure`. CAME_TO_REST replaces either if
-    the wheel `is_resting`.
+    If the interval did not end at an event, the result is `failure_outcome`. If the wheel
+    `is_resting`, CAME_TO_REST replaces either.
     """
     outcome = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
     outcome = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, outcome)
@@ -179,7 +190,7 @@ def interval_outcome(
 
 
 class StepDetails(NamedTuple):
-    """Further results of a step, named as in `UnilateralStep`."""
+    """Detailed results of a step, named as in `UnilateralStep`."""
 
     post_impact: Float[Array, "2 ..."]
     mode_durations: Float[Array, "4 4 ..."]
@@ -244,8 +255,12 @@ def record_interval(
 ) -> StepDetails:
     """Return the details after one more interval.
 
-    They gain the durations of the slots' modes, and the minimum stopper force of legs in the air at
-    the ends of the interval.
+    The interval adds to the durations of the slots' contact modes. The stopper force of legs in the
+    air is the minimum over the ends of all intervals.
+
+    - `slot_modes`: contact mode of each slot's foot;
+    - `duration`: length of the interval, s;
+    - `stopper_force`: minimum at the ends of this interval, N.
     """
     mode_codes = np.arange(4).reshape(-1, *(1,) * jnp.ndim(stopper_force))
     first_mode_indicator, second_mode_indicator = (
@@ -313,6 +328,7 @@ class UnilateralStep(AbstractContactStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
+        """Return the measures of contact steps and the stopper margins, by name."""
         return AbstractContactStep.model_measures(self) | {
             name: getattr(self.margins, name) for name in STOPPER_MARGIN_MEASURES
         }
@@ -324,7 +340,7 @@ def final_section_state(
     outcome: Array,
     tilt: Elementwise | None = None,
 ) -> FullState:
-    """Return the section state at the end of a step; zeros if it failed."""
+    """Return the section state at the end of a step, or zeros if the step failed."""
     x = pack_section_state(motion, contact_state, tilt)
     return jnp.where(outcome == Outcome.STEPPED, x, jnp.zeros_like(x))
 
@@ -339,7 +355,11 @@ def make_unilateral_step(
     engine: str,
     tilt: Elementwise | None = None,
 ) -> UnilateralStep:
-    """Return the step of this final state and these records."""
+    """Return the results of a step from its final state and its records.
+
+    - `engine`: name of the engine that took the step;
+    - `tilt`: angle by which the next line is steeper, rad.
+    """
     landing_place = landing_position(motion.L.shape[0], motion)
     replace_nonfinite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     details = details._replace(

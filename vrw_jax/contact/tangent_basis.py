@@ -1,8 +1,8 @@
 """Tangents of the dynamics along many directions, from the responses to unit coordinates.
 
-At a point everything is linear: a unit of the angle has the same effect in every direction. A
-length and its rate affect only their own leg, the hub and the slots. So legs are skipped if none of
-them moves, and so are input columns.
+The tangent at a point is linear in the direction: a unit of the angle has the same effect in every
+direction. A length and its rate affect only their own leg, the hub and the slots. So legs that do
+not move along any direction are skipped, and so are constant input columns.
 """
 
 import operator
@@ -51,11 +51,16 @@ from vrw_jax.numerics import run_if_any
 from vrw_jax.wheel import PARAMETER_NAMES
 
 N_MOVING_LEGS = 3
-"""Number of leading legs that usually include all that move: the others are on their stoppers."""
+"""Number of leading legs that usually include all moving legs. The other legs are on their
+stoppers."""
 _LEG_GROUP_SLICES = slice(0, N_MOVING_LEGS), slice(N_MOVING_LEGS, None)
 _MASS_PARAMETERS = "hub_mass", "leg_mass", "leg_com"
 _SPRING_PARAMETERS = "natural_length", "stiffness", "damping"
-_INPUT_NAMES = *PARAMETER_NAMES, "friction", "friction_before"  # the latter on uneven ground
+_INPUT_NAMES = (
+    *PARAMETER_NAMES,
+    "friction",
+    "friction_before",
+)  # on uneven ground
 PARAMETER_GROUPS = [
     tuple(map(_INPUT_NAMES.index, names))
     for names in (
@@ -65,44 +70,44 @@ PARAMETER_GROUPS = [
         ("friction", "friction_before"),
     )
 ]
-"""Groups of columns with one common effect. Lengths act through the position of stoppers alone, the
-tilt of the next line through guards alone."""
+"""Indices of the input columns in each group with a common effect. Lengths act through the position
+of stoppers alone, and the tilt of the next line acts through guards alone."""
 
 CoordinateTangentFn = Callable[[slice], tuple[Array, Array]]
-"""Function that returns some coordinates and rates of a tangent at a point."""
+"""Function that returns the tangents of some coordinates and of their rates at a point."""
 
 
 class UnitResponse(NamedTuple):
-    """Response to a unit input, with forces and accelerations fixed."""
+    """Response to a unit input, with constant forces and accelerations."""
 
-    leg_lengths: LegArray  # of their lengths
+    leg_lengths: LegArray  # acceleration of each leg's length
     total_tangent: TotalTangent
-    foot_speed: SlotPair  # of the slots' feet along the slope
+    foot_speed: SlotPair  # speed of the slots' feet along the slope
     damping: Array  # W
 
 
 class _UnitLengthResponse(NamedTuple):
-    """Response to a unit length of each leg, or to a unit rate.
+    """Response to a unit length of each leg, or to a unit length rate.
 
-    - `slots`: responses of lengths, of feet along e and along u, and of foot speed.
+    - `slot_responses`: of lengths, of feet transverse to and along their legs, and of foot speeds.
     """
 
-    leg_lengths: LegArray  # of its own length
+    leg_lengths: LegArray  # acceleration of the leg's length
     hub: tuple[LegArray, LegArray, LegArray]
     slot_responses: tuple[SlotPair, SlotPair, SlotPair, SlotPair]
 
 
 class _LengthResponse(NamedTuple):
-    """Response to the lengths and rates of some legs along a tangent."""
+    """Response to lengths and length rates of some legs along a tangent."""
 
     hub: HubVector
-    slot_length: SlotPair  # the slots'
+    slot_length: SlotPair  # length of the slots' legs
     slot_length_rate: SlotPair
     damping: Array
 
 
 class _PointLinearization(NamedTuple):
-    """Linearization at one point."""
+    """Linearization of the dynamics at one point."""
 
     dynamics: ModeDynamics
     motion: WheelMotion
@@ -110,7 +115,7 @@ class _PointLinearization(NamedTuple):
     inertia: ContactInverseInertia
     free_motion: FreeMotion
     solution: ForceSolution
-    zero_tangent: ContactConfiguration  # floats of the zero tangent
+    zero_tangent: ContactConfiguration  # zero tangent of the configuration's floats
 
     @classmethod
     def from_motion(cls, dynamics: ModeDynamics, motion: WheelMotion) -> "_PointLinearization":
@@ -124,7 +129,9 @@ class _PointLinearization(NamedTuple):
     def make_leg_residual(
         self, leg_slice: slice
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]:
-        """Return the residual tangent of some legs along a tangent, and the slots of these legs."""
+        """Return a function from a tangent to the residual tangent of some legs, and to their
+        slots.
+        """
         static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
         configuration = _restrict_legs(self.configuration, leg_slice)
         directions = LegDirections(*(leg_row[leg_slice] for leg_row in self.inertia.legs))
@@ -133,7 +140,7 @@ class _PointLinearization(NamedTuple):
         )
         solution = self.solution._replace(length_motion=self.solution.length_motion[leg_slice])
 
-        @jax.jit  # traced once
+        @jax.jit  # The residual is traced once.
         def compute_residual(tangent: ContactConfiguration) -> ResidualTangent:
             arguments = (
                 configuration,
@@ -146,7 +153,7 @@ class _PointLinearization(NamedTuple):
         return lambda tangent: (compute_residual(tangent), configuration.slots)
 
     def foot_speed_tangent(self, tangent: WheelMotion) -> SlotPair:
-        """Return the tangent of the foot speeds."""
+        """Return the tangent of the slots' foot speeds along the slope."""
         s, slots = self.dynamics.s, self.dynamics.slots
         compute_speeds = lambda motion: (
             foot_velocity(motion, slots, make_posture(s, motion, slots)).x
@@ -158,8 +165,8 @@ class _PointLinearization(NamedTuple):
         motion: WheelMotion,
         leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]],
     ) -> tuple:
-        """Return the residual tangent of legs along a motion tangent, their slots, and the feet's
-        speed.
+        """Return residual tangent, slots and foot speeds of some legs along a tangent of the
+        motion.
         """
         return *leg_residual(self.zero_tangent._replace(motion=motion)), self.foot_speed_tangent(
             motion
@@ -168,7 +175,7 @@ class _PointLinearization(NamedTuple):
     def compute_unit_length_responses(
         self, leg_slice: slice
     ) -> tuple[_UnitLengthResponse, _UnitLengthResponse]:
-        """Return the responses to some legs' lengths, and to their rates."""
+        """Return the responses to unit lengths of some legs, and to unit length rates."""
         leg_residual = self.make_leg_residual(leg_slice)
 
         def respond_to_coordinate(coordinate_name: str) -> _UnitLengthResponse:
@@ -180,10 +187,10 @@ class _PointLinearization(NamedTuple):
                 self.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}), leg_residual
             )
             return _UnitLengthResponse(
-                residual.legs,
-                residual.hub,
+                residual.leg_lengths,
+                residual.hub_by_leg,
                 (
-                    slots.gather(residual.legs),
+                    slots.gather(residual.leg_lengths),
                     residual.foot_transverse,
                     residual.foot_radial,
                     foot_speed,
@@ -221,29 +228,32 @@ def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> Con
 class TangentBasis(NamedTuple):
     """Quantities at a point that all tangents share.
 
-    - `whole_residual`: residual of all legs along any tangent;
-    - `length_responses`: those of the first legs, and of the others;
-    - `slot_responses`: the sum of these for the slots.
+    - `all_leg_residual`: function to the residual of all legs along any tangent;
+    - `length_responses`: those of the first legs, and those of the others;
+    - `slot_responses`: sum of both for the slots.
     """
 
     linearization: _PointLinearization
     forces: ContactForces
     solve_tangent: Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]
     all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]
-    angle_responses: tuple[UnitResponse, UnitResponse]  # to the angle, and to its rate
+    angle_responses: tuple[UnitResponse, UnitResponse]  # response to the angle, and to its rate
     length_responses: tuple[
         tuple[_UnitLengthResponse, _UnitLengthResponse],
         tuple[_UnitLengthResponse, _UnitLengthResponse],
     ]
     slot_responses: tuple[tuple[SlotPair, SlotPair, SlotPair, SlotPair], ...]
-    damping_response: LegArray  # W, for a unit rate of each leg
-    slip_tangent: Callable[[SlotPair, SlotPair], Array]  # tangent of sliding loss and slip
+    damping_response: LegArray  # damping power for a unit rate of each leg, W
+    slip_tangent: Callable[[SlotPair, SlotPair], Array]  # tangents of sliding loss and slip
 
     @classmethod
     def from_motion(
         cls, dynamics: ModeDynamics, motion: WheelMotion, has_later_moving_legs: Array
     ) -> "TangentBasis":
-        """Return the basis at this motion; `has_more_moving`: more than the first legs move."""
+        """Return the basis at this motion.
+
+        - `has_later_moving_legs`: whether legs after the first `N_MOVING_LEGS` move.
+        """
         linearization = _PointLinearization.from_motion(dynamics, motion)
         forces = compute_forces(dynamics, motion)
         all_leg_residual = linearization.make_leg_residual(slice(None))
@@ -287,7 +297,7 @@ class TangentBasis(NamedTuple):
                 all_leg_residual,
             )
             return UnitResponse(
-                residual.legs,
+                residual.leg_lengths,
                 sum_residual(slots, residual),
                 foot_speed,
                 jnp.zeros_like(unit_tangent),
@@ -363,7 +373,11 @@ class TangentBasis(NamedTuple):
         column_response: UnitResponse,
         has_later_moving_legs: Array,
     ) -> Array:
-        """Return the tangent of the accelerations and, if requested, of the accumulators."""
+        """Return the tangent of accelerations and, if requested, accumulators, along one direction.
+
+        - `coordinate_tangent_fn`: function to the tangents of some coordinates and rates;
+        - `column_response`: response to the direction's input columns.
+        """
         q, v = coordinate_tangent_fn(slice(0, 3 + N_MOVING_LEGS))
         theta, dtheta, first_length_tangents = q[2], v[2], (q[3:], v[3:])
         later_length_tangents = lambda: coordinate_tangent_fn(slice(3 + N_MOVING_LEGS, None))
@@ -383,14 +397,17 @@ class TangentBasis(NamedTuple):
         ][1:]
         total_tangent, foot_speed, damping_tangent = combined_responses
         slot_rows = (
-            total_tangent.slot_legs,
+            total_tangent.slot_lengths,
             total_tangent.foot_transverse,
             total_tangent.foot_radial,
             foot_speed,
         )
         slot_lengths, foot_transverse, foot_radial, foot_speed = (
             tuple(
-                a[i] + b[i] * length_response.L[i] + c[i] * length_response.dL[i] for i in range(2)
+                a[i]
+                + b[i] * length_response.slot_length[i]
+                + c[i] * length_response.slot_length_rate[i]
+                for i in range(2)
             )
             for a, b, c in zip(slot_rows, *self.slot_responses, strict=True)
         )
@@ -434,6 +451,7 @@ class TangentBasis(NamedTuple):
         return jnp.concatenate(row_tangents)
 
     def _propagate_lengths(self, group_index: int, L: Any, dL: Any) -> _LengthResponse:
+        """Return the response to lengths and length rates of one group of legs."""
         length_response, rate_response = self.length_responses[group_index]
         leg_slice = _LEG_GROUP_SLICES[group_index]
         sum_response = lambda a, b: sum_over_legs(a * L + b * dL)
@@ -457,6 +475,7 @@ class TangentBasis(NamedTuple):
         L: Any,
         dL: Any,
     ) -> Array:
+        """Return the tangents of the length accelerations of one group of legs."""
         (length_response, rate_response), leg_slice, linearization = (
             self.length_responses[group_index],
             _LEG_GROUP_SLICES[group_index],

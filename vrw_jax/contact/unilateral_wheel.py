@@ -104,25 +104,25 @@ from vrw_jax.wheel import (
 )
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
-"""Effect of stoppers on legs in the air: they hold with any force, or only push."""
+"""Effect of stoppers on legs in the air: they hold with any force, or they only push."""
 FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
 """Meaning of infinite friction: the limit of large friction, or the paper's rule (A1)-(A4)."""
 
 
 class UnilateralTrajectory(eqx.Module):
-    """The motion of one step between its events. Axes: phase, sample.
+    """Motion of one step between its events, with axes (phase, sample).
 
     A phase that did not happen has duration 0. The origin is the position of the opening landing.
     """
 
-    time: Float[Array, "phases n"]  # from the landing, s
-    state: Float[Array, "phases n dim"]  # see `contact_state.unpack_state`
-    contact: Int[Array, "phases legs"]  # mode of every foot
-    locked: Bool[Array, "phases legs"]  # on the stopper
+    time: Float[Array, "phases n"]  # time since the landing, s
+    state: Float[Array, "phases n dim"]  # see `contact_state.PackedState`
+    contact: Int[Array, "phases legs"]  # `ContactMode` of every foot
+    locked: Bool[Array, "phases legs"]  # whether each leg is on its stopper
     tangential: Float[Array, "phases n legs"]  # force on every foot, N
     normal: Float[Array, "phases n legs"]
     duration: Float[Array, " phases"]  # s
-    section_state: FullState  # after the step
+    section_state: FullState  # full section state after the step
     step_length: Scalar
     outcome: Int[Array, ""]
     model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `AbstractStep`
@@ -133,7 +133,7 @@ class _EventLoopState(NamedTuple):
 
     state: PackedState
     contact_state: ContactState
-    guard: Int[Array, ""]  # of the last event
+    guard: Int[Array, ""]  # index of the guard of the last event
     outcome: Int[Array, ""]
     is_running: Bool[Array, ""]
     counters: StepCounters
@@ -142,14 +142,14 @@ class _EventLoopState(NamedTuple):
 
 
 class UnevenGround(NamedTuple):
-    """Uneven ground: quantities of a step besides the ground of its own landing."""
+    """Uneven ground: quantities of a step that differ from those of its own landing."""
 
-    friction: Scalar  # of the feet that landed earlier
-    tilt: Scalar  # by which the next line is steeper, rad
+    friction: Scalar  # friction coefficient of the feet that landed earlier
+    tilt: Scalar  # angle by which the next line is steeper, rad
 
 
 def _convert_restitution(value: Any) -> Array | None:
-    """Return Newton's coefficient of restitution; None means 0.
+    """Return Newton's coefficient of restitution as an array; None means 0.
 
     Raises `ValueError` for a number outside [0, 1].
     """
@@ -232,7 +232,7 @@ class UnilateralWheel(AbstractWheel):
 
     @property
     def has_one_sided_stoppers(self) -> bool:
-        """Whether stoppers of legs in the air may release them."""
+        """Whether stoppers of legs in the air only push, so that they may release their legs."""
         return self.stoppers == STOPPERS_ONE_SIDED
 
     @property
@@ -241,7 +241,7 @@ class UnilateralWheel(AbstractWheel):
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
     def default_start(self, params: WheelParams) -> FullState:
-        """Return a start close to the paper's gait of Table 1."""
+        """Return a full section state close to the paper's gait of Table 1."""
         return embed_section_state(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
 
     def section_size(self, params: WheelParams) -> int:
@@ -254,12 +254,16 @@ class UnilateralWheel(AbstractWheel):
         return compute_section_units(units, n_legs)
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
-        """Return the full section state for (theta-, dtheta-, dL1-), with Leg 1 on the ground."""
+        """Return the full section state of `x`, which may be the paper's (theta-, dtheta-,
+        dL1-).
+        """
         return _embed_compiled(params, x) if x.shape == (3,) else x
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        """Return slope, friction, friction of the earlier feet, and tilt of the next line of each
-        step; None on flat ground of one friction.
+        """Return the ground of each step, or None on flat ground of one friction.
+
+        The ground is (slope, friction, friction of the earlier feet, tilt of the next line), each
+        of shape (n_steps,).
         """
         slope, friction = params.slope, self.friction
         if slope.ndim == friction.ndim == 0:
@@ -292,7 +296,7 @@ class UnilateralWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
-        """Return the outputs of a step, and the engine that took it."""
+        """Return the outputs of a step, and the name of the engine that computed them."""
         (leaves, structure), engine = (
             self._flatten_arguments(params, x, options),
             self._choose_engine(options),
@@ -303,18 +307,21 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[list, Any]:
         """Return the leaves and the tree structure of (wheel, params, x, options)."""
-        # Not by `replace`: friction is already validated and may be traced.
+        # `dataclasses.replace` would validate friction again, which may be traced.
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
     def _choose_engine(self, options: StepOptions) -> str:
-        """Return the name of the engine for these options."""
+        """Return the name of the engine for these options, "lanes" or "diffrax"."""
         return (
             "lanes" if self._check_lane_support(options) and can_use_lanes(options) else "diffrax"
         )
 
     def _check_lane_support(self, options: StepOptions) -> bool:
-        """Return whether machine code supports the ground: it has no restitution."""
+        """Return whether machine code supports the model, that is, whether restitution is None.
+
+        Raises `ValueError` if the options require machine code.
+        """
         is_supported = self.restitution is None
         if options.engine == "lanes" and not is_supported:
             raise ValueError(
@@ -350,7 +357,7 @@ class UnilateralWheel(AbstractWheel):
     def _sample_with_diffrax(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> SampledIntervals:
-        """Return the sampled step, integrated by diffrax."""
+        """Return the samples of a step, integrated by diffrax."""
         event_loop_state = _run_event_loop(
             self, params, x, options, is_detailed=False, has_log=True
         )
@@ -394,7 +401,7 @@ class UnilateralWheel(AbstractWheel):
 
 
 def _foot_friction(wheel: UnilateralWheel, friction: Elementwise) -> Friction:
-    """Return the friction of all feet, or that of the foot that landed last and of the others."""
+    """Return the friction of all feet, or of the foot that landed last and of the others."""
     friction = apply_friction_rule(friction, wheel.uses_paper_rule)
     if wheel.uneven is None:
         return friction
@@ -409,7 +416,7 @@ def _run_event_loop(
     is_detailed: bool,
     has_log: bool = False,
 ) -> _EventLoopState:
-    """Return the state at the end of the step."""
+    """Return the state of the event loop at the end of the step."""
     tilt = None if wheel.uneven is None else wheel.uneven.tilt
     is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, tilt)
     s, n = params.symbols(), params.n_legs
@@ -450,7 +457,7 @@ def _advance_to_event(
     options: StepOptions,
     event_loop_state: _EventLoopState,
 ) -> _EventLoopState:
-    """Return the state at the next event."""
+    """Return the state of the event loop at the next event."""
     motion, accumulators = unpack_state(event_loop_state.state)
     event_arguments = event_loop_state.guard, event_loop_state.counters.n_events, max_events
     result, event, outcome = process_event(
@@ -487,7 +494,7 @@ def _advance_to_event(
         lax.stop_gradient(event_arguments.solution.painleve_determinant)
         for event_arguments in end_forces
     )
-    # Forces change sign at the singularity without passing through zero.
+    # At the singularity, forces change sign without passing through zero.
     is_singular = is_at_singularity(determinant_before, determinant_after, options)
     failure_outcome = jnp.where(
         interval_end.timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
@@ -572,7 +579,7 @@ def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunc
 
 
 def _minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
-    """Return the minimal result: section state, durations, outcome, solver steps."""
+    """Return section state, durations, outcome and number of solver steps of a step."""
     counters = event_loop_state.counters
     final_state = unpack_state(event_loop_state.state)[0], event_loop_state.contact_state
     section_state = final_section_state(*final_state, event_loop_state.outcome, tilt)
@@ -582,7 +589,7 @@ def _minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None)
 def _full_result(
     event_loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
 ) -> UnilateralStep:
-    """Return the full result."""
+    """Return all results of a step."""
     motion, accumulators = unpack_state(event_loop_state.state)
     assert event_loop_state.details is not None
     records = event_loop_state.counters, event_loop_state.details, event_loop_state.outcome

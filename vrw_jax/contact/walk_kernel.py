@@ -1,9 +1,9 @@
 """Walks of many wheels with unilateral contact, in lanes side by side.
 
-The laws are those of one wheel, elementwise over lanes. A lane at an event is resolved, and then
-all lanes are integrated further (`integrate_interval`). A landing of the foremost foot is an event
-like any other. On a CPU all of it is one machine-code program in which few lanes are idle;
-elsewhere XLA compiles the same source.
+The laws are those of one wheel, elementwise over lanes. Each iteration resolves the events of all
+lanes at an event, then integrates all lanes further (`integrate_interval`). A landing of the
+foremost foot is an event like any other. On a CPU, all of this is one machine-code program in which
+few lanes are idle. Elsewhere XLA compiles the same source.
 """
 
 from typing import Any, NamedTuple
@@ -65,16 +65,16 @@ from vrw_jax.wheel import (
 )
 
 N_PARAMETERS = len(PARAMETER_NAMES)
-"""Number of columns of parameters, which friction follows."""
+"""Number of input columns that hold parameters. The column of friction follows."""
 N_UNEVEN_COLUMNS = 2
-"""Number of further columns on uneven ground: friction of the feet that landed earlier, and the
-angle by which the next line is steeper, rad."""
+"""Number of further input columns on uneven ground: friction of the feet that landed earlier, and
+the angle by which the next line is steeper, rad."""
 STATUS_UNFINISHED = -1
-"""Code of an unfinished lane in place of its outcome."""
+"""Code in place of the outcome of a lane whose walk is unfinished."""
 
 
 class StepSummary(NamedTuple):
-    """Summary of the last step of a walk."""
+    """Section state, durations and length of the last step of a walk, without details."""
 
     section_state: Array
     durations: Array  # (3, lanes)
@@ -84,14 +84,17 @@ class StepSummary(NamedTuple):
 class BatchWalkResult(NamedTuple):
     """Result of a walk, for every lane."""
 
-    step_result: Any  # of the last step: `StepSummary`, or a `UnilateralStep`
+    step_result: Any  # `StepSummary` or `UnilateralStep` of the last step
     outcome: Array
     n_stepped: Array
     n_solver_steps: Array
 
 
 def make_result_template(n: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
-    """Return zeros in the structure of the result of one wheel with n legs."""
+    """Return zeros in the structure of the result of one wheel with `n` legs.
+
+    - `is_detailed`: whether the step is a `UnilateralStep`.
+    """
     float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     leg_zeros, off_modes = jnp.zeros(n, dtype), jnp.zeros(n, jnp.int32)
     final_state = (
@@ -115,23 +118,23 @@ def make_result_template(n: int, dtype: Any, is_detailed: bool) -> BatchWalkResu
 
 
 class DifferentiableLaneState(NamedTuple):
-    """Differentiable part of a lane's state."""
+    """Differentiable part of a lane's state, or a tangent of this part."""
 
     q: Array
     v: Array
-    accumulators: tuple[Array | None, Array | None]  # in this step, and since the last event
+    accumulators: tuple[Array | None, Array | None]  # of this step, and since the last event
     time: Array
     durations: Array
-    details: Any  # their floats
+    details: Any  # floats of the details
 
 
 class LaneState(NamedTuple):
-    """State of a lane."""
+    """State of all lanes between two iterations of the kernel."""
 
     interval: IntervalState
-    counters: StepCounters  # of this step; attempted solver steps count over the walk
-    details: StepDetails | None  # of this step, if requested
-    step_accumulators: Array | None  # rows of `IntervalState.accumulated`, of this step
+    counters: StepCounters  # of this step, but solver steps of the walk
+    details: StepDetails | None  # details of this step, if requested
+    step_accumulators: Array | None  # integrals over this step, rows as in `IntervalState`
     n_stepped: Array
     outcome: Array
 
@@ -159,17 +162,17 @@ class LaneState(NamedTuple):
 
 
 class BatchWalkSettings(NamedTuple):
-    """Settings common to all wheels of a batch."""
+    """Settings common to all wheels of a batch, and the functions of a walk."""
 
     n_legs: int
     n_steps: Array | int
     max_events: int
     is_one_sided: bool
     uses_paper_rule: bool
-    is_detailed: bool  # whether full results of the step are requested
+    is_detailed: bool  # whether a `UnilateralStep` is requested
     options: StepOptions
     tableau: ButcherTableau
-    is_uneven: bool = False  # columns have `N_UNEVEN_COLUMNS` more, and a walk is one step
+    is_uneven: bool = False  # whether the input has `N_UNEVEN_COLUMNS`; one step only
 
     def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of the lanes in this contact state."""
@@ -183,7 +186,7 @@ class BatchWalkSettings(NamedTuple):
         return make_mode_dynamics(s, friction, *dynamics_arguments)
 
     def unpack_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
-        """Return symbols and friction from the columns of the lanes."""
+        """Return the symbols and the friction of the lanes from their input columns."""
         s = compute_symbols(self.n_legs, *input_columns[:N_PARAMETERS])
         friction = apply_friction_rule(input_columns[N_PARAMETERS], self.uses_paper_rule)
         if not self.is_uneven:
@@ -198,7 +201,7 @@ class BatchWalkSettings(NamedTuple):
         return input_columns[N_PARAMETERS + 2] if self.is_uneven else None
 
     def begin_walk(self, input_columns: Array, x: Array) -> LaneState:
-        """Return the lanes at the first landing of their walk, before it is resolved."""
+        """Return the lanes at the first landing of their walk, before its impact is resolved."""
         motion, contact_state = unpack_section_state(self.unpack_columns(input_columns)[0], x)
         dynamics = self.make_dynamics(input_columns, contact_state)
         interval = zeros_like_output(lambda: init_interval(dynamics, motion, self.options.dt0))
@@ -210,14 +213,17 @@ class BatchWalkSettings(NamedTuple):
         return LaneState(
             interval,
             *self._init_records(x[0]),
-            interval.guard * 0,
-            interval.guard * 0 + STATUS_UNFINISHED,
+            interval.triggered_guard * 0,
+            interval.triggered_guard * 0 + STATUS_UNFINISHED,
         )
 
     def _init_records(
         self, template: Array
     ) -> tuple[StepCounters, StepDetails | None, Array | None]:
-        """Return counters, details and accumulators at the start of a step."""
+        """Return counters, details and accumulators at the start of a step.
+
+        Details and accumulators are None if they are not requested.
+        """
         if not self.is_detailed:
             return init_counters(template), None, None
         broadcast_to_lanes = lambda leaf: jnp.broadcast_to(
@@ -231,7 +237,10 @@ class BatchWalkSettings(NamedTuple):
         )
 
     def process_events(self, input_columns: Array, lane_state: LaneState) -> LaneState:
-        """Return the stopped lanes after their events, or at the end of their walk."""
+        """Return the lanes with their events resolved.
+
+        A lane at the end of its walk gets its outcome. Running lanes are unchanged.
+        """
         interval, layout = lane_state.interval, make_guard_layout(self.n_legs, self.is_one_sided)
         s, friction = self.unpack_columns(input_columns)
         dynamics_before = self.make_dynamics(input_columns, interval.contact_state)
@@ -276,7 +285,7 @@ class BatchWalkSettings(NamedTuple):
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         ended_lane = LaneState(interval, counters, details, step_accumulators, n_stepped, outcome)
 
-        # A landing of the foremost foot opens the next step; every event is processed.
+        # A landing of the foremost foot opens the next step. Then every event is processed.
         opens_step, motion = has_landed & ~has_ended, motion_from_point(interval.point)
         opened_state = unpack_section_state(s, pack_section_state(motion, interval.contact_state))
         motion, contact_state = tree_where(
@@ -315,7 +324,7 @@ class BatchWalkSettings(NamedTuple):
         return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane_state)
 
     def compute_result(self, lane_state: LaneState, tilt: Array | None) -> Any:
-        """Of the last step of lanes that go no further."""
+        """Return the result of the last step of lanes whose walk has ended."""
         final_state = (
             motion_from_point(lane_state.interval.point),
             lane_state.interval.contact_state,
@@ -352,7 +361,7 @@ class BatchWalkSettings(NamedTuple):
         )
 
     def replace_invalid(self, input_columns: Array, x: Array) -> tuple[Array, Array, Array]:
-        """Columns and states that a walk may begin with, and which were so before."""
+        """Return input columns and states with invalid lanes replaced, and the valid lanes."""
         start_arguments = (
             wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
             input_columns[N_PARAMETERS],
@@ -370,7 +379,7 @@ class BatchWalkSettings(NamedTuple):
         return jnp.stack(column_rows), x, is_valid
 
     def deactivate_invalid(self, lane_state: LaneState, is_valid: Array) -> LaneState:
-        """Return the lane state with invalid lanes deactivated."""
+        """Return the lanes, with the outcome BAD_INPUT where a lane is invalid."""
         return lane_state._replace(
             outcome=jnp.where(is_valid, lane_state.outcome, Outcome.BAD_INPUT)
         )
@@ -379,7 +388,7 @@ class BatchWalkSettings(NamedTuple):
 def record_stopper_force(
     details: StepDetails, dynamics: ModeDynamics, motion: WheelMotion, duration: Array
 ) -> StepDetails:
-    """Return the details with the stopper forces at one end of an interval."""
+    """Return the details with the stopper forces at one end of an interval of this duration (s)."""
     force = min_stopper_force(dynamics, compute_forces(dynamics, motion))
     return record_interval(details, dynamics.slot_modes, duration, force)
 
@@ -387,7 +396,7 @@ def record_stopper_force(
 def init_lane_states(
     walk_settings: BatchWalkSettings, input_columns: Array, x: Array
 ) -> tuple[Array, LaneState]:
-    """Return valid columns, and the lanes before their first landing."""
+    """Return valid input columns, and the lanes before their first landing."""
     input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
     return input_columns, walk_settings.deactivate_invalid(
         walk_settings.begin_walk(input_columns, x), is_valid
@@ -402,7 +411,7 @@ def process_and_integrate(
 ) -> tuple[LaneState, LaneState]:
     """Return the lanes after their events, and the lanes integrated further.
 
-    - `waits_for_events`: integrate every lane to its next event.
+    - `waits_for_events`: whether every lane is integrated to its next event.
     """
     state_after_events = walk_settings.process_events(input_columns, lane_state)
     has_unfinished_walk = state_after_events.outcome == STATUS_UNFINISHED
@@ -422,7 +431,7 @@ def process_and_integrate(
 
 
 def run_walks(walk_settings: BatchWalkSettings, input_columns: Array, x: Array) -> BatchWalkResult:
-    """Return every lane after `n_steps` landings of the foremost foot."""
+    """Return the result of every lane after `n_steps` landings of the foremost foot."""
     input_columns, lane_state = init_lane_states(walk_settings, input_columns, x)
     run_iteration = lambda lane_state: process_and_integrate(
         walk_settings, input_columns, lane_state

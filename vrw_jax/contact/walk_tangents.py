@@ -1,9 +1,9 @@
 """Walks of a batch with unilateral contact, with tangents along many directions.
 
-Everything that determines the motion (events, contacts, step sizes) is computed once. At each stage
-of a Runge-Kutta step and at each event, quantities that all tangents share are computed once. Each
+Events, contacts and step sizes determine the motion and are computed once. At each stage of a
+Runge-Kutta step and at each event, quantities that all tangents share are computed once. Each
 tangent then needs only linear operations. The derivatives are those of the discrete flow at the
-accepted step sizes, and of the times of its events: see `numerics.tangents`.
+accepted step sizes, and of the times of its events: see `integrator.tangents`.
 """
 
 import math
@@ -52,21 +52,21 @@ class _IntervalTangent(NamedTuple):
     q: Array
     v: Array
     interval_accumulators: Array | None
-    dynamics_rows: Array  # of accelerations and, if requested, accumulators
+    dynamics_rows: Array  # tangents of accelerations and, if requested, accumulator rates
     time: Array  # tangent of the time, s
 
 
 class _Tangent(NamedTuple):
-    """Tangent of all of a lane's state."""
+    """Tangent of the whole state of a lane."""
 
     interval: _IntervalTangent
-    other_tangents: DifferentiableLaneState  # those not in the interval
+    other_tangents: DifferentiableLaneState  # tangents of what is not in the interval
 
     @classmethod
     def from_lane_tangents(
         cls, lane_tangents: DifferentiableLaneState, dynamics_rows: Array
     ) -> "_Tangent":
-        """Return the tangent of these lane tangents and dynamics rows."""
+        """Return the tangent made of these lane tangents and tangents of dynamics rows."""
         accumulators, interval_accumulators = lane_tangents.accumulators
         other_tangents: Any = lane_tangents._asdict() | {
             "q": None,
@@ -86,7 +86,7 @@ class _Tangent(NamedTuple):
         )
 
     def to_lane_tangents(self) -> DifferentiableLaneState:
-        """Return the lane tangents."""
+        """Return the tangent of the differentiable lane state."""
         q, v, interval_accumulators, _, time = self.interval
         return self.other_tangents._replace(
             q=q,
@@ -97,17 +97,15 @@ class _Tangent(NamedTuple):
 
 
 class TangentBatch(NamedTuple):
-    """Tangents of each lane: arrays have them on the first axis, lanes on the last."""
+    """Tangents of each lane: arrays have the tangents on the first axis and lanes on the last."""
 
-    n_tangents: Array  # number of tangents of a lane
-    n_column_tangents: Array  # number of leading ones that may have column parts
+    n_tangents: Array  # number of tangents of each lane
+    n_column_tangents: Array  # number of leading tangents whose columns may vary
     column_tangents: Array
-    tangent_rows: (
-        Array  # all numbers of a `_Tangent` in one array, for few loops and short compilation
-    )
+    tangent_rows: Array  # all numbers of a `_Tangent`, see `_pack_rows`, (tangents, rows, lanes)
 
     def allocate(self, n_rows: int) -> Array:
-        """Return uninitialized rows of each tangent, to be written."""
+        """Return uninitialized rows of all tangents, (tangents, n_rows, lanes)."""
         return lax.empty(
             (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
         )
@@ -118,8 +116,10 @@ class TangentBatch(NamedTuple):
         tangent_rows: Array,
         first_row: Array | int = 0,
     ) -> Array:
-        """Return the rows of each tangent, overwritten from row `first_row` on by `function(k,
-        rows)`.
+        """Return the rows of all tangents, with those from `first_row` on replaced by the
+        function's results.
+
+        - `function`: maps the index of a tangent and its rows to the new rows, as a tree.
         """
         should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
 
@@ -137,12 +137,12 @@ class TangentBatch(NamedTuple):
 
 
 def _pack_rows(tree: Any) -> Array:
-    """Return all numbers of a tree in one array of rows."""
+    """Return all numbers of a tree in one array (rows, lanes)."""
     return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
 
 
 def _unpack_rows(rows: Array, template: Any) -> Any:
-    """Return the rows as a tree of the template's structure: the inverse of `_pack_rows`."""
+    """Return rows as a tree of the template's structure: the inverse of `_pack_rows`."""
     leaves, structure = jax.tree.flatten(template)
     arrays, offset = [], 0
     for leaf in leaves:
@@ -168,7 +168,7 @@ def walk_with_tangents(
 ) -> tuple[BatchWalkResult, Any]:
     """Return the result of `run_walks`, and the tangents of its floats for each lane.
 
-    Tangents are the first axis of `d_columns`, `d_x` and the returned tangents; a lane has
+    Tangents are the first axis of `d_columns`, `d_x` and the returned tangents. Each lane has
     `n_tangents` of them.
     """
     input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
@@ -292,7 +292,7 @@ def _integrate_with_tangents(
     options: StepOptions,
     tableau: ButcherTableau,
 ) -> tuple[IntervalState, Array]:
-    """Return the result of `integrate_interval`, with the tangents propagated to the event."""
+    """Return the result of `integrate_interval`, and the tangent rows at the event."""
     dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(dynamics), len(tableau.nodes) - 1
     options = compute_own_units(dynamics.s).scale_times(options)
@@ -349,7 +349,7 @@ def _integrate_with_tangents(
                 strict=True,
             )
             q, v = map(jnp.concatenate, end_coordinates)
-            interval_accumulators = start_tangent.accumulated
+            interval_accumulators = start_tangent.interval_accumulators
             if interval_accumulators is not None:
                 weights = tableau.matrix[last_stage]
                 interval_accumulators = interval_accumulators + interval.h * sum(
@@ -389,7 +389,7 @@ def _evaluate_stages(
 ) -> tuple[Array, Array]:
     """Return the dynamics rows at the stages of a step, and the tangents of these rows.
 
-    The tangents are processed one after another.
+    The tangents are computed one after another.
     """
     point, h = interval.point, interval.h
     n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.nodes) - 1
@@ -447,7 +447,7 @@ def _evaluate_stages(
         lambda k, _: _unpack_tangent(tangents.tangent_rows, k, tangent_template).dynamics_rows,
         tangents.allocate((last_stage + 1) * n_dynamics_rows),
     )
-    # The first stage is the last one of the previous step, except after an event.
+    # The first stage is the last stage of the previous step, except after an event.
     first_stage = jnp.where(jnp.any(is_at_interval_start), 0, 1).astype(jnp.int32)
     should_continue = lambda state: state[0] <= last_stage
     return lax.while_loop(
@@ -463,7 +463,7 @@ def _stage_tangent(
     h: Array,
     leg_slice: slice,
 ) -> tuple[Array, Array]:
-    """Return the tangent of `stage_state` for some coordinates, from the earlier stages."""
+    """Return the tangent of `compute_stage_state` for some coordinates, from the earlier stages."""
     flat_matrices = [
         jnp.asarray(np.reshape(x, -1)) for x in (tableau.matrix, tableau.matrix_squared)
     ]
@@ -489,10 +489,10 @@ def _stage_tangent(
 def _max_stable_step(
     dynamics: ModeDynamics, tableau: ButcherTableau, safety_factor: float = 0.85
 ) -> Array:
-    """Return the step size above which tangents of a swinging leg grow, times a safety factor.
+    """Return the step size above which tangents of a swinging leg grow, times a safety factor, s.
 
-    The damper of such a leg stops it within m / c. Step-size control is based on the motion alone,
-    in which such a leg may be almost at rest.
+    The damper of such a leg stops the leg within m / c. Step-size control is based on the motion
+    alone, in which the leg may be almost at rest.
     """
     has_swing_leg = jnp.any(
         ~dynamics.contact_state.locked & (dynamics.contact_state.contact_modes == ContactMode.OFF),
@@ -528,7 +528,7 @@ def _shift_to_event(
     tangents: TangentBatch,
     tangent_template: _IntervalTangent,
 ) -> Callable[[Array, Array], _IntervalTangent]:
-    """Return the function that shifts tangents by the tangent of the event time."""
+    """Return a function that shifts tangents by the tangent of the event time."""
     point, n = interval.point, len(interval.point.q)
 
     def compute_guards(input_columns: Array, q: Array, v: Array) -> Array:
@@ -560,7 +560,7 @@ def _shift_to_event(
                 -guard_tangents[index] / jnp.where(is_at_guard, guard_rates[index], -1.0),
                 time_tangent,
             )
-        interval_accumulators = tangent.accumulated
+        interval_accumulators = tangent.interval_accumulators
         if interval_accumulators is not None:
             interval_accumulators = (
                 interval_accumulators + time_tangent * point.dynamics_rows[-N_ACCUMULATOR_ROWS:]
