@@ -29,14 +29,14 @@ def with_damping(
     The integral is one more component of the state: its error counts like any other.
     """
     s = params.symbols()
-    power = lambda y: dynamics.damping_power(s, phase.motion(y))
+    power = lambda y: dynamics.damping_power(s, phase.unpack_motion(y))
     field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
     watched = MonitoredFunctions(lambda y: phase.guards.evaluate(y[:-1]), phase.guards.n_guards)
     zero = 0.0 * start[:1]
     end = integrate_phase(
         field, watched, jnp.concatenate([start, zero]), jnp.asarray(True), options
     )
-    return end, end.state[-1], phase.motion(end.state[:-1])
+    return end, end.state[-1], phase.unpack_motion(end.state[:-1])
 
 
 def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptions) -> tuple:

@@ -22,8 +22,14 @@ from vrw_jax.contact.single_step import sample_interval
 from vrw_jax.contact.walk_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
 from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
 from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
-from vrw_jax.models import N_STEP_INPUTS, RigidWheel, StepResult, gait_step, jacobian_columns
-from vrw_jax.models.batch_step import make_lane_phase, run_batch_phases
+from vrw_jax.models import (
+    N_STEP_INPUTS,
+    RigidWheel,
+    StepResult,
+    compute_jacobian_columns,
+    take_gait_step,
+)
+from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
 from vrw_jax.models.phase_sequence import evaluate_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
 from vrw_jax.numerics import StepOptions, sine_cosine
@@ -95,7 +101,7 @@ def make_shared_programs() -> dict[str, Program]:
         given = dict(zip(PARAMETER_NAMES, tuple(parameters), strict=True))
         params, options = _OfAnyLegs(**given, legs=legs), _options(tolerance)
         shift = lambda *start: _advance(params, start, options)
-        columns, numbers, codes = jacobian_columns(shift, tuple(x), range(3))
+        columns, numbers, codes = compute_jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
     return {"linearised": Program(linearised, 2, simd.RegisterLimits(N_STEP_INPUTS))}
@@ -116,9 +122,9 @@ def programs(n_legs: int) -> dict[str, Program]:
         step = make_step_result(walk_result, friction, "lanes")
         motion = []
         for phase, start, end in zip(
-            walk_result.phases, walk_result.starts, walk_result.ends, strict=True
+            walk_result.phases, walk_result.phase_starts, walk_result.phase_ends, strict=True
         ):
-            flow = make_lane_phase(phase, records_margins=False)
+            flow = make_batch_phase(phase, records_margins=False)
             known_values = sample_batch_phase(
                 flow, load_explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
             )
@@ -263,22 +269,22 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
     """The same of the lowest rung, in whose formulas no tolerance stands."""
 
     def rolled(parameters: Array, x: tuple) -> tuple[tuple, tuple]:
-        step = RigidWheel().step_elementwise(wheel(parameters), x, jnp.ones_like(x[0]))
+        step = RigidWheel().compute_step_elementwise(wheel(parameters), x, jnp.ones_like(x[0]))
         return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
     def linearised(tolerance: Array, parameters: Array, x: Array) -> tuple:
         shift = lambda *start: rolled(parameters, start)
-        columns, numbers, codes = jacobian_columns(shift, tuple(x), range(3))
+        columns, numbers, codes = compute_jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         params = wheel(parameters)
-        step = RigidWheel().step_elementwise(params, tuple(x), friction + 0.0 * x[0])
+        step = RigidWheel().compute_step_elementwise(params, tuple(x), friction + 0.0 * x[0])
         half = 0.5 * params.leg_angle
         share = jnp.arange(SAMPLES)[:, None] * (1.0 / (SAMPLES - 1))
         roll = RollingMotion(params.symbols(), params.slope, step.post_impact[1])
         theta = half * (2.0 * share - 1.0) + 0.0 * x[0]
-        rows = jnp.concatenate([*roll.evaluate_states(theta), roll.time(theta)[None]])
+        rows = jnp.concatenate([*roll.evaluate_states(theta), roll.time_at_angle(theta)[None]])
         codes = jnp.stack([step.outcome, step.solver_steps])
         return _numbers_of(step), codes, rows
 
@@ -301,7 +307,7 @@ def _numbers_of(step: StepResult) -> Array:
 def _advance(
     params: WheelParams, x: tuple[Array, ...], options: StepOptions
 ) -> tuple[tuple, tuple]:
-    step = gait_step(params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True)
+    step = take_gait_step(params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True)
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
 

@@ -152,10 +152,10 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         phases = make_phases(s, landing.distance, stop_at_lift_off=True)
         dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
         y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]), setting)
-        m = dls.motion(y)
+        m = dls.unpack_motion(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
         y, second, n2 = until(sls1, start, setting)
-        hit = transitions.hit_stopper(s, sls1.motion(y)).motion
+        hit = transitions.hit_stopper(s, sls1.unpack_motion(y)).motion
         start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
         y, third, n3 = until(sls2, start, setting)
         times = first_time, second, third

@@ -96,11 +96,11 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         )
 
         def lifted(y):
-            m = flows(y[2])[0].motion(y[:2])
+            m = flows(y[2])[0].unpack_motion(y[:2])
             return jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
 
         def locked(y):
-            hit = transitions.hit_stopper(s, second.motion(y))
+            hit = transitions.hit_stopper(s, second.unpack_motion(y))
             return jnp.stack([y[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
 
         end, dls = through(with_distance, at_landing, durations[0])

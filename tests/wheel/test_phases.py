@@ -199,7 +199,7 @@ def end_by_diffrax():
 def end_by_lane_engine():
     phase, q, v = make_state_at(2)
     lanes = lambda x: tuple(jnp.tile(number, 8) for number in x)
-    phase_of = lambda *_: lane_step.make_lane_phase(phase, records_margins=False)
+    phase_of = lambda *_: lane_step.make_batch_phase(phase, records_margins=False)
     end = integrate_batch_phase(
         phase_of, (), (), load_explicit_tableau("Bosh3"), lanes(q), lanes(v),
         jnp.ones(8, bool), jnp.full(8, 5e-3), vrw.StepOptions(),

@@ -41,9 +41,9 @@ from vrw_jax.models import (
     N_STEP_INPUTS,
     AbstractWheel,
     AdvanceResult,
-    gait_step,
-    jacobian_columns,
-    scaled_jacobian_columns,
+    complete_jacobian_columns,
+    compute_jacobian_columns,
+    take_gait_step,
 )
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.runtime import with_default_settings
@@ -393,7 +393,7 @@ def _step_by_lanes(
         def step_outputs(*lanes: Array) -> tuple:
             params = wheel_from_parameters(lanes[:n_parameters], n_legs, *lanes[NEXT_SLOPE_INDEX:])
             x = lanes[n_parameters:NEXT_SLOPE_INDEX]
-            result = gait_step(
+            result = take_gait_step(
                 params, x, current_options, tableau, stop_at_lift_off, straggler_count
             )
             diagnostics = result.is_unfinished, result.outcome, result.solver_steps
@@ -404,7 +404,7 @@ def _step_by_lanes(
             return (*diagnostics, values)
         # With respect to all inputs, two columns follow from the units.
         needs_all = len(input_indices) == len(lanes)
-        compute_columns = scaled_jacobian_columns if needs_all else jacobian_columns
+        compute_columns = complete_jacobian_columns if needs_all else compute_jacobian_columns
         jacobian, values, diagnostics = compute_columns(step_outputs, lanes, input_indices)
         return (*diagnostics, values, jacobian)
 

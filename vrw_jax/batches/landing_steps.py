@@ -15,7 +15,12 @@ from jaxtyping import Array
 from vrw_jax import simd
 from vrw_jax.batches.programs import run_compiled
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.models import N_STEP_INPUTS, ViscoelasticWheel, jacobian_columns, step_after_landing
+from vrw_jax.models import (
+    N_STEP_INPUTS,
+    ViscoelasticWheel,
+    compute_jacobian_columns,
+    take_step_after_landing,
+)
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
 
@@ -93,16 +98,18 @@ def step_batch_after_landing(
         def landing_outputs(*lanes: Array) -> tuple:
             params = wheel_from_parameters(lanes[:n_parameters], n_legs, lanes[-1])
             state = lanes[n_parameters:-1]
-            result = step_after_landing(
+            result = take_step_after_landing(
                 params, state, current_options, tableau, stop_at_lift_off, straggler_count
             )
             diagnostics = result.is_unfinished, result.outcome, jnp.stack(result.durations)
-            return result.values, diagnostics
+            return result.landing_quantities, diagnostics
 
         if not input_indices:
             values, diagnostics = landing_outputs(*lanes)
             return (*diagnostics, values)
-        columns, values, diagnostics = jacobian_columns(landing_outputs, lanes, input_indices)
+        columns, values, diagnostics = compute_jacobian_columns(
+            landing_outputs, lanes, input_indices
+        )
         return (*diagnostics, values, columns)
 
     settings = ("step after landing", n_legs, stop_at_lift_off, structure, input_indices)

@@ -4,10 +4,10 @@ from vrw_jax.models import batch_step, unit_scaling
 from vrw_jax.models.batch_step import (
     N_STEP_INPUTS,
     can_use_lanes,
-    gait_step,
-    jacobian_columns,
+    compute_jacobian_columns,
     split_jacobian,
-    step_after_landing,
+    take_gait_step,
+    take_step_after_landing,
 )
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel, StepGround
@@ -33,5 +33,5 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.models.unit_scaling import scaled_jacobian_columns
+from vrw_jax.models.unit_scaling import complete_jacobian_columns
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -35,7 +35,7 @@ from vrw_jax.models.phase_sequence import (
     make_advance_result,
     make_step_result,
     make_trajectory,
-    next_section,
+    next_section_state,
     run_phases,
 )
 from vrw_jax.models.step_results import (
@@ -108,7 +108,7 @@ class _PhaseCarry(NamedTuple):
     is_unfinished: Bool[Array, " lanes"]
 
 
-def make_lane_phase(
+def make_batch_phase(
     phase: AbstractPhase, records_margins: bool, is_noinline: bool = False
 ) -> BatchPhase:
     """Return a phase in the form of the batched integrator.
@@ -116,35 +116,44 @@ def make_lane_phase(
     - `records_margins`: evaluate its margins in addition to its guards.
     """
 
-    def evaluate(q: Vector, v: Vector) -> StageAcceleration:
+    def evaluate_acceleration(q: Vector, v: Vector) -> StageAcceleration:
         sin, cos = sine_cosine(q[0])
         return StageAcceleration(
             sin, cos, phase.acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
         )
 
-    def motion(stage: StageState) -> Motion:
+    def motion_at_stage(stage: StageState) -> Motion:
         return phase.complete_motion(
             stage.acceleration.sin, stage.acceleration.cos, stage.q, stage.v
         )
 
-    def instant(stage: StageState) -> PhaseInstant:
-        return PhaseInstant(phase, motion(stage), stage.acceleration.acceleration)
+    def make_instant(stage: StageState) -> PhaseInstant:
+        return PhaseInstant(phase, motion_at_stage(stage), stage.acceleration.acceleration)
 
     implicit_dynamics = ImplicitDynamics(
-        lambda stage: phase.dynamics_residual(motion(stage), stage.acceleration.acceleration),
-        lambda stage, rows: phase.solve_dynamics(motion(stage), rows),
+        lambda stage: phase.dynamics_residual(
+            motion_at_stage(stage), stage.acceleration.acceleration
+        ),
+        lambda stage, rows: phase.solve_dynamics(motion_at_stage(stage), rows),
     )
-    margins = lambda stage: phase.margins(instant(stage))
+    margin_functions = lambda stage: phase.margins(make_instant(stage))
     monitored_margins = (
-        MarginFunctions(margins, phase.margins_counted_at_start) if records_margins else None
+        MarginFunctions(margin_functions, phase.margins_counted_at_start)
+        if records_margins
+        else None
     )
-    guards = lambda stage: phase.guards(instant(stage))
+    guards = lambda stage: phase.guards(make_instant(stage))
     return BatchPhase(
-        evaluate, guards, monitored_margins, implicit_dynamics, is_noinline, phase.coordinate_units
+        evaluate_acceleration,
+        guards,
+        monitored_margins,
+        implicit_dynamics,
+        is_noinline,
+        phase.coordinate_units,
     )
 
 
-def gait_step(
+def take_gait_step(
     params: WheelParams,
     x: Vector,
     options: StepOptions,
@@ -165,23 +174,25 @@ def gait_step(
         records_margins=False,
         straggler_count=straggler_count,
     )
-    ends, has_stepped = sequence.ends, sequence.outcome == Outcome.STEPPED
-    section = next_section(sequence)
+    phase_ends, has_stepped = sequence.phase_ends, sequence.outcome == Outcome.STEPPED
+    next_section = next_section_state(sequence)
     return BatchAdvanceResult(
-        section_state=tuple(jnp.where(has_stepped, value, 0.0) for value in section),
-        durations=tuple(end.duration for end in ends),
+        section_state=tuple(jnp.where(has_stepped, value, 0.0) for value in next_section),
+        durations=tuple(end.duration for end in phase_ends),
         outcome=sequence.outcome,
-        solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        is_unfinished=ends[0].engine_carry.is_unfinished
-        | ends[1].engine_carry.is_unfinished
-        | ends[2].engine_carry.is_unfinished,
+        solver_steps=phase_ends[0].n_solver_steps
+        + phase_ends[1].n_solver_steps
+        + phase_ends[2].n_solver_steps,
+        is_unfinished=phase_ends[0].engine_carry.is_unfinished
+        | phase_ends[1].engine_carry.is_unfinished
+        | phase_ends[2].engine_carry.is_unfinished,
     )
 
 
 class LandingStep(NamedTuple):
     """A step of every lane between two landings that leave both feet on the ground."""
 
-    values: Array
+    landing_quantities: Array
     """Rows of lanes: (theta+, dtheta+) just after the next landing, rad and rad/s; the normal
     impulse of the rear foot in it with both feet held, N s; `stopper_margin`, m^2/s. The first
     three are zero unless the outcome is STEPPED."""
@@ -191,7 +202,7 @@ class LandingStep(NamedTuple):
     is_unfinished: Bool[Array, " lanes"]  # see `BatchAdvanceResult`
 
 
-def step_after_landing(
+def take_step_after_landing(
     params: WheelParams,
     y: Vector,
     options: StepOptions,
@@ -215,29 +226,33 @@ def step_after_landing(
         straggler_count=straggler_count,
         land=transitions.start_on_both_feet,
     )
-    ends, has_stepped = sequence.ends, sequence.outcome == Outcome.STEPPED
-    section = tuple(
+    phase_ends, has_stepped = sequence.phase_ends, sequence.outcome == Outcome.STEPPED
+    next_section = tuple(
         jnp.where(has_stepped, value, jnp.asarray(safe_value, value.dtype))
-        for value, safe_value in zip(next_section(sequence), PAPER_START, strict=True)
+        for value, safe_value in zip(next_section_state(sequence), PAPER_START, strict=True)
     )
-    landing = with_batched_jvp(transitions.land)(sequence.s, *section)
-    rows = landing.theta, landing.motion.dtheta, landing.rear_impulse.normal
-    landing_values = [jnp.where(has_stepped, row, 0.0) for row in rows]
+    landing = with_batched_jvp(transitions.land)(sequence.s, *next_section)
+    landing_rows = landing.theta, landing.motion.dtheta, landing.rear_impulse.normal
+    landing_values = [jnp.where(has_stepped, row, 0.0) for row in landing_rows]
     sls1 = sequence.phases[1]
-    margin = with_batched_jvp(_stopper_margin)(sequence.s, sls1.turn, ends[1].q, ends[1].v)
-    margin = jnp.where(sequence.phases_happened[1], margin, 0.0)
+    order_margin = with_batched_jvp(_event_order_margin)(
+        sequence.s, sls1.turn, phase_ends[1].q, phase_ends[1].v
+    )
+    order_margin = jnp.where(sequence.phases_happened[1], order_margin, 0.0)
     return LandingStep(
-        values=jnp.stack([*landing_values, margin]),
+        landing_quantities=jnp.stack([*landing_values, order_margin]),
         outcome=sequence.outcome,
-        durations=tuple(end.duration for end in ends),
-        solver_steps=ends[0].n_solver_steps + ends[1].n_solver_steps + ends[2].n_solver_steps,
-        is_unfinished=ends[0].engine_carry.is_unfinished
-        | ends[1].engine_carry.is_unfinished
-        | ends[2].engine_carry.is_unfinished,
+        durations=tuple(end.duration for end in phase_ends),
+        solver_steps=phase_ends[0].n_solver_steps
+        + phase_ends[1].n_solver_steps
+        + phase_ends[2].n_solver_steps,
+        is_unfinished=phase_ends[0].engine_carry.is_unfinished
+        | phase_ends[1].engine_carry.is_unfinished
+        | phase_ends[2].engine_carry.is_unfinished,
     )
 
 
-def _stopper_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
+def _event_order_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
     """Return a margin of the order of two events at the end of SLS-I, m^2/s.
 
     If Leg 2 meets its stopper first, it is the rate of Leg 2 times the height of the landing foot.
@@ -269,50 +284,54 @@ def run_batch_phases(
     - `land`: the landing that opens the step.
     """
 
-    def run(
-        phase: AbstractPhase, q: Vector, v: Vector, active: Array, previous_end: PhaseResult | None
+    def run_phase(
+        phase: AbstractPhase,
+        q: Vector,
+        v: Vector,
+        is_active: Array,
+        previous_end: PhaseResult | None,
     ) -> PhaseResult:
-        limited = compute_own_units(phase.s).scale_times(options)
-        dt0 = limited.dt0 + jnp.zeros_like(q[0])
+        scaled_options = compute_own_units(phase.s).scale_times(options)
+        dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
         if previous_end is not None:
-            carry: _PhaseCarry = previous_end.engine_carry
-            dt0 = carry.next_dt
+            engine_carry: _PhaseCarry = previous_end.engine_carry
+            dt0 = engine_carry.next_dt
             if phase.has_stiff_start:
                 tolerance_root = jnp.exp(jnp.log(options.rtol.astype(jnp.float32)) / tableau.order)
                 transient_dt = stiff_start.max_transient_step * tolerance_root.astype(dt0.dtype)
                 max_transient_dt = transient_dt * phase.s.m / phase.s.c
                 dt0 = jnp.minimum(stiff_start.max_step_ratio * dt0, max_transient_dt)
-                dt0 = jnp.where(carry.has_run, dt0, carry.next_dt)
-        floats, static = eqx.partition((phase.s, phase.turn), eqx.is_array)
+                dt0 = jnp.where(engine_carry.has_run, dt0, engine_carry.next_dt)
+        float_leaves, static_leaves = eqx.partition((phase.s, phase.turn), eqx.is_array)
 
-        def make_phase(floats: Any, constants: Vector) -> BatchPhase:
-            s, turn = eqx.combine(floats, static)
+        def make_phase(float_leaves: Any, constants: Vector) -> BatchPhase:
+            s, turn = eqx.combine(float_leaves, static_leaves)
             rebuilt_phase = dataclasses.replace(phase, s=s, constants=constants, turn=turn)
-            return make_lane_phase(rebuilt_phase, records_margins, is_noinline)
+            return make_batch_phase(rebuilt_phase, records_margins, is_noinline)
 
-        end = integrate_batch_phase(
+        phase_end = integrate_batch_phase(
             make_phase,
-            floats,
+            float_leaves,
             phase.constants,
             tableau,
             q,
             v,
-            active,
+            is_active,
             dt0,
-            limited,
+            scaled_options,
             straggler_count,
         )
         return PhaseResult(
-            *end.state[:2],
-            duration=end.duration,
-            guard=end.guard,
-            is_timed_out=end.timed_out,
-            n_solver_steps=end.n_tried_steps,
-            margin_minima=end.minima,
-            engine_carry=_PhaseCarry(end.next_dt, active, end.is_unfinished),
+            *phase_end.state[:2],
+            duration=phase_end.duration,
+            guard=phase_end.guard,
+            is_timed_out=phase_end.timed_out,
+            n_solver_steps=phase_end.n_tried_steps,
+            margin_minima=phase_end.minima,
+            engine_carry=_PhaseCarry(phase_end.next_dt, is_active, phase_end.is_unfinished),
         )
 
-    return run_phases(run, params, x, options, stop_at_lift_off, with_batched_jvp(land))
+    return run_phases(run_phase, params, x, options, stop_at_lift_off, with_batched_jvp(land))
 
 
 def can_use_lanes(options: StepOptions) -> bool:
@@ -332,20 +351,20 @@ def can_use_lanes(options: StepOptions) -> bool:
 class _StaticConfig(NamedTuple):
     """Static configuration of a batched step: what it depends on besides its arrays."""
 
-    structure: Any  # of (params, x, options), whose leaves are the arrays
+    argument_structure: Any  # of (params, x, options), whose leaves are the arrays
     stop_at_lift_off: bool
     friction: float | None  # for margins; None for the minimal result
 
     @property
     def cache_key(self) -> tuple:
         """Cache key of the trace, by `repr`."""
-        return str(self.structure), self.stop_at_lift_off, self.friction
+        return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
-    def run(self, *leaves: Array) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
+    def run_lanes(self, *leaves: Array) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
         """Return the step over lanes, which the leaves have on their last axis, with tableau and
         options.
         """
-        params, x, options = jax.tree.unflatten(self.structure, leaves)
+        params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by `can_use_lanes`
         records_margins = self.friction is not None
@@ -354,33 +373,35 @@ class _StaticConfig(NamedTuple):
 
     def compute_outputs(self, *leaves: Array) -> tuple:
         """Return the outputs of the step, floats first."""
-        sequence, friction = self.run(*leaves)[0], self.friction
+        sequence, friction = self.run_lanes(*leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(sequence, "lanes"), eqx.is_inexact_array)
-        ends = tuple(end._replace(engine_carry=None) for end in sequence.ends)
-        moving_sequence = sequence._replace(phases=(), starts=(), ends=ends)  # only floats
+        phase_ends = tuple(end._replace(engine_carry=None) for end in sequence.phase_ends)
+        float_sequence = sequence._replace(
+            phases=(), phase_starts=(), phase_ends=phase_ends
+        )  # only floats
         result = with_batched_jvp(lambda sequence: make_step_result(sequence, friction, "lanes"))(
-            moving_sequence
+            float_sequence
         )
         return eqx.partition(result, eqx.is_inexact_array)
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return arrays in the structure of `compute_outputs`."""
         x = leaves[0]
-        codes = jnp.zeros_like(x, jnp.int32)
-        pair, triple = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
-        result: Any = AdvanceResult(triple, triple, codes, codes, engine="lanes")
+        int_zeros = jnp.zeros_like(x, jnp.int32)
+        two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
+        result: Any = AdvanceResult(three_rows, three_rows, int_zeros, int_zeros, engine="lanes")
         if self.friction is not None:
             result = StepResult(
-                section_state=triple,
-                post_impact=pair,
-                durations=triple,
+                section_state=three_rows,
+                post_impact=two_rows,
+                durations=three_rows,
                 step_length=x,
                 indicators=_fill_fields(DoubleSupportIndicators, x),
                 margins=_fill_fields(Margins, x),
                 energy=_fill_fields(EnergyLoss, x),
-                outcome=codes,
-                solver_steps=codes,
+                outcome=int_zeros,
+                solver_steps=int_zeros,
                 engine="lanes",
             )
         return eqx.partition(result, eqx.is_inexact_array)
@@ -392,25 +413,27 @@ def _fill_fields(record_type: Any, x: Array) -> Any:
 
 
 def build_step_function(
-    structure: Any, stop_at_lift_off: bool, friction: float | None
+    argument_structure: Any, stop_at_lift_off: bool, friction: float | None
 ) -> ForwardFunction:
     """Return the step over the leaves of (params, x, options), as a forward rule for any AD
     mode.
     """
-    config = _StaticConfig(structure, stop_at_lift_off, friction)
+    config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *config.cache_key)
     return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
 
 
-def build_step_sampler(structure: Any, stop_at_lift_off: bool, n_samples: int) -> BatchFunction:
+def build_step_sampler(
+    argument_structure: Any, stop_at_lift_off: bool, n_samples: int
+) -> BatchFunction:
     """Return the step sampled at equal times of each phase, over the same leaves."""
-    config = _StaticConfig(structure, stop_at_lift_off, None)
+    config = _StaticConfig(argument_structure, stop_at_lift_off, None)
 
-    def sample_lanes_of_step(*leaves: Array) -> Trajectory:
-        sequence, tableau, options = config.run(*leaves)
+    def sample_lanes(*leaves: Array) -> Trajectory:
+        sequence, tableau, options = config.run_lanes(*leaves)
         samples = [
             sample_batch_phase(
-                make_lane_phase(phase, False),
+                make_batch_phase(phase, False),
                 tableau,
                 *start,
                 end.duration,
@@ -418,44 +441,47 @@ def build_step_sampler(structure: Any, stop_at_lift_off: bool, n_samples: int) -
                 compute_own_units(phase.s).scale_times(options),
             )
             for phase, start, end in zip(
-                sequence.phases, sequence.starts, sequence.ends, strict=True
+                sequence.phases, sequence.phase_starts, sequence.phase_ends, strict=True
             )
         ]
         return make_trajectory(sequence, samples)
 
     def make_template(x: Array, *_: Array) -> Trajectory:
-        rows = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
+        make_rows = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
         n = n_samples
-        sample_arrays = rows(n), rows(n, 6), rows(n, 4), rows(n, 3)
-        return Trajectory(*sample_arrays, rows(), rows(), jnp.zeros_like(x, jnp.int32))
+        sample_arrays = make_rows(n), make_rows(n, 6), make_rows(n, 4), make_rows(n, 3)
+        return Trajectory(*sample_arrays, make_rows(), make_rows(), jnp.zeros_like(x, jnp.int32))
 
     return unbatch(
-        cached_lane_function(
-            sample_lanes_of_step, make_template, ("samples", *config.cache_key, n_samples)
-        )
+        cached_lane_function(sample_lanes, make_template, ("samples", *config.cache_key, n_samples))
     )
 
 
 def build_step_jacobian(
-    structure: Any, stop_at_lift_off: bool, friction: float | None, input_indices: tuple[int, ...]
+    argument_structure: Any,
+    stop_at_lift_off: bool,
+    friction: float | None,
+    input_indices: tuple[int, ...],
 ) -> ForwardFunction:
     """Return the Jacobian of `build_step_function`.
 
     It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
     """
-    config = _StaticConfig(structure, stop_at_lift_off, friction)
+    config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
 
     def tighten_tolerances(*leaves: Array) -> list[Array]:
-        params, x, options = jax.tree.unflatten(structure, leaves)
+        params, x, options = jax.tree.unflatten(argument_structure, leaves)
         return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
 
     def make_template(*leaves: Array) -> tuple:
-        value, other = config.make_template(*leaves)
-        return value, value, other
+        value, other_outputs = config.make_template(*leaves)
+        return value, value, other_outputs
 
-    evaluate_lanes = lambda *leaves: jacobian_columns(config.compute_outputs, leaves, input_indices)
+    evaluate_lanes = lambda *leaves: compute_jacobian_columns(
+        config.compute_outputs, leaves, input_indices
+    )
     cache_key = ("gait step with derivatives", *config.cache_key, input_indices)
-    calls = {
+    compiled_by_size = {
         n: unbatch(
             cached_lane_function(evaluate_lanes, make_template, cache_key, simd.RegisterLimits(n))
         )
@@ -464,26 +490,28 @@ def build_step_jacobian(
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
         n_directions = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
-        evaluate = calls[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
-        columns, value, other = evaluate(*tighten_tolerances(*leaves))
-        return (split_jacobian(columns, leaves, input_indices), value), other
+        evaluate_columns = compiled_by_size[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
+        jacobian_columns, value, other_outputs = evaluate_columns(*tighten_tolerances(*leaves))
+        return (split_jacobian(jacobian_columns, leaves, input_indices), value), other_outputs
 
     return evaluate_jacobian
 
 
-def split_jacobian(columns: Any, leaves: Sequence[Array], input_indices: Sequence[int]) -> tuple:
+def split_jacobian(
+    jacobian_columns: Any, leaves: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
     """Return a Jacobian leaf by leaf; its leading axis runs over all entries of the selected
     leaves.
     """
     jacobians, offset = [], 0
     for i in input_indices:
         shape = jnp.shape(leaves[i])
-        index_range = slice(offset, offset + int(np.prod(shape)))
-        select_columns = lambda x, index_range=index_range, shape=shape: jnp.moveaxis(
-            x[index_range], 0, -1
+        column_range = slice(offset, offset + int(np.prod(shape)))
+        select_columns = lambda x, column_range=column_range, shape=shape: jnp.moveaxis(
+            x[column_range], 0, -1
         ).reshape(*x.shape[1:], *shape)
-        jacobians.append(jax.tree.map(select_columns, columns))
-        offset = index_range.stop
+        jacobians.append(jax.tree.map(select_columns, jacobian_columns))
+        offset = column_range.stop
     return tuple(jacobians)
 
 
@@ -492,8 +520,8 @@ N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
 the slope of the next line. Machine code keeps one number per derivative in registers."""
 
 
-def jacobian_columns(
-    function: BatchFunction, leaves: Sequence[Array], input_indices: Sequence[int]
+def compute_jacobian_columns(
+    batch_function: BatchFunction, leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
     """Return the columns of the Jacobian of `function(*leaves)`, and its results.
 
@@ -501,16 +529,18 @@ def jacobian_columns(
     returns floats over lanes and auxiliary outputs.
     """
 
-    def evaluate_at(*values: Array) -> tuple:
-        inputs = list(leaves)
-        for i, leaf in zip(input_indices, values, strict=True):
-            inputs[i] = leaf
-        return function(*inputs)
+    def evaluate_at(*selected_leaves: Array) -> tuple:
+        all_leaves = list(leaves)
+        for i, leaf in zip(input_indices, selected_leaves, strict=True):
+            all_leaves[i] = leaf
+        return batch_function(*all_leaves)
 
     primals = [leaves[i] for i in input_indices]
-    jvp_along = lambda tangents: jax.jvp(evaluate_at, primals, tangents, has_aux=True)
-    value, columns, aux = jax.vmap(jvp_along, out_axes=(None, 0, None))(_unit_tangents(primals))
-    return columns, value, aux
+    compute_jvp = lambda tangents: jax.jvp(evaluate_at, primals, tangents, has_aux=True)
+    value, jacobian_columns, other_outputs = jax.vmap(compute_jvp, out_axes=(None, 0, None))(
+        _unit_tangents(primals)
+    )
+    return jacobian_columns, value, other_outputs
 
 
 def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
@@ -519,10 +549,16 @@ def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
     Each number has its own ones and zeros, so that machine code omits products with them.
     """
     sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
-    units, tangents, offset = np.eye(sum(sizes)), [], 0
+    unit_vectors, tangents, entry_offset = np.eye(sum(sizes)), [], 0
     for leaf, size in zip(leaves, sizes, strict=True):
-        rows = [jnp.asarray(units[:, i], leaf.dtype)[:, None] for i in range(offset, offset + size)]
-        broadcast_rows = [jnp.broadcast_to(row, (len(units), leaf.shape[-1])) for row in rows]
-        tangents.append(broadcast_rows[0] if leaf.ndim == 1 else jnp.stack(broadcast_rows, 1))
-        offset += size
+        entry_tangents = [
+            jnp.asarray(unit_vectors[:, i], leaf.dtype)[:, None]
+            for i in range(entry_offset, entry_offset + size)
+        ]
+        lane_tangents = [
+            jnp.broadcast_to(entry_tangent, (len(unit_vectors), leaf.shape[-1]))
+            for entry_tangent in entry_tangents
+        ]
+        tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
+        entry_offset += size
     return tangents

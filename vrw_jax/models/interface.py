@@ -64,11 +64,11 @@ class AbstractWheel(eqx.Module):
 
     def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
         """Return the values of `parameter_names`, for one wheel on this ground."""
-        numbers = [
+        parameters = [
             getattr(self if name == FRICTION_NAME else params, name)
             for name in self.parameter_names
         ]
-        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in numbers])
+        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in parameters])
 
     def from_values(
         self, values: Array | tuple[Array, ...], n_legs: int

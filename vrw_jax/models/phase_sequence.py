@@ -36,7 +36,7 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-SAFE_SINGLE_SUPPORT = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
+SAFE_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """A regular posture (theta, L1, L2 and rates) that replaces the state of a wheel whose step has
 failed; it is never integrated."""
 
@@ -64,15 +64,15 @@ class PhaseSequenceResult(NamedTuple):
     s: Symbols
     landing: Landing
     phases: tuple[AbstractPhase, ...]
-    starts: tuple[tuple[Vector, Vector], ...]
-    ends: tuple[PhaseResult, ...]
+    phase_starts: tuple[tuple[Vector, Vector], ...]
+    phase_ends: tuple[PhaseResult, ...]
     phases_happened: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
     tilt: Elementwise | None = None  # by which the next line is steeper, rad; None: flat ground
 
 
 def run_phases(
-    run: PhaseRunner,
+    run_phase: PhaseRunner,
     params: WheelParams,
     x: StateValues,
     options: StepOptions,
@@ -88,59 +88,71 @@ def run_phases(
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
     s = params.symbols()
     landing = land(s, *x)
-    turn = () if tilt is None else sine_cosine(tilt)
-    phases = make_phases(s, landing.distance, stop_at_lift_off, turn)
+    tilt_sin_cos = () if tilt is None else sine_cosine(tilt)
+    phases = make_phases(s, landing.distance, stop_at_lift_off, tilt_sin_cos)
     theta, motion = landing.theta, landing.motion
     # A landing that releases the rear foot continues in SLS-I.
     is_active = is_valid & landing.keeps_rear_foot
-    outcome_code = jnp.where(is_valid, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
-    starts, phases_happened = [], []
-    ends: list[PhaseResult] = []
+    outcome = jnp.where(is_valid, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
+    phase_starts, phases_happened = [], []
+    phase_ends: list[PhaseResult] = []
     for previous_phase, phase in zip((None, *phases), phases, strict=False):
         if previous_phase is not None:
-            end_state = ends[-1].q[0], previous_phase.motion_at(ends[-1].q, ends[-1].v)
-            theta, motion = tree_where(is_active, end_state, (theta, motion))
-            is_active = outcome_code == Outcome.STEPPED
-            safe_theta, *safe_others = (
-                jnp.asarray(value, jnp.result_type(theta)) for value in SAFE_SINGLE_SUPPORT
+            end_state = (
+                phase_ends[-1].q[0],
+                previous_phase.motion_at(phase_ends[-1].q, phase_ends[-1].v),
             )
-            safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_others)
+            theta, motion = tree_where(is_active, end_state, (theta, motion))
+            is_active = outcome == Outcome.STEPPED
+            safe_theta, *safe_lengths_and_rates = (
+                jnp.asarray(value, jnp.result_type(theta)) for value in SAFE_SINGLE_SUPPORT_STATE
+            )
+            safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_lengths_and_rates)
             theta, motion = tree_where(is_active, (theta, motion), safe_state)
             motion = previous_phase.reset_map(motion)
-        start = phase.own_coordinates(theta, motion)
-        end = run(phase, *start, is_active, ends[-1] if ends else None)
-        outcome_of_end = phase.outcome_of_guard(end.guard, end.is_timed_out)
+        start_state = phase.own_coordinates(theta, motion)
+        phase_end = run_phase(
+            phase, *start_state, is_active, phase_ends[-1] if phase_ends else None
+        )
+        phase_outcome = phase.outcome_of_guard(phase_end.guard, phase_end.is_timed_out)
         if phase.can_come_to_rest:
-            is_resting = phase.is_at_rest(end.q, end.v, options.atol)
-            outcome_of_end = replace_rest_outcome(outcome_of_end, is_resting)
-        outcome_code = jnp.where(is_active, outcome_of_end, outcome_code)
-        starts.append(start)
-        ends.append(end)
+            is_at_rest = phase.is_at_rest(phase_end.q, phase_end.v, options.atol)
+            phase_outcome = replace_rest_outcome(phase_outcome, is_at_rest)
+        outcome = jnp.where(is_active, phase_outcome, outcome)
+        phase_starts.append(start_state)
+        phase_ends.append(phase_end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.
         phases_happened.append(
-            is_active if phase is phases[-1] else is_active & (end.duration > 0.0)
+            is_active if phase is phases[-1] else is_active & (phase_end.duration > 0.0)
         )
     return PhaseSequenceResult(
-        s, landing, phases, tuple(starts), tuple(ends), tuple(phases_happened), outcome_code, tilt
+        s,
+        landing,
+        phases,
+        tuple(phase_starts),
+        tuple(phase_ends),
+        tuple(phases_happened),
+        outcome,
+        tilt,
     )
 
 
-def next_section(sequence: PhaseSequenceResult) -> Vector:
+def next_section_state(sequence: PhaseSequenceResult) -> Vector:
     """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line that is
     reached.
     """
-    theta, rates = sequence.ends[2].q[0], sequence.ends[2].v
+    theta, rates = sequence.phase_ends[2].q[0], sequence.phase_ends[2].v
     return (theta if sequence.tilt is None else theta - sequence.tilt), *rates
 
 
 def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
     """Return the minimal result; its section state is zero if the step failed."""
-    theta, dtheta, dL1 = next_section(sequence)
+    theta, dtheta, dL1 = next_section_state(sequence)
     has_stepped = sequence.outcome == Outcome.STEPPED
-    solver_steps = [end.n_solver_steps for end in sequence.ends]
+    solver_steps = [end.n_solver_steps for end in sequence.phase_ends]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in (theta, dtheta, dL1)]),
-        durations=jnp.stack([end.duration for end in sequence.ends]),
+        durations=jnp.stack([end.duration for end in sequence.phase_ends]),
         outcome=sequence.outcome,
         solver_steps=solver_steps[0] + solver_steps[1] + solver_steps[2],
         engine=engine,
@@ -151,42 +163,48 @@ def make_step_result(
     sequence: PhaseSequenceResult, friction: Elementwise | float, engine: str
 ) -> StepResult:
     """Return the full result, for one wheel or a batch; the margins must have been recorded."""
-    s, landing, ends = sequence.s, sequence.landing, sequence.ends
+    s, landing, phase_ends = sequence.s, sequence.landing, sequence.phase_ends
     has_begun = sequence.outcome != Outcome.BAD_INPUT
     hits_stopper, has_stepped = sequence.phases_happened[2], sequence.outcome == Outcome.STEPPED
     dls, sls1, sls2 = make_phases(s, landing.distance, stop_at_lift_off=True)
-    liftoff_motion = dls.motion_at(ends[0].q, ends[0].v)
-    at_stopper = [
-        jnp.where(hits_stopper, x, jnp.asarray(fallback, x.dtype))
-        for x, fallback in zip((*ends[1].q, *ends[1].v), SAFE_SINGLE_SUPPORT, strict=True)
+    liftoff_motion = dls.motion_at(phase_ends[0].q, phase_ends[0].v)
+    stopper_state = [
+        jnp.where(hits_stopper, x, jnp.asarray(safe_value, x.dtype))
+        for x, safe_value in zip(
+            (*phase_ends[1].q, *phase_ends[1].v), SAFE_SINGLE_SUPPORT_STATE, strict=True
+        )
     ]
-    hit = transitions.hit_stopper(s, sls1.motion_at(tuple(at_stopper[:3]), tuple(at_stopper[3:])))
-    last_motion = sls2.motion_at(ends[2].q, ends[2].v)
+    stopper_hit = transitions.hit_stopper(
+        s, sls1.motion_at(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
+    )
+    last_motion = sls2.motion_at(phase_ends[2].q, phase_ends[2].v)
     initial_energy, final_energy = (
         dynamics.mechanical_energy(s, m).total for m in (landing.motion, last_motion)
     )
     fore_force, rear_force = transitions.landing_forces(s, landing)
-    advance = make_advance_result(sequence, engine)
+    advance_result = make_advance_result(sequence, engine)
     return StepResult(
-        section_state=advance.section_state,
+        section_state=advance_result.section_state,
         post_impact=jnp.stack(
             [jnp.where(has_begun, x, 0.0) for x in (landing.theta, landing.motion.dtheta)]
         ),
-        durations=advance.durations,
+        durations=advance_result.durations,
         step_length=jnp.where(has_begun, landing.distance, 0.0),
         indicators=DoubleSupportIndicators(
             lambda_I4=jnp.where(has_begun, landing.rear_impulse.normal, 0.0),
             lambda_2=jnp.where(has_begun, fore_force.normal, 0.0),
             lambda_4=jnp.where(has_begun, rear_force.normal, 0.0),
         ),
-        margins=_make_margins(sequence, rear_force, liftoff_motion, hit, friction),
+        margins=_make_margins(sequence, rear_force, liftoff_motion, stopper_hit, friction),
         energy=EnergyLoss(
             landing=jnp.where(has_begun, landing.energy_lost, 0.0),
-            stopper=jnp.where(hits_stopper, hit.energy_lost, 0.0),
-            damping=jnp.where(has_stepped, initial_energy - final_energy - hit.energy_lost, 0.0),
+            stopper=jnp.where(hits_stopper, stopper_hit.energy_lost, 0.0),
+            damping=jnp.where(
+                has_stepped, initial_energy - final_energy - stopper_hit.energy_lost, 0.0
+            ),
         ),
-        outcome=advance.outcome,
-        solver_steps=advance.solver_steps,
+        outcome=advance_result.outcome,
+        solver_steps=advance_result.solver_steps,
         engine=engine,
     )
 
@@ -196,20 +214,22 @@ def make_trajectory(sequence: PhaseSequenceResult, samples: Sequence[Array]) -> 
 
     - `samples`: of each phase, with axes (sample, coordinates and rates, ...).
     """
-    advance = make_advance_result(sequence, "")
-    durations, n = advance.durations, len(samples[0])
+    advance_result = make_advance_result(sequence, "")
+    durations, n_samples = advance_result.durations, len(samples[0])
     start_times = jnp.stack([0.0 * durations[0], durations[0], durations[0] + durations[1]])
-    fractions = jnp.linspace(0.0, 1.0, n).reshape(-1, *(1 for _ in durations.shape[1:]))
+    time_fractions = jnp.linspace(0.0, 1.0, n_samples).reshape(
+        -1, *(1 for _ in durations.shape[1:])
+    )
     phase_arrays = [
         evaluate_states(phase, jnp.moveaxis(states, 1, 0))
         for phase, states in zip(sequence.phases, samples, strict=True)
     ]
     states, forces, energies = (
-        jnp.stack([jnp.moveaxis(rows, 0, 1) for rows in arrays])
+        jnp.stack([jnp.moveaxis(phase_rows, 0, 1) for phase_rows in arrays])
         for arrays in zip(*phase_arrays, strict=True)
     )
-    times = start_times[:, None] + fractions * durations[:, None]
-    end_state = advance.section_state, durations, advance.outcome
+    times = start_times[:, None] + time_fractions * durations[:, None]
+    end_state = advance_result.section_state, durations, advance_result.outcome
     return Trajectory(times, states, forces, energies, *end_state)
 
 
@@ -234,7 +254,7 @@ def _make_margins(
     sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
-    hit: transitions.StopperHit,
+    stopper_hit: transitions.StopperHit,
     friction: Elementwise | float,
 ) -> Margins:
     """Return the margins of the step.
@@ -244,15 +264,19 @@ def _make_margins(
     """
     s, landing, phases_happened = sequence.s, sequence.landing, sequence.phases_happened
     has_begun, hits_stopper = sequence.outcome != Outcome.BAD_INPUT, phases_happened[2]
-    margin_rows = [end.margin_minima for end in sequence.ends if end.margin_minima is not None]
-    minima = [PhaseMargins.from_values(tuple(rows), s.n) for rows in margin_rows]
+    margin_rows = [
+        end.margin_minima for end in sequence.phase_ends if end.margin_minima is not None
+    ]
+    phase_minima = [PhaseMargins.from_values(tuple(rows), s.n) for rows in margin_rows]
 
-    def lowest_margin(name: str, *indices: int) -> Array:
+    def lowest_margin(margin_name: str, *phase_indices: int) -> Array:
         """Return the minimum over those phases that happened; 0 if none did."""
         value: Any = jnp.inf
-        for index in indices:
-            phase_minimum = jnp.asarray(getattr(minima[index], name))
-            value = jnp.minimum(value, jnp.where(phases_happened[index], phase_minimum, jnp.inf))
+        for phase_index in phase_indices:
+            phase_minimum = jnp.asarray(getattr(phase_minima[phase_index], margin_name))
+            value = jnp.minimum(
+                value, jnp.where(phases_happened[phase_index], phase_minimum, jnp.inf)
+            )
         return jnp.where(jnp.isfinite(value), value, 0.0)
 
     def friction_margin(force: dynamics.FootForce, is_loaded: Array) -> Array:
@@ -278,8 +302,10 @@ def _make_margins(
         friction_fore=jnp.where(has_begun, friction + lowest_margin("friction", 0, 1, 2), 0.0),
         friction_rear=friction_margin(rear_force, phases_happened[0]),
         landing_stopper_impulse=stopper_impulses(landing.motion, landing.hub_jump, has_begun),
-        hit_stopper_impulse=stopper_impulses(hit.motion, hit.hub_jump, hits_stopper),
-        hit_planted_impulse=jnp.where(hits_stopper, hit.foot_impulse.normal, 0.0),
+        hit_stopper_impulse=stopper_impulses(
+            stopper_hit.motion, stopper_hit.hub_jump, hits_stopper
+        ),
+        hit_planted_impulse=jnp.where(hits_stopper, stopper_hit.foot_impulse.normal, 0.0),
         landing_friction_fore=friction_margin(landing.fore_impulse, has_begun),
         landing_friction_rear=friction_margin(
             landing.rear_impulse, has_begun & landing.keeps_rear_foot

@@ -42,18 +42,18 @@ from vrw_jax.wheel import (
 
 
 @dataclass(frozen=True)
-class ZoomOptions:
+class MinimumSearchOptions:
     """Search for the minima of margins over the angle, by repeated zooming."""
 
     n_angles: int = 33
     """Number of angles in each round, chosen because forces are smooth over the 45 degrees of a
     step."""
-    n_rounds: int = 5
+    n_zoom_rounds: int = 5
     """Number of rounds, chosen because the angle is then accurate to 1e-6 rad, and the error of a
     minimum is the square of that."""
 
 
-ZOOM_OPTIONS = ZoomOptions()
+MINIMUM_SEARCH_OPTIONS = MinimumSearchOptions()
 
 
 class RigidWheel(AbstractWheel):
@@ -124,66 +124,77 @@ class RigidWheel(AbstractWheel):
 
     @eqx.filter_jit
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
-        return self.step_elementwise(params, tuple(x), jnp.asarray(self.friction, x.dtype))
+        return self.compute_step_elementwise(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
-    def step_elementwise(
+    def compute_step_elementwise(
         self, params: WheelParams, x: StateValues, friction: Elementwise
     ) -> StepResult:
         """Return the step elementwise: for one wheel or for a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
         params, is_valid, tilt = select_line(params, x)
-        end = half_angle if tilt is None else half_angle + tilt
+        end_angle = half_angle if tilt is None else half_angle + tilt
         params, x = replace_invalid(is_valid, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
         rate_before, rate_after = x[1], self._rate_ratio(s) * x[1]
-        rolling = RollingMotion(s, params.slope, rate_after, None if tilt is None else end)
+        rolling_motion = RollingMotion(
+            s, params.slope, rate_after, None if tilt is None else end_angle
+        )
 
-        apex = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
-        passes_apex = rolling.rate_squared(apex) > 0.0
-        margin_minima = rolling.margin_minima()
-        lifts_off = (margin_minima[0] <= 0.0) & passes_apex & self.stop_at_lift_off
+        apex_angle = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
+        passes_apex = rolling_motion.rate_squared_at_angle(apex_angle) > 0.0
+        margin_minima = rolling_motion.find_margin_minima()
+        has_lifted_off = (margin_minima[0] <= 0.0) & passes_apex & self.stop_at_lift_off
         outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
-        outcome = jnp.where(lifts_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
         outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
         has_stepped = outcome == Outcome.STEPPED
-        safe_rolling = RollingMotion(s, params.slope, jnp.where(passes_apex, rate_after, 10.0))
-        rate_end, duration = jnp.sqrt(safe_rolling.rate_squared(end)), safe_rolling.time(end)
+        safe_rolling_motion = RollingMotion(
+            s, params.slope, jnp.where(passes_apex, rate_after, 10.0)
+        )
+        end_rate, duration = (
+            jnp.sqrt(safe_rolling_motion.rate_squared_at_angle(end_angle)),
+            safe_rolling_motion.time_at_angle(end_angle),
+        )
 
         zero = jnp.zeros_like(rate_before)
-        if_valid = lambda value: jnp.where(is_valid, value, jnp.zeros_like(value))
-        if_stepped = lambda value: jnp.where(has_stepped, value, jnp.zeros_like(value))
+        zero_if_invalid = lambda value: jnp.where(is_valid, value, jnp.zeros_like(value))
+        zero_unless_stepped = lambda value: jnp.where(has_stepped, value, jnp.zeros_like(value))
         rear_impulse, friction_margins, stopper_impulse = self._landing_impulses(
-            s, x, rolling, friction
+            s, x, rolling_motion, friction
         )
         return StepResult(
-            section_state=if_stepped(jnp.stack([half_angle + zero, rate_end, zero])),
-            post_impact=if_valid(jnp.stack([-half_angle + zero, rate_after])),
-            durations=if_stepped(jnp.stack([zero, zero, duration])),
-            step_length=if_valid(2.0 * s.L0 * jnp.sin(half_angle)),
+            section_state=zero_unless_stepped(jnp.stack([half_angle + zero, end_rate, zero])),
+            post_impact=zero_if_invalid(jnp.stack([-half_angle + zero, rate_after])),
+            durations=zero_unless_stepped(jnp.stack([zero, zero, duration])),
+            step_length=zero_if_invalid(2.0 * s.L0 * jnp.sin(half_angle)),
             indicators=DoubleSupportIndicators(
-                lambda_I4=if_valid(rear_impulse.normal),
-                lambda_2=if_valid(rolling.foot_force(-half_angle + zero).normal),
+                lambda_I4=zero_if_invalid(rear_impulse.normal),
+                lambda_2=zero_if_invalid(
+                    rolling_motion.foot_force_at_angle(-half_angle + zero).normal
+                ),
                 lambda_4=zero,
             ),
             margins=Margins(
-                fore_foot_force=if_stepped(margin_minima[0]),
+                fore_foot_force=zero_unless_stepped(margin_minima[0]),
                 takeoff_acceleration=zero,
                 clearance_sls1=zero,
-                clearance_sls2=if_stepped(rear_foot_height(s, rolling.motion(end + zero))),
-                locked_stopper_force=if_stepped(margin_minima[3:]),
-                rear_stopper_force=if_stepped(margin_minima[2]),
+                clearance_sls2=zero_unless_stepped(
+                    rear_foot_height(s, rolling_motion.motion_at_angle(end_angle + zero))
+                ),
+                locked_stopper_force=zero_unless_stepped(margin_minima[3:]),
+                rear_stopper_force=zero_unless_stepped(margin_minima[2]),
                 contraction=zero,
-                friction_fore=if_stepped(friction + margin_minima[1]),
-                friction_rear=if_valid(friction + zero),
-                landing_stopper_impulse=if_valid(stopper_impulse),
+                friction_fore=zero_unless_stepped(friction + margin_minima[1]),
+                friction_rear=zero_if_invalid(friction + zero),
+                landing_stopper_impulse=zero_if_invalid(stopper_impulse),
                 hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
                 hit_planted_impulse=zero,
-                landing_friction_fore=if_valid(friction_margins[0]),
-                landing_friction_rear=if_valid(friction_margins[1]),
+                landing_friction_fore=zero_if_invalid(friction_margins[0]),
+                landing_friction_rear=zero_if_invalid(friction_margins[1]),
             ),
             energy=EnergyLoss(
-                landing=if_valid(
+                landing=zero_if_invalid(
                     0.5 * _foot_inertia(s) * (rate_before * rate_before - rate_after * rate_after)
                 ),
                 stopper=zero,
@@ -194,7 +205,7 @@ class RigidWheel(AbstractWheel):
         )
 
     def _landing_impulses(
-        self, s: Symbols, x: StateValues, rolling: "RollingMotion", friction: Elementwise
+        self, s: Symbols, x: StateValues, rolling_motion: "RollingMotion", friction: Elementwise
     ) -> tuple:
         """Return the landing impulses and friction margins.
 
@@ -202,23 +213,30 @@ class RigidWheel(AbstractWheel):
         the impulses of the stoppers of legs 3..n.
         """
         zero = jnp.zeros_like(x[1])
-        motion_after = rolling.motion(-jnp.asarray(0.5 * s.alpha, zero.dtype) + zero)
+        motion_after = rolling_motion.motion_at_angle(
+            -jnp.asarray(0.5 * s.alpha, zero.dtype) + zero
+        )
         hub_jump = transitions.hub_velocity_jump(
             transitions.motion_before_landing(s, *x), motion_after
         )
-        is_held = self.held_landing
+        holds_rear_foot = self.held_landing
         rear_impulse = (
-            transitions.land(s, *x).rear_impulse if is_held else dynamics.FootForce(zero, zero)
+            transitions.land(s, *x).rear_impulse
+            if holds_rear_foot
+            else dynamics.FootForce(zero, zero)
         )
         # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
         fore_impulse = dynamics.FootForce(
             s.Mt * hub_jump[0] - rear_impulse.tangential, s.Mt * hub_jump[1] - rear_impulse.normal
         )
         friction_margins = tuple(
-            friction - dynamics.required_friction(foot) for foot in (fore_impulse, rear_impulse)
+            friction - dynamics.required_friction(foot_impulse)
+            for foot_impulse in (fore_impulse, rear_impulse)
         )
-        impulse = transitions.locked_leg_impulses(s, motion_after, hub_jump, range(3, s.n + 1))
-        return rear_impulse, friction_margins, impulse
+        stopper_impulses = transitions.locked_leg_impulses(
+            s, motion_after, hub_jump, range(3, s.n + 1)
+        )
+        return rear_impulse, friction_margins, stopper_impulses
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
@@ -227,21 +245,21 @@ class RigidWheel(AbstractWheel):
         result = self.take_step(params, x, options)
         params, next_slope = split_slopes(params)
         s, half_angle = params.symbols(), 0.5 * params.leg_angle
-        end = half_angle if next_slope is None else half_angle + next_slope - params.slope
-        rolling = RollingMotion(s, params.slope, result.post_impact[1])
+        end_angle = half_angle if next_slope is None else half_angle + next_slope - params.slope
+        rolling_motion = RollingMotion(s, params.slope, result.post_impact[1])
         start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
         rolling_angles = jnp.where(
             result.outcome == Outcome.STEPPED,
-            jnp.linspace(-0.5 * s.alpha, end, n_samples),
+            jnp.linspace(-0.5 * s.alpha, end_angle, n_samples),
             start_angles,
         )
         angles = jnp.stack([start_angles, start_angles, rolling_angles])
 
         state, forces, energy = (
-            jnp.moveaxis(rows, 0, -1) for rows in rolling.evaluate_states(angles)
+            jnp.moveaxis(rows, 0, -1) for rows in rolling_motion.evaluate_states(angles)
         )
         end_state = result.section_state, result.durations, result.outcome
-        return Trajectory(rolling.time(angles), state, forces, energy, *end_state)
+        return Trajectory(rolling_motion.time_at_angle(angles), state, forces, energy, *end_state)
 
 
 class RollingMotion(eqx.Module):
@@ -250,16 +268,16 @@ class RollingMotion(eqx.Module):
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at theta = -alpha/2, rad/s
-    end: Elementwise | None = None
+    end_angle: Elementwise | None = None
     """Angle theta at the next landing, rad; None is alpha/2, as on flat ground."""
 
-    def rate_squared(self, theta: Elementwise) -> Elementwise:
+    def rate_squared_at_angle(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta; negative where the wheel does not arrive."""
         s = self.s
-        height_drop = _cos_of_sum(s, -0.5 * s.alpha) - _cos_of_sum(s, theta)
+        height_drop = _cos_from_vertical(s, -0.5 * s.alpha) - _cos_from_vertical(s, theta)
         return self.initial_rate**2 + 2.0 * _gravity_stiffness(s) * height_drop
 
-    def time(self, theta: Elementwise) -> Elementwise:
+    def time_at_angle(self, theta: Elementwise) -> Elementwise:
         """Return the time from theta = -alpha/2, s, by Carlson's R_F.
 
         With t = sin^2 of half the angle from the vertical, the rate is the square root of a linear
@@ -267,89 +285,122 @@ class RollingMotion(eqx.Module):
         """
         s = self.s
         kappa = 2.0 * _gravity_stiffness(s)
-        begin, end = 0.5 * (self.phi - 0.5 * s.alpha), 0.5 * (self.phi + theta)
+        begin_half_angle, end_half_angle = (
+            0.5 * (self.phi - 0.5 * s.alpha),
+            0.5 * (self.phi + theta),
+        )
         # Squared rate at the vertical.
-        min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin) - 1.0)
-        is_across_vertical = begin * end < 0.0
-        from_vertical = jnp.zeros_like(end)
-        main_time = _elliptic_time(
-            jnp.where(is_across_vertical, from_vertical, jnp.minimum(begin**2, end**2)),
-            jnp.where(is_across_vertical, end**2, jnp.maximum(begin**2, end**2)),
+        min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin_half_angle) - 1.0)
+        is_across_vertical = begin_half_angle * end_half_angle < 0.0
+        zero_squared = jnp.zeros_like(end_half_angle)
+        time_to_end = _rolling_time(
+            jnp.where(
+                is_across_vertical,
+                zero_squared,
+                jnp.minimum(begin_half_angle**2, end_half_angle**2),
+            ),
+            jnp.where(
+                is_across_vertical,
+                end_half_angle**2,
+                jnp.maximum(begin_half_angle**2, end_half_angle**2),
+            ),
             min_rate_squared,
             kappa,
         )
-        extra_time = _elliptic_time(
-            from_vertical, jnp.where(is_across_vertical, begin**2, 0.0), min_rate_squared, kappa
+        time_to_vertical = _rolling_time(
+            zero_squared,
+            jnp.where(is_across_vertical, begin_half_angle**2, 0.0),
+            min_rate_squared,
+            kappa,
         )
-        return main_time + extra_time
+        return time_to_end + time_to_vertical
 
-    def motion(self, theta: Elementwise) -> Motion:
+    def motion_at_angle(self, theta: Elementwise) -> Motion:
         """Return the motion at theta; its rate is zero where the wheel does not arrive."""
         zero = 0.0 * theta
-        speed_squared = self.rate_squared(theta)
+        speed_squared = self.rate_squared_at_angle(theta)
         is_moving = speed_squared > 0.0
         rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, speed_squared, 1.0)), 0.0)
-        length = self.s.L0 + zero
-        return Motion.from_angle(theta, length, length, rate, zero, zero)
+        leg_length = self.s.L0 + zero
+        return Motion.from_angle(theta, leg_length, leg_length, rate, zero, zero)
 
-    def acceleration(self, theta: Elementwise) -> dynamics.Acceleration:
+    def acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
         """Return the angular acceleration under gravity; the legs do not move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_gravity_stiffness(self.s) * sin_p, zero, zero)
 
-    def foot_force(self, theta: Elementwise) -> dynamics.FootForce:
+    def foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
         """Return the force of the ground on the stance foot, N."""
-        return dynamics.fore_foot_force(self.s, self.motion(theta), self.acceleration(theta))
+        return dynamics.fore_foot_force(
+            self.s, self.motion_at_angle(theta), self.acceleration_at_angle(theta)
+        )
 
-    def stopper_force(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
+    def stopper_force_at_angle(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
         """Return the force of the stoppers of `legs`, N."""
-        return dynamics.stopper_force(self.s, self.motion(theta), self.acceleration(theta), legs)
+        return dynamics.stopper_force(
+            self.s, self.motion_at_angle(theta), self.acceleration_at_angle(theta), legs
+        )
 
     def evaluate_states(self, theta: Elementwise) -> tuple[Array, Array, Array]:
         """Return coordinates with rates, forces of both feet and energies at theta, as rows."""
-        motion, foot_force, zero = self.motion(theta), self.foot_force(theta), 0.0 * theta
+        motion, foot_force, zero = (
+            self.motion_at_angle(theta),
+            self.foot_force_at_angle(theta),
+            0.0 * theta,
+        )
         state = jnp.stack([theta, motion.L1, motion.L2, motion.dtheta, motion.dL1, motion.dL2])
         forces = jnp.stack([foot_force.tangential, foot_force.normal, zero, zero])
         return state, forces, jnp.stack(dynamics.mechanical_energy(self.s, motion))
 
-    def margins(self, theta: Array) -> Array:
+    def margins_at_angles(self, theta: Array) -> Array:
         """Return the margins, each at its own angle.
 
         They are the normal force, minus the required friction, and the stopper forces of legs 2..n.
         """
-        stoppers = [
-            self.stopper_force(theta[leg], range(leg, leg + 1))[0] for leg in range(2, self.s.n + 1)
+        stopper_forces = [
+            self.stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
+            for leg in range(2, self.s.n + 1)
         ]
-        required = dynamics.required_friction(self.foot_force(theta[1]))
-        return jnp.stack([self.foot_force(theta[0]).normal, -required, *stoppers])
+        required_friction = dynamics.required_friction(self.foot_force_at_angle(theta[1]))
+        return jnp.stack(
+            [self.foot_force_at_angle(theta[0]).normal, -required_friction, *stopper_forces]
+        )
 
-    def margin_minima(self, options: ZoomOptions = ZOOM_OPTIONS) -> Array:
+    def find_margin_minima(self, options: MinimumSearchOptions = MINIMUM_SEARCH_OPTIONS) -> Array:
         """Return the minima of `margins` from landing to landing, to round-off.
 
         Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
         """
         half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
-        end = half_angle if self.end is None else self.end
-        middle = 0.0 * self.initial_rate if self.end is None else 0.5 * (end - half_angle)
+        end_angle = half_angle if self.end_angle is None else self.end_angle
+        middle_angle = (
+            0.0 * self.initial_rate if self.end_angle is None else 0.5 * (end_angle - half_angle)
+        )
 
-        def zoom(_round: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-            center, width = bracket
+        def zoom_in(_round: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            center, half_width = bracket
 
-            def compare(i: Array, lowest: tuple[Array, Array]) -> tuple[Array, Array]:
-                offset = width * (i * (2.0 / (options.n_angles - 1)) - 1.0)
-                theta = jnp.clip(center + offset, -half_angle, end)
-                value = self.margins(theta)
-                return tree_where(value < lowest[1], (theta, value), lowest)
+            def compare_with_lowest(
+                i: Array, lowest_so_far: tuple[Array, Array]
+            ) -> tuple[Array, Array]:
+                angle_offset = half_width * (i * (2.0 / (options.n_angles - 1)) - 1.0)
+                theta = jnp.clip(center + angle_offset, -half_angle, end_angle)
+                value = self.margins_at_angles(theta)
+                return tree_where(value < lowest_so_far[1], (theta, value), lowest_so_far)
 
-            initial = center, jnp.full_like(center, jnp.inf)
-            lowest_theta, _ = lax.fori_loop(0, options.n_angles, compare, initial)
-            return lowest_theta, width * (2.5 / options.n_angles)
+            initial_minimum = center, jnp.full_like(center, jnp.inf)
+            lowest_theta, _ = lax.fori_loop(
+                0, options.n_angles, compare_with_lowest, initial_minimum
+            )
+            return lowest_theta, half_width * (2.5 / options.n_angles)
 
-        start_angles = jnp.stack([middle] * (1 + self.s.n))
-        width = half_angle if self.end is None else 0.5 * (half_angle + end)
-        theta, _ = lax.fori_loop(0, options.n_rounds, zoom, (start_angles, width))
-        return self.margins(lax.stop_gradient(theta))
+        start_angles = jnp.stack([middle_angle] * (1 + self.s.n))
+        half_width = half_angle if self.end_angle is None else 0.5 * (half_angle + end_angle)
+        minimum_angles, _ = lax.fori_loop(
+            0, options.n_zoom_rounds, zoom_in, (start_angles, half_width)
+        )
+        return self.margins_at_angles(lax.stop_gradient(minimum_angles))
 
 
 def _hub_inertia(s: Symbols) -> Elementwise:
@@ -370,14 +421,14 @@ def _gravity_stiffness(s: Symbols) -> Elementwise:
     return s.Mt * s.g * s.L0 / _foot_inertia(s)
 
 
-def _cos_of_sum(s: Symbols, theta: Elementwise | float) -> Elementwise:
+def _cos_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
     """Return cos(theta + phi)."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
-def _elliptic_time(
-    begin_squared: Elementwise,
-    end_squared: Elementwise,
+def _rolling_time(
+    begin_angle_squared: Elementwise,
+    end_angle_squared: Elementwise,
     min_rate_squared: Elementwise,
     kappa: Elementwise,
 ) -> Elementwise:
@@ -387,20 +438,22 @@ def _elliptic_time(
     It is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2, as 2
     R_F (DLMF 19.29.4); zero if both ends coincide.
     """
-    is_nonempty = end_squared > begin_squared
-    low = jnp.where(is_nonempty, begin_squared, 0.0)
-    high = jnp.where(is_nonempty, end_squared, 1.0)
-    is_off_vertical = low > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
-    angle_low = jnp.where(is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, low, 1.0)), 0.0)
-    angle_high = jnp.sqrt(high)
+    is_nonempty = end_angle_squared > begin_angle_squared
+    lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)
+    upper_squared = jnp.where(is_nonempty, end_angle_squared, 1.0)
+    is_off_vertical = lower_squared > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
+    angle_low = jnp.where(
+        is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, lower_squared, 1.0)), 0.0
+    )
+    angle_high = jnp.sqrt(upper_squared)
     y1, y2 = jnp.sin(angle_low), jnp.cos(angle_low)
     x1, x2 = jnp.sin(angle_high), jnp.cos(angle_high)
     y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))
     x3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * x1**2, 1e-300))
-    gap = x1**2 - y1**2
-    u12 = (x1 * x2 * y3 + y1 * y2 * x3) / gap
-    u13 = (x1 * x3 * y2 + y1 * y3 * x2) / gap
-    u23 = (x2 * x3 * y1 + y2 * y3 * x1) / gap
+    difference = x1**2 - y1**2
+    u12 = (x1 * x2 * y3 + y1 * y2 * x3) / difference
+    u13 = (x1 * x3 * y2 + y1 * y3 * x2) / difference
+    u23 = (x2 * x3 * y1 + y2 * y3 * x1) / difference
     return jnp.where(is_nonempty, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
 
 
@@ -411,13 +464,17 @@ def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
     fifth-order series is exact in float64 for arguments within ten decades of each other.
     """
 
-    def double(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def duplicate(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, y, z = xyz
         root_x, root_y, root_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
-        shift = root_x * root_y + root_y * root_z + root_z * root_x
-        return 0.25 * (x + shift), 0.25 * (y + shift), 0.25 * (z + shift)
+        duplication_shift = root_x * root_y + root_y * root_z + root_z * root_x
+        return (
+            0.25 * (x + duplication_shift),
+            0.25 * (y + duplication_shift),
+            0.25 * (z + duplication_shift),
+        )
 
-    x, y, z = lax.fori_loop(0, 12, double, (x, y, z))
+    x, y, z = lax.fori_loop(0, 12, duplicate, (x, y, z))
     mean = (x + y + z) / 3.0
     dx, dy = 1.0 - x / mean, 1.0 - y / mean
     dz = -dx - dy

@@ -63,13 +63,13 @@ def complete_slopes(slope: Array, n_steps: int) -> Array:
     return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
 
 
-def check_step_values(name: str, values: Array, n_steps: int) -> None:
+def check_step_values(quantity_name: str, values: Array, n_steps: int) -> None:
     """Raise a ValueError for an array with neither one value per step nor one more."""
     if jnp.shape(values) not in ((n_steps,), (n_steps + 1,)):
-        steps = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
+        steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
-            f"{name} has shape {jnp.shape(values)}, but {steps} of one wheel takes one number, or "
-            f"an array of {n_steps} or {n_steps + 1} over its steps: map over batches of wheels "
+            f"{quantity_name} has shape {jnp.shape(values)}, but {steps_text} of one wheel takes one "
+            f"number, or an array of {n_steps} or {n_steps + 1} over its steps: map over batches of wheels "
             "with jax.vmap."
         )
 

@@ -173,7 +173,7 @@ class AbstractStep(AbstractPrintable):
 
         Batch axes lead; legs come last.
         """
-        shared = {
+        shared_measures = {
             "dls_fraction": self.dls_fraction,
             "period": self.period,
             "speed": self.speed,
@@ -186,7 +186,7 @@ class AbstractStep(AbstractPrintable):
             "outcome": self.outcome,
             "solver_steps": self.solver_steps,
         }
-        return shared | self.model_measures()
+        return shared_measures | self.model_measures()
 
     def summary_rows(self) -> list[TextRow]:
         """Return the printable rows: measures, then margins and whether their assumptions hold."""
@@ -198,11 +198,11 @@ class AbstractStep(AbstractPrintable):
         for name, value in values.items():
             if name == "outcome":
                 continue
-            measure, lowest = MEASURES[name], float(np.min(np.asarray(value)))
-            verdict = ", holds" if lowest >= 0.0 else ", broken"
-            text = measure.format_with_unit(lowest)
+            measure, lowest_value = MEASURES[name], float(np.min(np.asarray(value)))
+            verdict_text = ", holds" if lowest_value >= 0.0 else ", broken"
+            text = measure.format_with_unit(lowest_value)
             if name in MARGIN_MEASURES:
-                rows.append((f"margin: {measure.label}", text + verdict))
+                rows.append((f"margin: {measure.label}", text + verdict_text))
             else:
                 rows.append((measure.label, text))
         return rows

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.models.batch_step import jacobian_columns
+from vrw_jax.models.batch_step import compute_jacobian_columns
 from vrw_jax.numerics import BatchFunction
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
 
@@ -29,14 +29,14 @@ class UnitScaling(NamedTuple):
     output_powers: tuple[int, ...]  # in section state and durations
 
     def subtract_columns(
-        self, remainder: Array, inputs: Sequence[Array], columns: Mapping[int, Array]
+        self, remainder: Array, inputs: Sequence[Array], known_columns: Mapping[int, Array]
     ) -> Array:
         """Return `remainder` minus the given columns, each times its input and that input's power.
 
         The argument is the output times its power. By Euler's theorem, the result is the sum of the
         same products over the columns that are not given.
         """
-        for i, column in columns.items():
+        for i, column in known_columns.items():
             if self.input_powers[i]:
                 remainder = remainder - (self.input_powers[i] * inputs[i]) * column
         return remainder
@@ -61,33 +61,35 @@ because its unit contains a length."""
 
 
 def complete_by_scaling(
-    inputs: Sequence[Array], columns: Mapping[int, Array], scaled_outputs: Mapping[int, Array]
+    inputs: Sequence[Array], known_columns: Mapping[int, Array], scaled_outputs: Mapping[int, Array]
 ) -> dict[int, Array]:
     """Return all columns; those of `SCALING_BY_PARAMETER` follow from the outputs times their
     powers.
     """
-    columns = dict(columns)
+    known_columns = dict(known_columns)
     for index, scaling in SCALING_BY_PARAMETER.items():
-        remainder = scaling.subtract_columns(scaled_outputs[index], inputs, columns)
-        columns[index] = remainder / (scaling.input_powers[index] * inputs[index])
-    return columns
+        remainder = scaling.subtract_columns(scaled_outputs[index], inputs, known_columns)
+        known_columns[index] = remainder / (scaling.input_powers[index] * inputs[index])
+    return known_columns
 
 
-def scaled_jacobian_columns(
-    function: BatchFunction, inputs: Sequence[Array], input_indices: Sequence[int]
+def complete_jacobian_columns(
+    batch_function: BatchFunction, inputs: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return `jacobian_columns` of a step's section state and durations for all inputs.
+    """Return `compute_jacobian_columns` of a step's section state and durations for all inputs.
 
     - `inputs`: parameters, then the start, then on uneven ground the slope of the next line;
     - `input_indices`: indices of all inputs, in the order of the returned columns.
     """
     computed_indices = [i for i in range(len(inputs)) if i not in SCALING_BY_PARAMETER]
-    columns, outputs, aux = jacobian_columns(function, inputs, computed_indices)
+    computed_columns, outputs, other_outputs = compute_jacobian_columns(
+        batch_function, inputs, computed_indices
+    )
     scaled_outputs = {
         i: jnp.asarray(scaling.output_powers, outputs.dtype)[:, None] * outputs
         for i, scaling in SCALING_BY_PARAMETER.items()
     }
     columns_by_input = complete_by_scaling(
-        inputs, dict(zip(computed_indices, columns, strict=True)), scaled_outputs
+        inputs, dict(zip(computed_indices, computed_columns, strict=True)), scaled_outputs
     )
-    return jnp.stack([columns_by_input[i] for i in input_indices]), outputs, aux
+    return jnp.stack([columns_by_input[i] for i in input_indices]), outputs, other_outputs

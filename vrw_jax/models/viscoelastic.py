@@ -52,7 +52,7 @@ from vrw_jax.wheel import (
 class DiffraxPhase(NamedTuple):
     """A phase for the diffrax integrator, over the state y = (q, v) as one vector."""
 
-    motion: Callable[[StateVector], Motion]
+    unpack_motion: Callable[[StateVector], Motion]
     vector_field: VectorField
     guards: MonitoredFunctions
 
@@ -63,24 +63,27 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     - `records_margins`: evaluate the phase's margins in addition to its guards.
     """
 
-    def motion(y: StateVector) -> Motion:
+    def unpack_motion(y: StateVector) -> Motion:
         coordinates = tuple(y)
         return phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
 
     def vector_field(y: StateVector) -> StateVector:
-        return jnp.stack([*y[phase.n_dof :], *phase.acceleration(motion(y))[: phase.n_dof]])
+        return jnp.stack([*y[phase.n_dof :], *phase.acceleration(unpack_motion(y))[: phase.n_dof]])
 
     def monitored_values(y: StateVector) -> Array:
-        instant = PhaseInstant(phase, motion(y), None)
+        phase_instant = PhaseInstant(phase, unpack_motion(y), None)
         return jnp.stack(
-            [*phase.guards(instant), *(phase.margins(instant) if records_margins else ())]
+            [
+                *phase.guards(phase_instant),
+                *(phase.margins(phase_instant) if records_margins else ()),
+            ]
         )
 
-    margins_counted = phase.margins_counted_at_start if records_margins else ()
+    counted_margins = phase.margins_counted_at_start if records_margins else ()
     return DiffraxPhase(
-        motion,
+        unpack_motion,
         vector_field,
-        MonitoredFunctions(monitored_values, len(phase.all_guard_outcomes), margins_counted),
+        MonitoredFunctions(monitored_values, len(phase.all_guard_outcomes), counted_margins),
     )
 
 
@@ -136,16 +139,18 @@ class ViscoelasticWheel(AbstractWheel):
     ) -> Trajectory:
         leaves, structure = jax.tree.flatten((params, x, options))
         if can_use_lanes(options):
-            sample = build_step_sampler(structure, self.stop_at_lift_off, n_samples)
+            sampler = build_step_sampler(structure, self.stop_at_lift_off, n_samples)
         else:
-            sample = functools.partial(self._sample_with_diffrax, structure, n_samples)
-        return sample(*leaves)
+            sampler = functools.partial(self._sample_with_diffrax, structure, n_samples)
+        return sampler(*leaves)
 
     def _sample_with_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
         """Return the sampled step, integrated by diffrax."""
         params, x, options = jax.tree.unflatten(structure, leaves)
         sequence, samples = self._run_phases(params, x, options, records_margins=False), []
-        for phase, start, end in zip(sequence.phases, sequence.starts, sequence.ends, strict=True):
+        for phase, start, end in zip(
+            sequence.phases, sequence.phase_starts, sequence.phase_ends, strict=True
+        ):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
             y = jnp.stack([*start[0], *start[1]])
             units = jnp.stack(phase.coordinate_units), compute_own_units(phase.s).time
@@ -160,27 +165,27 @@ class ViscoelasticWheel(AbstractWheel):
         """Return all phases of the step, integrated by diffrax."""
 
         def run_phase(
-            phase: AbstractPhase, q: Vector, v: Vector, active: Array, _: PhaseResult | None
+            phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
         ) -> PhaseResult:
             diffrax_phase = make_diffrax_phase(phase, records_margins)
-            end = integrate_in_units(
+            phase_end = integrate_in_units(
                 diffrax_phase.vector_field,
                 diffrax_phase.guards,
                 jnp.stack([*q, *v]),
-                active,
+                is_active,
                 options,
                 jnp.stack(phase.coordinate_units),
                 compute_own_units(phase.s).time,
             )
-            state = tuple(end.state)
+            end_state = tuple(phase_end.state)
             return PhaseResult(
-                state[: phase.n_dof],
-                state[phase.n_dof :],
-                end.duration,
-                end.guard,
-                end.timed_out,
-                end.solver_steps,
-                end.minima if records_margins else None,
+                end_state[: phase.n_dof],
+                end_state[phase.n_dof :],
+                phase_end.duration,
+                phase_end.guard,
+                phase_end.timed_out,
+                phase_end.solver_steps,
+                phase_end.minima if records_margins else None,
             )
 
         return run_phases(run_phase, params, tuple(x), options, self.stop_at_lift_off)
@@ -193,14 +198,14 @@ def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -
     static_options = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
     engine = "lanes" if can_use_lanes(static_options) else "diffrax"
 
-    def step_with_diffrax(tightens: bool, *leaves: Array) -> tuple:
+    def compute_with_diffrax(tightens_tolerances: bool, *leaves: Array) -> tuple:
         """Return the outputs of the step by diffrax.
 
         With the batch kernel as engine, it serves only derivatives of derivatives, under that
         engine's name.
         """
         params, x, options = jax.tree.unflatten(structure, leaves)
-        options = options.with_derivative_tolerances() if tightens else options
+        options = options.with_derivative_tolerances() if tightens_tolerances else options
         sequence = model._run_phases(params, x, options, records_margins=is_detailed)
         result: AdvanceResult | StepResult = (
             make_step_result(sequence, model.friction, engine)
@@ -209,14 +214,15 @@ def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -
         )
         return eqx.partition(result, eqx.is_inexact_array)
 
-    evaluate, evaluate_tighter = (
-        functools.partial(step_with_diffrax, tighten) for tighten in (False, True)
+    step_fn, tight_step_fn = (
+        functools.partial(compute_with_diffrax, tightens_tolerances)
+        for tightens_tolerances in (False, True)
     )
     if engine == "diffrax":
-        return enable_all_ad_modes(evaluate, evaluate_tighter)
+        return enable_all_ad_modes(step_fn, tight_step_fn)
     static_config = structure, model.stop_at_lift_off, model.friction if is_detailed else None
     return enable_all_ad_modes(
         build_step_function(*static_config),
-        evaluate_tighter,
+        tight_step_fn,
         functools.partial(build_step_jacobian, *static_config),
     )
