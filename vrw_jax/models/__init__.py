@@ -1,4 +1,4 @@
-"""The models of the wheel, one per file, with one interface."""
+"""Models of the wheel, one per file, with one interface."""
 
 from vrw_jax.models import batch_step, unit_scaling
 from vrw_jax.models.batch_step import (

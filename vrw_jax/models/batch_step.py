@@ -1,6 +1,6 @@
 """The paper's step in batches: one source for machine code and GPUs, values and derivatives.
 
-The phases are those of the diffrax engine; arrays hold one quantity of all wheels instead of the
+The phases are those of the diffrax engine. Arrays hold one quantity of all wheels instead of the
 quantities of one wheel. `build_step_function` returns a function of one wheel that `jax.vmap` maps
 onto lanes, for use in JAX programs.
 """
@@ -78,13 +78,12 @@ class StiffStartOptions:
     """
 
     max_step_ratio: float = 0.3
-    """Bound as a fraction of the solver step that DLS proposes next."""
+    """Upper bound as a fraction of the solver step that DLS proposes next."""
     max_transient_step: float = 7.0
-    """Bound in units of m/c times the tolerance's root of the solver's order.
+    """Upper bound in units of m/c times the tolerance's root of the solver's order.
 
-    It is chosen because the step-size controller settles at 7.2 to 9.5, for solvers of orders 5 to
-    8 and tolerances of 1e-4 to 1e-10.
-    """
+    The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for
+    solvers of orders 5 to 8 and tolerances of 1e-4 to 1e-10."""
 
 
 STIFF_START_OPTIONS = StiffStartOptions()
@@ -93,18 +92,18 @@ STIFF_START_OPTIONS = StiffStartOptions()
 class BatchAdvanceResult(NamedTuple):
     """Minimal results of one gait step of every lane."""
 
-    section_state: Vector  # three arrays
+    section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, " lanes"]  # an Outcome
     solver_steps: Int[Array, " lanes"]
-    is_unfinished: Bool[Array, " lanes"]  # stragglers not completed: their other fields are void
+    is_unfinished: Bool[Array, " lanes"]  # lanes stopped as stragglers; no other field is valid
 
 
 class _PhaseCarry(NamedTuple):
-    """Data passed from one phase to the next."""
+    """Data that a phase passes to the next phase."""
 
     next_dt: Array  # step size that the controller proposes next, s
-    has_run: Bool[Array, " lanes"]  # where the phase took place
+    has_run: Bool[Array, " lanes"]  # whether the phase took place
     is_unfinished: Bool[Array, " lanes"]
 
 
@@ -113,7 +112,7 @@ def make_batch_phase(
 ) -> BatchPhase:
     """Return a phase in the form of the batched integrator.
 
-    - `records_margins`: evaluate its margins in addition to its guards.
+    - `records_margins`: whether margins are evaluated in addition to guards.
     """
 
     def evaluate_acceleration(q: Vector, v: Vector) -> StageAcceleration:
@@ -161,7 +160,7 @@ def take_gait_step(
     stop_at_lift_off: bool,
     straggler_count: Array | None = None,
 ) -> BatchAdvanceResult:
-    """Return one gait step of every lane, from touchdown to touchdown.
+    """Return the minimal results of one gait step of every lane, from touchdown to touchdown.
 
     - `straggler_count`: see `integrate_batch_phase`.
     """
@@ -190,12 +189,12 @@ def take_gait_step(
 
 
 class LandingStep(NamedTuple):
-    """A step of every lane between two landings that leave both feet on the ground."""
+    """Step of every lane between two landings that leave both feet on the ground."""
 
     landing_quantities: Array
-    """Rows of lanes: (theta+, dtheta+) just after the next landing, rad and rad/s; the normal
-    impulse of the rear foot in it with both feet held, N s; `stopper_margin`, m^2/s. The first
-    three are zero unless the outcome is STEPPED."""
+    """Array (4, lanes): (theta+, dtheta+) just after the next landing, rad and rad/s; the rear
+    foot's normal impulse in that landing with both feet held, N s; `_event_order_margin`, m^2/s.
+    The first three are zero unless the outcome is STEPPED."""
     outcome: Int[Array, " lanes"]  # an Outcome
     durations: Vector  # of DLS, SLS-I, SLS-II, s
     solver_steps: Int[Array, " lanes"]
@@ -212,8 +211,8 @@ def take_step_after_landing(
 ) -> LandingStep:
     """Return one step of every lane from just after a landing to just after the next one.
 
-    `y` is (theta+, dtheta+) in the frame of the line under both feet. The result is in the frame of
-    the next line, see `split_slopes`.
+    - `y`: (theta+, dtheta+), rad and rad/s, in the frame of the line under both feet. The result is
+      in the frame of the next line, see `split_slopes`.
     """
     theta, dtheta = y
     sequence = run_batch_phases(
@@ -255,9 +254,9 @@ def take_step_after_landing(
 def _event_order_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
     """Return a margin of the order of two events at the end of SLS-I, m^2/s.
 
-    If Leg 2 meets its stopper first, it is the rate of Leg 2 times the height of the landing foot.
-    If that foot lands first, it is minus the foot's falling speed times the distance of Leg 2 from
-    its stopper. Both forms vanish together, with equal derivatives.
+    If Leg 2 meets its stopper first, the margin is the rate of Leg 2 times the height of the
+    landing foot. If that foot lands first, the margin is minus the foot's falling speed times the
+    distance of Leg 2 from its stopper. Both forms vanish together, with equal derivatives.
     """
     phase = SingleSupport1(s, (), False, turn)
     motion = phase.motion_at(q, v)
@@ -277,11 +276,11 @@ def run_batch_phases(
     land: Callable[..., transitions.Landing] = transitions.land,
     stiff_start: StiffStartOptions = STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
-    """Return all phases of every lane's step.
+    """Return the result of all phases of every lane's step.
 
     - `straggler_count`: see `integrate_batch_phase`;
     - `is_noinline`: see `BatchPhase`;
-    - `land`: the landing that opens the step.
+    - `land`: function of the landing that opens the step.
     """
 
     def run_phase(
@@ -349,30 +348,31 @@ def can_use_lanes(options: StepOptions) -> bool:
 
 
 class _StaticConfig(NamedTuple):
-    """Static configuration of a batched step: what it depends on besides its arrays."""
+    """Static configuration of a batched step: its dependencies besides arrays."""
 
-    argument_structure: Any  # of (params, x, options), whose leaves are the arrays
+    argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
-    friction: float | None  # for margins; None for the minimal result
+    friction: float | None  # friction of the margins; None for the minimal results
 
     @property
     def cache_key(self) -> tuple:
-        """Cache key of the trace, by `repr`."""
+        """Key of the trace in caches, compared by `repr`."""
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
     def run_lanes(self, *leaves: Array) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
-        """Return the step over lanes, which the leaves have on their last axis, with tableau and
-        options.
+        """Return the phases of the lanes, the tableau and the options.
+
+        The leaves have the lanes on their last axis.
         """
         params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
         tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # checked by `can_use_lanes`
+        assert tableau is not None  # `can_use_lanes` has checked the solver.
         records_margins = self.friction is not None
         arguments = params, tuple(x), options, tableau, self.stop_at_lift_off, records_margins
         return run_batch_phases(*arguments, is_noinline=True), tableau, options
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the outputs of the step, floats first."""
+        """Return the floats and the other outputs of the step."""
         sequence, friction = self.run_lanes(*leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(sequence, "lanes"), eqx.is_inexact_array)
@@ -386,7 +386,7 @@ class _StaticConfig(NamedTuple):
         return eqx.partition(result, eqx.is_inexact_array)
 
     def make_template(self, *leaves: Array) -> tuple:
-        """Return arrays in the structure of `compute_outputs`."""
+        """Return arrays in the structure of `compute_outputs` for one wheel."""
         x = leaves[0]
         int_zeros = jnp.zeros_like(x, jnp.int32)
         two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
@@ -408,15 +408,16 @@ class _StaticConfig(NamedTuple):
 
 
 def _fill_fields(record_type: Any, x: Array) -> Any:
-    """Return the record with `x` in all fields."""
+    """Return a record of this type with `x` in all fields."""
     return record_type(*(x for _ in dataclasses.fields(record_type)))
 
 
 def build_step_function(
     argument_structure: Any, stop_at_lift_off: bool, friction: float | None
 ) -> ForwardFunction:
-    """Return the step over the leaves of (params, x, options), as a forward rule for any AD
-    mode.
+    """Return a function from the leaves of (params, x, options) to the floats and others of a step.
+
+    The function is a forward rule from which all AD modes are built.
     """
     config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *config.cache_key)
@@ -426,7 +427,9 @@ def build_step_function(
 def build_step_sampler(
     argument_structure: Any, stop_at_lift_off: bool, n_samples: int
 ) -> BatchFunction:
-    """Return the step sampled at equal times of each phase, over the same leaves."""
+    """Return a function from the leaves of (params, x, options) to samples at equal times of each
+    phase.
+    """
     config = _StaticConfig(argument_structure, stop_at_lift_off, None)
 
     def sample_lanes(*leaves: Array) -> Trajectory:
@@ -463,9 +466,10 @@ def build_step_jacobian(
     friction: float | None,
     input_indices: tuple[int, ...],
 ) -> ForwardFunction:
-    """Return the Jacobian of `build_step_function`.
+    """Return a function that computes the Jacobian of `build_step_function`.
 
-    It gives (Jacobian with respect to the leaves at `input_indices`, floats) and the other outputs.
+    The function returns (Jacobian with respect to the leaves at `input_indices`, floats) and the
+    other outputs.
     """
     config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
 
@@ -500,8 +504,9 @@ def build_step_jacobian(
 def split_jacobian(
     jacobian_columns: Any, leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return a Jacobian leaf by leaf; its leading axis runs over all entries of the selected
-    leaves.
+    """Return a Jacobian as one tree for each selected leaf.
+
+    The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
     jacobians, offset = [], 0
     for i in input_indices:
@@ -516,14 +521,14 @@ def split_jacobian(
 
 
 N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
-"""Number of inputs of a step on flat ground: parameters and section state. Uneven ground adds one,
-the slope of the next line. Machine code keeps one number per derivative in registers."""
+"""Number of inputs of a step on flat ground: parameters and section state. Uneven ground adds the
+slope of the next line. Machine code keeps one number per derivative in registers."""
 
 
 def compute_jacobian_columns(
     batch_function: BatchFunction, leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the columns of the Jacobian of `function(*leaves)`, and its results.
+    """Return the Jacobian columns of `batch_function(*leaves)`, its floats and its other outputs.
 
     The columns are those of the leaves at `input_indices`, on the leading axis. The function
     returns floats over lanes and auxiliary outputs.
@@ -544,9 +549,9 @@ def compute_jacobian_columns(
 
 
 def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
-    """Return, for each leaf, its part of the unit vectors of all leaves, on the leading axis.
+    """Return for each leaf its part of the unit vectors of all leaves, on the leading axis.
 
-    Each number has its own ones and zeros, so that machine code omits products with them.
+    Each number has its own ones and zeros, so that machine code omits products with zeros.
     """
     sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
     unit_vectors, tangents, entry_offset = np.eye(sum(sizes)), [], 0

@@ -1,32 +1,33 @@
-"""What the library offers for a model: each model declares it, each package reads its part."""
+"""Features of the library for each model: each model declares them, and packages read them."""
 
 import enum
 from dataclasses import dataclass
 
 
 class GaitMethod(enum.StrEnum):
-    """Ways to find, follow and scan the gaits of a model."""
+    """Methods that find, follow and scan the gaits of a model."""
 
     COLLOCATION = enum.auto()
     """Newton's method on the whole cycle, for a fixed sequence of phases."""
     CONTACT_WALKS = enum.auto()
-    """Walks that settle on a gait, then Newton's method on the return map in contact modes."""
+    """Walks that settle on a gait, then Newton's method on the return map with fixed contact
+    modes."""
     RETURN_MAP = enum.auto()
     """Newton's method on the return map."""
     SELECTION = enum.auto()
-    """The method of the model that is selected for each wheel."""
+    """Method of the model that is selected for each wheel."""
 
 
 @dataclass(frozen=True)
 class ModelCapabilities:
-    """What the library offers for a model."""
+    """Features of the library for one model."""
 
     config_name: str
     """Name of the model in a configuration and on the command line."""
     gait_method: GaitMethod
-    """How gaits of the model are found; branches and scans follow from it."""
+    """Method that finds the gaits of the model; branches and scans follow from it."""
     commands: frozenset[str]
     """Commands that accept the model: "scan", "map", "tune", "branch" and "explore"."""
     fixed_by_tolerance: tuple[str, ...] | None = None
-    """Fields that need their default values if measures are requested to a tolerance; None if no
-    tolerance can refer to the model."""
+    """Fields that need their default values if measures are requested to a tolerance. None means
+    that the model does not support measures to a tolerance."""

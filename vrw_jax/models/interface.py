@@ -1,4 +1,4 @@
-"""Interface of every model: what it declares, and the methods that take its steps."""
+"""Interface of every model: its declarations, and the methods that take its steps."""
 
 import abc
 from typing import Any, ClassVar
@@ -22,13 +22,13 @@ from vrw_jax.wheel import (
 )
 
 StepGround = tuple[Array, ...]
-"""Ground of one step, or of all steps: what `with_ground` needs."""
+"""Ground of one step, or of all steps: the arguments of `with_ground`."""
 
 
 class AbstractWheel(eqx.Module):
-    """A model of the wheel. Models are final; the rest of the library uses only this interface.
+    """Model of the wheel. Models are final; the rest of the library uses only this interface.
 
-    `advance` and `step` compile themselves, once for each structure of their arguments.
+    `advance` and `take_step` compile themselves, once for each structure of their arguments.
 
     Examples:
         >>> isinstance(vrw.RigidWheel(), vrw.AbstractWheel)
@@ -38,16 +38,15 @@ class AbstractWheel(eqx.Module):
     model_name: eqx.AbstractClassVar[str]
     """Name of the model in results."""
     capabilities: eqx.AbstractClassVar[ModelCapabilities]
-    """What the library offers for the model."""
+    """Features of the library for the model."""
     parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """Inputs of the motion: the wheel's parameters and, where the motion depends on it,
-    friction."""
+    """Inputs of the motion: the wheel's parameters and, if the motion depends on it, friction."""
     reports_contacts: eqx.AbstractClassVar[bool]
-    """Whether trajectories report every leg's contact instead of the paper's phases."""
+    """Whether trajectories report the contact of every leg instead of the paper's phases."""
     batch_kernel: ClassVar[str] = ""
     """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
     is_compliant: ClassVar[bool] = True
-    """Whether springs and dampers affect the motion; it selects what is tuned and scanned."""
+    """Whether springs and dampers affect the motion. Tuning and scans vary them only then."""
 
     def __repr__(self) -> str:
         if is_traced(self):
@@ -59,7 +58,9 @@ class AbstractWheel(eqx.Module):
 
     @property
     def fallback_model(self) -> "AbstractWheel":
-        """Model that is valid for any start: itself, or the upper model of a ladder."""
+        """Model that is valid for any start: the model itself, or the most general one of a
+        ladder.
+        """
         return self
 
     def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
@@ -73,8 +74,9 @@ class AbstractWheel(eqx.Module):
     def from_values(
         self, values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with other values: the inverse of `parameter_values`; works on
-        tracers.
+        """Return model and wheel with these values of `parameter_names`.
+
+        This is the inverse of `parameter_values`, also for tracers.
         """
         n = len(PARAMETER_NAMES)
         model = self
@@ -85,8 +87,9 @@ class AbstractWheel(eqx.Module):
     def with_parameter(
         self, params: WheelParams, name: str, value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with another value of one of `parameter_names`; works on
-        tracers.
+        """Return model and wheel with another value of one of `parameter_names`.
+
+        The value may be a tracer.
         """
         if name == FRICTION_NAME:
             return eqx.tree_at(lambda ground: ground.friction, self, value), params
@@ -94,13 +97,17 @@ class AbstractWheel(eqx.Module):
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        """Return one step in its minimal form. Differentiable in any mode, to any order."""
+        """Return the minimal results of one step.
+
+        The results are differentiable in any mode, to any order.
+        """
 
     @abc.abstractmethod
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Return one step with all indicators, margins and energies. Differentiable in any mode.
+        """Return all results of one step: indicators, margins and energies.
 
-        The result is a `StepResult`, or the counterpart of the model.
+        The type is `StepResult`, or its counterpart for the model. The results are differentiable
+        in any mode.
         """
 
     @abc.abstractmethod
@@ -109,12 +116,12 @@ class AbstractWheel(eqx.Module):
     ) -> Any:
         """Return the motion of the step at `n_samples` times of each phase.
 
-        The result is a `Trajectory`, or the counterpart of the model.
+        The type is `Trajectory`, or its counterpart for the model.
         """
 
     @abc.abstractmethod
     def default_start(self, params: WheelParams) -> SectionState:
-        """Return a section state from which a walk may begin."""
+        """Return a section state from which a walk can start."""
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
         """Return the ground of each step if slope or friction are arrays over steps, else None."""
@@ -126,27 +133,26 @@ class AbstractWheel(eqx.Module):
     def with_ground(
         self, params: WheelParams, ground: StepGround
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step: slopes of two lines, see
+        """Return model and wheel on the ground of one step: the slopes of two lines, see
         `split_slopes`.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, ground[0])
 
     def section_size(self, params: WheelParams) -> int:
-        """Return the length of a section state."""
+        """Return the number of entries of a section state."""
         return 3
 
     def n_continuous(self, params: WheelParams) -> int:
-        """Return the number of leading entries of a section state that vary continuously; the rest
-        are codes.
+        """Return the number of leading entries of a section state that vary continuously.
+
+        The other entries are codes.
         """
         return self.section_size(params)
 
     def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
-        """Return the wheel's own units of each of the section's numbers."""
+        """Return the wheel's own unit of each entry of a section state, as a list."""
         return [units.length / units.length, units.rate, units.speed]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
-        """Return the model's section state for a three-number one; others are returned
-        unchanged.
-        """
+        """Return the model's section state of `x`, which may be the paper's three numbers."""
         return x

@@ -1,8 +1,8 @@
 """The paper's step from landing to landing, for any engine that integrates its phases.
 
-An engine provides a `PhaseRunner`, which takes one phase to its end. This module determines which
-phases take place, where they start, how the step ends and what it returns. Everything is
-elementwise: for one wheel or a batch.
+An engine provides a `PhaseRunner`, which integrates one phase to its end. This module determines
+which phases take place, where they start, how the step ends and its results. All functions work
+elementwise, for one wheel or a batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,29 +37,30 @@ from vrw_jax.wheel import (
 )
 
 SAFE_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
-"""A regular posture (theta, L1, L2 and rates) that replaces the state of a wheel whose step has
-failed; it is never integrated."""
+"""Regular posture (theta, L1, L2 and rates) in place of the state of a wheel whose step has failed.
+This state is never integrated."""
 
 
 class PhaseResult(NamedTuple):
-    """End of a phase; it equals the start where the phase was not active."""
+    """End of a phase; equal to its start if the phase was not active."""
 
     q: Vector
     v: Vector
     duration: Elementwise  # s
-    guard: Int[Array, "..."]  # index of the guard that ended it; -1 if none did
+    guard: Int[Array, "..."]  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Bool[Array, "..."]
     n_solver_steps: Int[Array, "..."]  # attempted, accepted or not
-    margin_minima: Array | None  # of the phase's margins, on the leading axis, if recorded
-    engine_carry: Any = None  # data that the engine passes to its next phase
+    margin_minima: Array | None  # of the margins, on the leading axis, if recorded
+    engine_carry: Any = None  # data that the engine passes to the next phase
 
 
 PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]
-"""Function from a phase's start (q, v), its active mask and the previous phase's end to its end."""
+"""Function to the end of a phase from its start (q, v), its active mask and the end of the previous
+phase."""
 
 
 class PhaseSequenceResult(NamedTuple):
-    """Result of running all phases of a step."""
+    """Starts and ends of all phases of a step, and its outcome."""
 
     s: Symbols
     landing: Landing
@@ -68,7 +69,7 @@ class PhaseSequenceResult(NamedTuple):
     phase_ends: tuple[PhaseResult, ...]
     phases_happened: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
-    tilt: Elementwise | None = None  # by which the next line is steeper, rad; None: flat ground
+    tilt: Elementwise | None = None  # of the next line, rad; None on flat ground
 
 
 def run_phases(
@@ -79,10 +80,13 @@ def run_phases(
     stop_at_lift_off: bool,
     land: Callable[..., Landing] = transitions.land,
 ) -> PhaseSequenceResult:
-    """Return all phases of one step from the section state `x`, given entry by entry.
+    """Return the result of all phases of one step from the section state `x`, given entry by entry.
 
     The motion is in the frame of the line under both feet in double support. On uneven ground (see
-    `split_slopes`) the touchdown and the section state at it refer to the next line.
+    `split_slopes`), the touchdown and the section state at the end refer to the next line.
+
+    - `run_phase`: engine;
+    - `land`: function of the landing that opens the step.
     """
     params, is_valid, tilt = select_line(params, x)
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
@@ -138,15 +142,17 @@ def run_phases(
 
 
 def next_section_state(sequence: PhaseSequenceResult) -> Vector:
-    """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line that is
-    reached.
+    """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line of the next
+    landing.
+
+    The units are rad, rad/s and m/s.
     """
     theta, rates = sequence.phase_ends[2].q[0], sequence.phase_ends[2].v
     return (theta if sequence.tilt is None else theta - sequence.tilt), *rates
 
 
 def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
-    """Return the minimal result; its section state is zero if the step failed."""
+    """Return the minimal results of a step; the section state is zero if the step failed."""
     theta, dtheta, dL1 = next_section_state(sequence)
     has_stepped = sequence.outcome == Outcome.STEPPED
     solver_steps = [end.n_solver_steps for end in sequence.phase_ends]
@@ -162,7 +168,10 @@ def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceRe
 def make_step_result(
     sequence: PhaseSequenceResult, friction: Elementwise | float, engine: str
 ) -> StepResult:
-    """Return the full result, for one wheel or a batch; the margins must have been recorded."""
+    """Return all results of a step, for one wheel or a batch.
+
+    The margins must have been recorded.
+    """
     s, landing, phase_ends = sequence.s, sequence.landing, sequence.phase_ends
     has_begun = sequence.outcome != Outcome.BAD_INPUT
     hits_stopper, has_stepped = sequence.phases_happened[2], sequence.outcome == Outcome.STEPPED
@@ -210,7 +219,7 @@ def make_step_result(
 
 
 def make_trajectory(sequence: PhaseSequenceResult, samples: Sequence[Array]) -> Trajectory:
-    """Return the step with states at equal times of each phase.
+    """Return the trajectory of a step from samples at equal times of each phase.
 
     - `samples`: of each phase, with axes (sample, coordinates and rates, ...).
     """
@@ -234,9 +243,10 @@ def make_trajectory(sequence: PhaseSequenceResult, samples: Sequence[Array]) -> 
 
 
 def evaluate_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
-    """Return coordinates and rates, forces of the ground and energies at states of the phase.
+    """Return coordinates with rates, ground forces (N) and energies (J) at states of a phase.
 
-    - `y`: the phase's own coordinates, then their rates, on the first axis; other axes are kept.
+    - `y`: the phase's coordinates, then their rates, on the first axis. Results have the same other
+      axes.
     """
     coordinates = tuple(y)
     motion = phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
@@ -259,8 +269,9 @@ def _make_margins(
 ) -> Margins:
     """Return the margins of the step.
 
-    - `rear_force`: force on the rear foot just after the landing;
-    - `liftoff_motion`: motion at the end of double support.
+    - `rear_force`: force on the rear foot just after the landing, N;
+    - `liftoff_motion`: motion at the end of double support;
+    - `stopper_hit`: collision of Leg 2 with its stopper.
     """
     s, landing, phases_happened = sequence.s, sequence.landing, sequence.phases_happened
     has_begun, hits_stopper = sequence.outcome != Outcome.BAD_INPUT, phases_happened[2]
@@ -270,7 +281,7 @@ def _make_margins(
     phase_minima = [PhaseMargins.from_values(tuple(rows), s.n) for rows in margin_rows]
 
     def lowest_margin(margin_name: str, *phase_indices: int) -> Array:
-        """Return the minimum over those phases that happened; 0 if none did."""
+        """Return the minimum of a margin over those phases that happened; 0 if none did."""
         value: Any = jnp.inf
         for phase_index in phase_indices:
             phase_minimum = jnp.asarray(getattr(phase_minima[phase_index], margin_name))

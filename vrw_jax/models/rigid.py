@@ -43,14 +43,17 @@ from vrw_jax.wheel import (
 
 @dataclass(frozen=True)
 class MinimumSearchOptions:
-    """Search for the minima of margins over the angle, by repeated zooming."""
+    """Options of the search for the minimum of each margin over the angle, by repeated zooming."""
 
     n_angles: int = 33
-    """Number of angles in each round, chosen because forces are smooth over the 45 degrees of a
-    step."""
+    """Number of angles in each round.
+
+    The value is chosen because forces are smooth over the 45 degrees of a step."""
     n_zoom_rounds: int = 5
-    """Number of rounds, chosen because the angle is then accurate to 1e-6 rad, and the error of a
-    minimum is the square of that."""
+    """Number of rounds.
+
+    The value is chosen because the angle is then accurate to 1e-6 rad, and the error of a minimum
+    is the square of that."""
 
 
 MINIMUM_SEARCH_OPTIONS = MinimumSearchOptions()
@@ -95,7 +98,7 @@ class RigidWheel(AbstractWheel):
     )
 
     def default_start(self, params: WheelParams) -> SectionState:
-        """Return the rate of the rolling fixed point, or a fast start where no fixed point
+        """Return the section state of the rolling fixed point, or a fast start if no fixed point
         exists.
         """
         s = params.symbols()
@@ -111,7 +114,7 @@ class RigidWheel(AbstractWheel):
         )
 
     def _rate_ratio(self, s: Symbols) -> Elementwise:
-        """Return the ratio of the rate after to the rate before the landing."""
+        """Return the ratio of the angular rates after and before the landing."""
         foot_inertia = _foot_inertia(s)
         if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
@@ -129,7 +132,7 @@ class RigidWheel(AbstractWheel):
     def compute_step_elementwise(
         self, params: WheelParams, x: StateValues, friction: Elementwise
     ) -> StepResult:
-        """Return the step elementwise: for one wheel or for a batch."""
+        """Return the results of a step elementwise, for one wheel or a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
         params, is_valid, tilt = select_line(params, x)
@@ -207,10 +210,10 @@ class RigidWheel(AbstractWheel):
     def _landing_impulses(
         self, s: Symbols, x: StateValues, rolling_motion: "RollingMotion", friction: Elementwise
     ) -> tuple:
-        """Return the landing impulses and friction margins.
+        """Return the impulses (N s) and friction margins of the landing.
 
-        These are the impulse at the rear foot, the friction margins of both feet (fore, rear), and
-        the impulses of the stoppers of legs 3..n.
+        The results are the impulse at the rear foot, the friction margins of fore and rear foot,
+        and the stopper impulses of legs 3..n.
         """
         zero = jnp.zeros_like(x[1])
         motion_after = rolling_motion.motion_at_angle(
@@ -225,7 +228,8 @@ class RigidWheel(AbstractWheel):
             if holds_rear_foot
             else dynamics.FootForce(zero, zero)
         )
-        # Impulse at the fore foot: the jump of total momentum Mt v_hub (the mass centre).
+        # The impulse at the fore foot is the jump of total momentum, Mt v_hub (the mass centre),
+        # minus that at the rear foot.
         fore_impulse = dynamics.FootForce(
             s.Mt * hub_jump[0] - rear_impulse.tangential, s.Mt * hub_jump[1] - rear_impulse.normal
         )
@@ -241,7 +245,7 @@ class RigidWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        """Return the motion at equal angles instead of equal times."""
+        """Return the motion of a step at equal angles instead of equal times."""
         result = self.take_step(params, x, options)
         params, next_slope = split_slopes(params)
         s, half_angle = params.symbols(), 0.5 * params.leg_angle
@@ -263,25 +267,27 @@ class RigidWheel(AbstractWheel):
 
 
 class RollingMotion(eqx.Module):
-    """Rolling over one foot from theta = -alpha/2 at the given rate, by conservation of energy."""
+    """Rolling over one foot from theta = -alpha/2 at a given rate, by conservation of energy."""
 
     s: Symbols
     phi: Elementwise  # slope, rad
     initial_rate: Elementwise  # at theta = -alpha/2, rad/s
     end_angle: Elementwise | None = None
-    """Angle theta at the next landing, rad; None is alpha/2, as on flat ground."""
+    """Angle theta at the next landing, rad; None means alpha/2, as on flat ground."""
 
     def rate_squared_at_angle(self, theta: Elementwise) -> Elementwise:
-        """Return the square of dtheta at theta; negative where the wheel does not arrive."""
+        """Return the square of dtheta at theta, rad^2/s^2; negative if the wheel does not
+        arrive.
+        """
         s = self.s
         height_drop = _cos_from_vertical(s, -0.5 * s.alpha) - _cos_from_vertical(s, theta)
         return self.initial_rate**2 + 2.0 * _gravity_stiffness(s) * height_drop
 
     def time_at_angle(self, theta: Elementwise) -> Elementwise:
-        """Return the time from theta = -alpha/2, s, by Carlson's R_F.
+        """Return the time from theta = -alpha/2 to theta, s, by Carlson's R_F.
 
-        With t = sin^2 of half the angle from the vertical, the rate is the square root of a linear
-        function of t. Time is then the complete cubic form of the elliptic integral.
+        Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
+        function of t. So time is the complete cubic form of the elliptic integral.
         """
         s = self.s
         kappa = 2.0 * _gravity_stiffness(s)
@@ -289,7 +295,7 @@ class RollingMotion(eqx.Module):
             0.5 * (self.phi - 0.5 * s.alpha),
             0.5 * (self.phi + theta),
         )
-        # Squared rate at the vertical.
+        # This is the squared rate at the vertical.
         min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin_half_angle) - 1.0)
         is_across_vertical = begin_half_angle * end_half_angle < 0.0
         zero_squared = jnp.zeros_like(end_half_angle)
@@ -316,7 +322,7 @@ class RollingMotion(eqx.Module):
         return time_to_end + time_to_vertical
 
     def motion_at_angle(self, theta: Elementwise) -> Motion:
-        """Return the motion at theta; its rate is zero where the wheel does not arrive."""
+        """Return the motion at theta; its rate is zero if the wheel does not arrive."""
         zero = 0.0 * theta
         speed_squared = self.rate_squared_at_angle(theta)
         is_moving = speed_squared > 0.0
@@ -325,7 +331,7 @@ class RollingMotion(eqx.Module):
         return Motion.from_angle(theta, leg_length, leg_length, rate, zero, zero)
 
     def acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
-        """Return the angular acceleration under gravity; the legs do not move."""
+        """Return the angular acceleration under gravity, rad/s^2; the legs do not move."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
         return dynamics.Acceleration(_gravity_stiffness(self.s) * sin_p, zero, zero)
@@ -337,13 +343,15 @@ class RollingMotion(eqx.Module):
         )
 
     def stopper_force_at_angle(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
-        """Return the force of the stoppers of `legs`, N."""
+        """Return the forces of the stoppers of `legs`, N."""
         return dynamics.stopper_force(
             self.s, self.motion_at_angle(theta), self.acceleration_at_angle(theta), legs
         )
 
     def evaluate_states(self, theta: Elementwise) -> tuple[Array, Array, Array]:
-        """Return coordinates with rates, forces of both feet and energies at theta, as rows."""
+        """Return coordinates with rates, forces of both feet (N) and energies (J) at theta, on the
+        first axis.
+        """
         motion, foot_force, zero = (
             self.motion_at_angle(theta),
             self.foot_force_at_angle(theta),
@@ -354,9 +362,10 @@ class RollingMotion(eqx.Module):
         return state, forces, jnp.stack(dynamics.mechanical_energy(self.s, motion))
 
     def margins_at_angles(self, theta: Array) -> Array:
-        """Return the margins, each at its own angle.
+        """Return the margins, each at its own angle `theta[i]`.
 
-        They are the normal force, minus the required friction, and the stopper forces of legs 2..n.
+        The margins are the normal force (N), minus the required friction, and the stopper forces of
+        legs 2..n (N).
         """
         stopper_forces = [
             self.stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
@@ -368,9 +377,10 @@ class RollingMotion(eqx.Module):
         )
 
     def find_margin_minima(self, options: MinimumSearchOptions = MINIMUM_SEARCH_OPTIONS) -> Array:
-        """Return the minima of `margins` from landing to landing, to round-off.
+        """Return the minima of `margins_at_angles` from landing to landing, to round-off.
 
-        Each minimum is found by repeated zooming; the remaining error of the angle enters squared.
+        Each minimum is found by repeated zooming. The error of a minimum is the square of the
+        remaining error of its angle.
         """
         half_angle = jnp.asarray(0.5 * self.s.alpha, self.initial_rate.dtype)
         end_angle = half_angle if self.end_angle is None else self.end_angle
@@ -416,13 +426,13 @@ def _foot_inertia(s: Symbols) -> Elementwise:
 def _gravity_stiffness(s: Symbols) -> Elementwise:
     """Return Mt g L0 over the inertia about the foot, 1/s^2.
 
-    It equals g/l for a rimless wheel without leg masses.
+    The value is g/l for a rimless wheel without leg masses.
     """
     return s.Mt * s.g * s.L0 / _foot_inertia(s)
 
 
 def _cos_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
-    """Return cos(theta + phi)."""
+    """Return the cosine of the angle from the vertical, theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
@@ -435,13 +445,13 @@ def _rolling_time(
     """Return the time between two half-angles on one side of the vertical, given by their squares,
     s.
 
-    It is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2, as 2
-    R_F (DLMF 19.29.4); zero if both ends coincide.
+    The time is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2,
+    as 2 R_F (DLMF 19.29.4). The result is zero if both ends coincide.
     """
     is_nonempty = end_angle_squared > begin_angle_squared
     lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)
     upper_squared = jnp.where(is_nonempty, end_angle_squared, 1.0)
-    is_off_vertical = lower_squared > 0.0  # sqrt has no derivative at the vertical, where Y1 = 0
+    is_off_vertical = lower_squared > 0.0  # The square root has no derivative at 0.
     angle_low = jnp.where(
         is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, lower_squared, 1.0)), 0.0
     )
@@ -460,7 +470,7 @@ def _rolling_time(
 def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
     """Return Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
 
-    Each duplication brings the arguments four times closer together. After 12 duplications the
+    Each duplication brings the arguments four times closer together. After 12 duplications, the
     fifth-order series is exact in float64 for arguments within ten decades of each other.
     """
 

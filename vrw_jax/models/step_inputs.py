@@ -1,6 +1,6 @@
 """Inputs of a step: section states, and the slopes of uneven ground, with their checks.
 
-Uneven ground consists of straight lines that join the footholds.
+Uneven ground consists of straight lines between the footholds.
 """
 
 import functools
@@ -16,27 +16,30 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import MAX_SI_VALUE, PARAMETER_DOMAINS, WheelParams
 
 SectionState = Float[Array, "3"]
-"""(theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad, rad/s,
-m/s. The length of Leg 1 follows from the touchdown condition; Leg 2 is on its stopper."""
+"""State (theta-, dtheta-, dL1-) just before touchdown, in the leg labels of the ending step: rad,
+rad/s, m/s. The length of Leg 1 follows from the touchdown condition. Leg 2 is on its stopper."""
 AnySectionState = Float[Array, "section ..."]
-"""A `SectionState`, or the longer one of another model; in a batch, elements are on the last
-axis."""
+"""Section state of any model: a `SectionState` or a longer vector. In a batch, elements are on the
+last axis."""
 PAPER_START = (0.1, 1.6, -0.1)
-"""A start near the gait of Table 1, inside its basin: rad, rad/s, m/s."""
+"""Start near the gait of Table 1, inside its basin of attraction: rad, rad/s, m/s."""
 
 
 StateValues = Float[Array, "section ..."] | tuple[Array, ...]
-"""A section state, or its entries one by one, each of which may be an array over a batch."""
+"""Section state as one array or as separate entries, each of which may be an array over a batch."""
 
 
 def is_valid_start(params: WheelParams, x: StateValues) -> Array:
-    """Return whether parameters and start are finite, in their domains and rolling forward."""
+    """Return whether parameters and start are finite, in their domains and rolling forward.
+
+    The result is False for NaN.
+    """
     theta, dtheta = x[0], x[1]
     is_upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (
         jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi
     )
     is_bounded = functools.reduce(operator.and_, [jnp.abs(value) < MAX_SI_VALUE for value in x])
-    return params.is_in_domain() & is_bounded & is_upright & (dtheta > 0.0)  # False for NaN
+    return params.is_in_domain() & is_bounded & is_upright & (dtheta > 0.0)
 
 
 def replace_invalid(
@@ -45,8 +48,9 @@ def replace_invalid(
     x: StateValues,
     fallback_x: Any,
 ) -> tuple[WheelParams, Any]:
-    """Return Table 1 and a safe start in place of invalid input, so that no NaN is ever
-    computed.
+    """Return parameters and start, with Table 1 and `fallback_x` in place of invalid input.
+
+    The replacement prevents that a NaN is computed.
     """
     return jax.tree.map(
         lambda value, default: jnp.where(is_valid, value, jnp.asarray(default, value.dtype)),
@@ -56,30 +60,31 @@ def replace_invalid(
 
 
 def complete_slopes(slope: Array, n_steps: int) -> Array:
-    """Return the slopes of the n + 1 lines of n steps, rad; the last of n given slopes is used
-    twice.
+    """Return the slopes of the n + 1 lines of n steps, rad.
+
+    If `slope` has n entries, the last one is repeated.
     """
     check_step_values("slope", slope, n_steps)
     return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
 
 
 def check_step_values(quantity_name: str, values: Array, n_steps: int) -> None:
-    """Raise a ValueError for an array with neither one value per step nor one more."""
+    """Raise `ValueError` for an array with neither one value per step nor one more."""
     if jnp.shape(values) not in ((n_steps,), (n_steps + 1,)):
         steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
-            f"{quantity_name} has shape {jnp.shape(values)}, but {steps_text} of one wheel takes one "
-            f"number, or an array of {n_steps} or {n_steps + 1} over its steps: map over batches of wheels "
-            "with jax.vmap."
+            f"{quantity_name} has shape {jnp.shape(values)}, but {steps_text} of one wheel "
+            f"takes one number, or an array of {n_steps} or {n_steps + 1} over its steps: map "
+            "over batches of wheels with jax.vmap."
         )
 
 
 def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
-    """Return the wheel on the line under both feet in double support, and the slope of the next
-    line, rad.
+    """Return the wheel on the line under both feet in double support, and the next line's slope,
+    rad.
 
     On uneven ground `params.slope` has both slopes on a leading axis, which no other parameter has.
-    On flat ground it has no such axis, and the second result is None.
+    On flat ground, `params.slope` has no such axis and the second result is None.
     """
     if jnp.ndim(params.slope) == jnp.ndim(params.damping):
         return params, None
@@ -88,15 +93,17 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
 
 
 def is_valid_slope(slope: Elementwise) -> Array:
-    """Return whether a slope lies in its domain; False for NaN."""
+    """Return whether a slope (rad) lies in its domain; False for NaN."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains(slope))
 
 
 def select_line(
     params: WheelParams, x: StateValues
 ) -> tuple[WheelParams, Array, Elementwise | None]:
-    """Return the wheel on the line under both feet, whether a step may begin, and the angle by
-    which the next line is steeper, rad; None on flat ground.
+    """Return the wheel on the line under both feet, whether a step may start, and the tilt of the
+    next line.
+
+    The tilt is the angle by which the next line is steeper, rad; None on flat ground.
     """
     params, next_slope = split_slopes(params)
     is_valid = is_valid_start(params, x)

@@ -1,4 +1,4 @@
-"""Results of one step: measures, margins, energies, and what every model returns."""
+"""Results of one step: measures, margins and energies, with the common part of all models."""
 
 import abc
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ from vrw_jax.printing import (
 from vrw_jax.wheel import Outcome
 
 MeasureValue = Float[Array, "..."]
-"""One number of a step; in a batch, one number per element."""
+"""Value of a measure of a step; in a batch, one value per element."""
 
 
 class AbstractMeasures(AbstractPrintable):
-    """Several measures; each field is one of `measures.MEASURES`."""
+    """Group of measures; each field is one of `measures.MEASURES`."""
 
     measure_names: eqx.AbstractClassVar[Mapping[str, str]]
-    """Names in `measures.MEASURES` of the fields whose own names differ."""
+    """Names in `measures.MEASURES` of the fields that have another name there."""
 
     def measures(self) -> dict[str, Array]:
         """Return the fields by their names in `measures.MEASURES`."""
@@ -137,7 +137,7 @@ class Margins(AbstractMeasures):
 
 
 class AbstractStep(AbstractPrintable):
-    """Result of one step, as far as all models share it. Batched under vmap."""
+    """Results of one step that all models have. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -148,7 +148,7 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how the step ended, as a sentence; a batch has an array of sentences."""
+        """Description of how the step ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     @property
@@ -164,14 +164,14 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def speed(self) -> Array:
-        """Step length over period, m/s; 0 for a step of zero duration."""
+        """Step length over duration, m/s; 0 for a step of zero duration."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
     def measures(self) -> dict[str, Array]:
         """Return all measures of the step by their names in `measures.MEASURES`.
 
-        Batch axes lead; legs come last.
+        Batch axes come first, and the axis of legs comes last.
         """
         shared_measures = {
             "dls_fraction": self.dls_fraction,
@@ -189,7 +189,7 @@ class AbstractStep(AbstractPrintable):
         return shared_measures | self.model_measures()
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the printable rows: measures, then margins and whether their assumptions hold."""
+        """Return labels and texts: measures, then margins with whether their assumptions hold."""
         outcome, values = np.asarray(self.outcome), self.measures()
         if outcome.ndim:
             return [("steps", format_outcome_counts(outcome, Outcome))]
@@ -208,20 +208,22 @@ class AbstractStep(AbstractPrintable):
         return rows
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the code of the model that took the step and the reason, by names of
+        """Return the code of the model that took the step and that of the reason, by names of
         `SELECTION_ATTRS`.
 
-        It is empty for a model that does not choose.
+        The result is empty for a model that does not select another one.
         """
         return {}
 
     @abc.abstractmethod
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures that not every model reports."""
+        """Return the measures that not every model has, by name."""
 
 
 class AbstractContactStep(AbstractStep):
-    """A step with contacts in any order; `durations` are those with two, one and no loaded feet."""
+    """Step with contacts in any order. The `durations` are those with two, one and no loaded feet,
+    s.
+    """
 
     energy_impacts: eqx.AbstractVar[MeasureValue]  # lost in impacts, J
     energy_damping: eqx.AbstractVar[MeasureValue]  # lost in the dampers, J
@@ -272,6 +274,8 @@ class StepResult(AbstractStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
+        """Return the measures of the paper's steps by name."""
+        """Return the measures of contact steps by name."""
         return {
             "duration_sls1": self.durations[..., 1],
             "duration_sls2": self.durations[..., 2],
@@ -283,26 +287,26 @@ class StepResult(AbstractStep):
 
 
 class AdvanceResult(eqx.Module):
-    """Minimal result of a step: what the next step and a walk need."""
+    """Minimal results of a step: the input of the next step, and the outcome."""
 
     section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # of DLS, SLS-I, SLS-II, s
     outcome: Int[Array, "..."]  # an Outcome
     solver_steps: Int[Array, "..."]  # attempted solver steps
-    model_code: Int[Array, "..."] | None = None  # of the chosen model: see ladder
-    reason_code: Int[Array, "..."] | None = None  # of that choice
+    model_code: Int[Array, "..."] | None = None  # code of the selected model
+    reason_code: Int[Array, "..."] | None = None  # code of the reason
     engine: str = eqx.field(static=True, default="")  # see `StepOptions`
 
 
 class Trajectory(eqx.Module):
-    """States of one step at samples of each phase, both ends included, with the forces there.
+    """States of one step at samples of each phase, both ends included, with forces and energies.
 
-    It also holds the `AdvanceResult` fields of the same integration. The axes are phase (DLS,
-    SLS-I, SLS-II) and sample. A phase that did not happen has duration 0 and repeats its start.
-    Coordinates use the leg labels of this step; the origin is the foot of Leg 1.
+    The axes are phase (DLS, SLS-I, SLS-II) and sample. A phase that did not happen has duration 0
+    and repeats its start. Coordinates use the leg labels of this step, and the foot of Leg 1 is the
+    origin. The last three fields are those of the `AdvanceResult`.
     """
 
-    time: Float[Array, "3 n ..."]  # from the landing, s
+    time: Float[Array, "3 n ..."]  # time since the landing, s
     state: Float[Array, "3 n 6 ..."]  # theta, L1, L2 and their rates
     forces: Float[Array, "3 n 4 ..."]  # lambda_1 ... lambda_4, N
     energy: Float[Array, "3 n 3 ..."]  # kinetic, gravitational, elastic, J

@@ -3,9 +3,9 @@
 In other units of length, time and mass every gait is the same. So every output of a step or a cycle
 is a homogeneous function of the wheel and the start. By Euler's theorem, each unit gives one column
 of the derivatives from the other columns. The Jacobian of a step obtains two columns in this way. A
-third would follow from the unit of mass. No mass is always large enough to divide by, and the
-column of a light leg would lose its digits. For the Jacobian of a cycle, whose columns cost more,
-the direction in which both masses grow is given as well.
+third column would follow from the unit of mass. No mass is always large enough to divide by, and
+the column of a light leg would lose its digits. The Jacobian of a cycle has more expensive columns.
+There, the direction in which both masses grow also follows from the unit of mass.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,16 +25,16 @@ _INPUT_UNITS = (*(domain.unit for domain in PARAMETER_DOMAINS.values()), *_STATE
 class UnitScaling(NamedTuple):
     """Powers of one unit in the inputs and outputs of a step."""
 
-    input_powers: tuple[int, ...]  # in parameters, start, and slope of the next line
-    output_powers: tuple[int, ...]  # in section state and durations
+    input_powers: tuple[int, ...]  # of parameters, start, and slope of the next line
+    output_powers: tuple[int, ...]  # of section state and durations
 
     def subtract_columns(
         self, remainder: Array, inputs: Sequence[Array], known_columns: Mapping[int, Array]
     ) -> Array:
-        """Return `remainder` minus the given columns, each times its input and that input's power.
+        """Return `remainder` minus each known column times its input and the power of this input.
 
         The argument is the output times its power. By Euler's theorem, the result is the sum of the
-        same products over the columns that are not given.
+        same products over the unknown columns.
         """
         for i, column in known_columns.items():
             if self.input_powers[i]:
@@ -56,15 +56,17 @@ SCALING_BY_PARAMETER = {
     PARAMETER_NAMES.index("gravity"): TIME_SCALING,
     PARAMETER_NAMES.index("locked_length"): LENGTH_SCALING,
 }
-"""Scaling that gives the column of a parameter, by the parameter's index. Gravity comes first,
-because its unit contains a length."""
+"""Unit scaling that gives the Jacobian column of a parameter, by the parameter's index. Gravity
+comes first, because its unit contains a length."""
 
 
 def complete_by_scaling(
     inputs: Sequence[Array], known_columns: Mapping[int, Array], scaled_outputs: Mapping[int, Array]
 ) -> dict[int, Array]:
-    """Return all columns; those of `SCALING_BY_PARAMETER` follow from the outputs times their
-    powers.
+    """Return all columns of a Jacobian, with those of `SCALING_BY_PARAMETER` from Euler's theorem.
+
+    - `known_columns`: all other columns, by the index of the input;
+    - `scaled_outputs`: outputs times their powers, by the index of the parameter.
     """
     known_columns = dict(known_columns)
     for index, scaling in SCALING_BY_PARAMETER.items():
@@ -76,7 +78,9 @@ def complete_by_scaling(
 def complete_jacobian_columns(
     batch_function: BatchFunction, inputs: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return `compute_jacobian_columns` of a step's section state and durations for all inputs.
+    """Return `compute_jacobian_columns` of section state and durations with respect to all inputs.
+
+    Two columns follow from the others by scaling.
 
     - `inputs`: parameters, then the start, then on uneven ground the slope of the next line;
     - `input_indices`: indices of all inputs, in the order of the returned columns.

@@ -1,5 +1,5 @@
-"""Viscoelastic model of the paper: landing, double support, single support I, stopper, support
-II.
+"""Viscoelastic model of the paper: landing, double support, single support I, stopper, single
+support II.
 """
 
 import functools
@@ -50,7 +50,7 @@ from vrw_jax.wheel import (
 
 
 class DiffraxPhase(NamedTuple):
-    """A phase for the diffrax integrator, over the state y = (q, v) as one vector."""
+    """Functions of a phase for the diffrax integrator, of the state y = (q, v) as one vector."""
 
     unpack_motion: Callable[[StateVector], Motion]
     vector_field: VectorField
@@ -58,9 +58,9 @@ class DiffraxPhase(NamedTuple):
 
 
 def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhase:
-    """Return the phase for the diffrax integrator.
+    """Return the functions of a phase for the diffrax integrator.
 
-    - `records_margins`: evaluate the phase's margins in addition to its guards.
+    - `records_margins`: whether margins are evaluated in addition to guards.
     """
 
     def unpack_motion(y: StateVector) -> Motion:
@@ -118,7 +118,7 @@ class ViscoelasticWheel(AbstractWheel):
     )
 
     def default_start(self, params: WheelParams) -> SectionState:
-        """Return a start close to the gait of Table 1, inside its basin."""
+        """Return a section state close to the gait of Table 1, inside its basin of attraction."""
         return jnp.asarray(PAPER_START, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
@@ -130,7 +130,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
-        """Return the result of the compiled step."""
+        """Return the results of a step by the compiled function."""
         leaves, structure = jax.tree.flatten((params, x, options))
         return eqx.combine(*_compile_step(self, structure, is_detailed)(*leaves))
 
@@ -145,7 +145,7 @@ class ViscoelasticWheel(AbstractWheel):
         return sampler(*leaves)
 
     def _sample_with_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
-        """Return the sampled step, integrated by diffrax."""
+        """Return the samples of a step, integrated by diffrax."""
         params, x, options = jax.tree.unflatten(structure, leaves)
         sequence, samples = self._run_phases(params, x, options, records_margins=False), []
         for phase, start, end in zip(
@@ -162,7 +162,7 @@ class ViscoelasticWheel(AbstractWheel):
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
-        """Return all phases of the step, integrated by diffrax."""
+        """Return the result of all phases of a step, integrated by diffrax."""
 
         def run_phase(
             phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
@@ -199,10 +199,10 @@ def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -
     engine = "lanes" if can_use_lanes(static_options) else "diffrax"
 
     def compute_with_diffrax(tightens_tolerances: bool, *leaves: Array) -> tuple:
-        """Return the outputs of the step by diffrax.
+        """Return the floats and the other outputs of a step by diffrax.
 
-        With the batch kernel as engine, it serves only derivatives of derivatives, under that
-        engine's name.
+        If the batch kernel is the engine, this function computes only derivatives of derivatives,
+        under the name of that engine.
         """
         params, x, options = jax.tree.unflatten(structure, leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options
