@@ -371,7 +371,7 @@ class AttemptedStep(NamedTuple):
     guard_values: Array  # at the end of the step, (guards, lanes)
     parabola_curvature: Array  # of the parabola through each guard, (guards, lanes)
     parabola_linear_term: Array
-    dip_fraction: Array  # fraction of the step to a possible zero of a guard inside, else 1
+    minimum_fraction: Array  # fraction of the step to a negative guard minimum, else 1
     accumulator_increments: Array | None  # increment of `IntervalState.interval_accumulators`
 
 
@@ -455,7 +455,7 @@ def complete_attempt(
     parabola_terms = fit_guard_parabola(
         tableau, state.guard_values, middle_guard_values, end_guard_values
     )
-    dip_fraction = _earliest_dip_fraction(
+    minimum_fraction = _earliest_minimum_fraction(
         tableau, [state.guard_values, *inner_guard_values, end_guard_values], _is_initiating(state)
     )
     return AttemptedStep(
@@ -463,7 +463,7 @@ def complete_attempt(
         squared_error,
         end_guard_values,
         *parabola_terms,
-        dip_fraction,
+        minimum_fraction,
         accumulator_increments,
     )
 
@@ -504,8 +504,8 @@ def integrator_step(
     is_accurate = is_running & ~event_bracket.is_active & (attempt.squared_error <= 1.0)
     needs_retry = (
         is_accurate
-        & (attempt.dip_fraction < 1.0)
-        & (state.time + h * attempt.dip_fraction > state.time)
+        & (attempt.minimum_fraction < 1.0)
+        & (state.time + h * attempt.minimum_fraction > state.time)
     )
     has_crossed = is_accurate & ~needs_retry & jnp.any(attempt.guard_values <= 0.0, axis=0)
     is_accepted = is_accurate & ~needs_retry & ~has_crossed
@@ -514,7 +514,9 @@ def integrator_step(
     )
     has_reached_event = event.has_reached_event
     step_size_ratio = jnp.where(
-        needs_retry, attempt.dip_fraction, step_size_factor(tableau, attempt.squared_error, h.dtype)
+        needs_retry,
+        attempt.minimum_fraction,
+        step_size_factor(tableau, attempt.squared_error, h.dtype),
     )
     # The last step ends exactly at the time limit.
     time_limit = options.max_phase_time
@@ -671,17 +673,19 @@ def _is_initiating(state: IntervalState) -> Array:
     return (state.time == 0.0) & (state.guard_offset != 0.0)
 
 
-def _earliest_dip_fraction(
+def _earliest_minimum_fraction(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
-    """Return the fraction of the step to the earliest possible guard zero inside it, or 1.
+    """Return the fraction of the step to the earliest negative minimum of a guard inside it; 1
+    without one.
 
-    A guard that is positive at both ends may be negative between them: see `integrator.find_dip`.
-    Initiating guards are not considered.
+    A guard that is positive at both ends may be negative between them: see
+    `integrator.find_guard_minimum`. Initiating guards are not considered.
     """
-    has_dip, dip_fraction = find_dip(tableau, guard_values)
+    has_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
     return jnp.min(
-        jnp.where(has_dip & (guard_values[0] > 0.0) & ~is_initiating, dip_fraction, 1.0), axis=0
+        jnp.where(has_minimum & (guard_values[0] > 0.0) & ~is_initiating, minimum_fraction, 1.0),
+        axis=0,
     )
 
 
