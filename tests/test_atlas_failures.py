@@ -29,10 +29,10 @@ def test_a_case_has_a_reference_rows_a_figure_and_a_section_of_the_page(name):
     assert all((case.title, case.breaks, case.truth, case.source))
     assert any(row["case"] == name for row in FAILURE_TABLE)
     assert (ROOT / "docs" / "figures" / f"failure_{name}.png").exists()
-    page = (ROOT / "docs" / "verification" / "failures.md").read_text()
-    assert f"### {case.title}\n" in page
-    assert f"](#{failures.anchor(case.title)})" in page
-    assert f"<!-- failure {name} -->" in page
+    problems = failures.PROBLEMS.read_text()
+    assert f"## {case.title}\n" in problems
+    assert f"<!-- failure {name} -->" in problems
+    assert f"](hybrid_problems.md#{failures.anchor(case.title)})" in failures.OVERVIEW.read_text()
 
 
 def test_there_are_at_least_ten_cases_and_this_library_is_never_silently_wrong():

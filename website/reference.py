@@ -46,12 +46,16 @@ def describe_fields(settings_class: type) -> dict[str, str]:
 def toml_page() -> str:
     """Return the page of every table and key of a config."""
     lines = [_OPENING]
-    lines += _section("wheel", "Parameters that no design varies; missing keys default to Table 1.")
+    lines += _section(
+        "wheel",
+        "Parameters in this table are the same in all samples. Missing keys have the values of "
+        "Table 1.",
+    )
     wheel = [(f"`{n}`", f"{_DEFAULTS[n]:g}", d.unit, str(d).split(")")[0] + ")", d.description)
              for n, d in PARAMETER_DOMAINS.items()]  # fmt: skip
     wheel.append(("`n_legs`", "8", "", "5 and more", "number of legs, a whole number"))
     lines += format_markdown_table(("key", "default", "unit", "allowed", "meaning"), wheel)
-    lines += _section("model", "The model, and its settings.")
+    lines += _section("model", "This table contains the model and its settings.")
     model_names = list_config_names()
     choices = ", ".join(f'`"{name}"`' for name in model_names)
     rows = [("`name`", "", '`"viscoelastic"`', f"one of {choices}")]
@@ -76,27 +80,38 @@ def toml_page() -> str:
 _OPENING = """# Keys of a config
 
 A config is a TOML file for `vrw gait`, `scan`, `continue` and `tune`. `vrw init` writes examples.
-An unknown key, or a value outside its domain, is refused in one sentence before the computation
+An unknown key, or a value outside its domain, raises an error before the computation
 starts. `python -m website --pages` generates this page from the sources.
 """
 _HEADER = ("key", "default", "meaning")
 _DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
-    ("options", StepOptions, "Numerical choices of a step."),
-    ("gait", GaitConfig, "The walk of `vrw gait`."),
-    ("scan", ScanConfig, "Results of `vrw scan`; a table of its own contains the design."),
-    ("branch", BranchConfig, "The branch of `vrw continue`."),
-    ("tune", TuneConfig, "Objective, bounds and constraints of `vrw tune`."),
+    ("options", StepOptions, "This table contains the numerical options of a step."),
+    ("gait", GaitConfig, "This table contains the walk of `vrw gait`."),
+    (
+        "scan",
+        ScanConfig,
+        "This table contains the results of `vrw scan`. A separate table contains the design.",
+    ),
+    ("branch", BranchConfig, "This table contains the branch of `vrw continue`."),
+    (
+        "tune",
+        TuneConfig,
+        "This table contains the objective, bounds and constraints of `vrw tune`.",
+    ),
 )
 _GRID = (
-    "`parameter = [1.0, 2.0]` lists values, `parameter = { from = 1.0, to = 2.0, count = 5 }` "
-    "spaces them evenly. Parameters are those of `[wheel]`, and `friction` for models that "
-    "have it. A config has at most one design.",
+    "`parameter = [1.0, 2.0]` lists values, and `parameter = { from = 1.0, to = 2.0, count = 5 }` "
+    "defines equally spaced values. The parameters are those of `[wheel]`, and `friction` for "
+    "models with friction. A config has at most one design.",
 )
-_SAMPLES = ("`parameter = [1.0, 2.0]`: lists of equal length, one sample per index.",)
+_SAMPLES = (
+    "`parameter = [1.0, 2.0]` lists values. All lists have equal length and one sample per index.",
+)
 _DRAWN_KEYS = (
-    "`n = 512` is the number of samples (rows for `saltelli`), a power of two. `seed = 0` selects "
-    "the sequence. `parameter = [lower, upper]` gives the range of each parameter.",
+    "`n = 512` is the number of samples, a power of two (for `saltelli`, the number of groups of "
+    "samples). `seed = 0` selects the sequence. `parameter = [lower, upper]` is the range of each "
+    "parameter.",
 )
 
 
@@ -144,15 +159,18 @@ cycles. Scans also accept derivatives, as in `"d speed / d damping"`. `python -m
 generates this page from the sources.
 """
 _GROUPS = (
-    ("Of a step", STEP_MEASURES, "Measures of `vrw.step`, gaits and scans."),
-    ("Margins", MARGIN_MEASURES, "Positive while the condition holds: "
-        "`step.margins`, scans."),
-    ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "In addition to "
-        "those of a step, which every model has."),
-    ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES, "Of a limit cycle."),
-    ("Of a trajectory", TRAJECTORY_MEASURES, "Coordinates and variables of `vrw.simulate`."),
-    ("Of a trajectory with unilateral contact", CONTACT_MEASURES, "Variables of each leg."),
-    ("Parameters", PARAMETER_MEASURES, "Axes of scans and branches."),
+    ("Of a step", STEP_MEASURES, "`vrw.step`, gaits and scans report these measures."),
+    ("Margins", MARGIN_MEASURES, "A margin is positive while its condition holds. "
+        "`step.margins` and scans report margins."),
+    ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Steps with unilateral "
+        "contact report these measures in addition to those of a step."),
+    ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES,
+        "Limit cycles report these measures."),
+    ("Of a trajectory", TRAJECTORY_MEASURES,
+        "`vrw.simulate` returns these coordinates and variables."),
+    ("Of a trajectory with unilateral contact", CONTACT_MEASURES,
+        "`vrw.simulate` returns these variables of each leg."),
+    ("Parameters", PARAMETER_MEASURES, "The parameters are the axes of scans and branches."),
 )  # fmt: skip
 
 

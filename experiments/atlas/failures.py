@@ -4,8 +4,8 @@
 
 Each case is a module of experiments/atlas/cases with its truth. The rows of the table are what each
 method gave in one run of the whole: its answer, its error, its own words, what it cost.
-docs/verification/failures.md opens with them. With --only these cases are run again; `run` tells
-when.
+docs/verification/failures.md and hybrid_problems.md contain them. With --only these cases are run
+again; `run` gives the time.
 """
 
 import importlib
@@ -42,7 +42,8 @@ ORDER = (
     "singular_field", "tangent_guards", "simplest_walker", "compass_gait", "rimless_wheel",
 )  # fmt: skip
 NAMES = [name for name in ORDER if name in {m.name for m in pkgutil.iter_modules(cases.__path__)}]
-TEXT = DOCS / "verification" / "failures.md"
+OVERVIEW = DOCS / "verification" / "failures.md"
+PROBLEMS = DOCS / "verification" / "hybrid_problems.md"
 
 
 def import_case(name: str) -> Case:
@@ -116,7 +117,7 @@ def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()) -> None:
-    """Tables of the page: one line for each case, and under each case one for each method.
+    """Write the tables of both pages: a line for each case, and for each method of a case.
 
     Blocks of the cases that were measured now get a new line of command, commit, machine and date.
     """
@@ -130,7 +131,7 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
             "; ".join(m for m, verdict, *_ in methods if verdict == label)
             for label in VERDICT_LABELS.values()
         ]
-        link = f"[{case.title}](#{anchor(case.title)})"
+        link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *result_list, f"{max(errors):.0e}" if errors else "-"])
         origins.append([link, case.breaks, case.truth, case.source])
         header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
@@ -138,12 +139,12 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         table = format_markdown(header, methods)
         measured = name in measured_names
         source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None
-        replace_block(TEXT, f"failure {name}", table, source)
+        replace_block(PROBLEMS, f"failure {name}", table, source)
     header = ["problem", *VERDICT_LABELS.values(), "error of vrw_jax over condition"]
     source = describe_run("experiments.atlas.failures") if len(measured_names) > 1 else None
-    replace_block(TEXT, "failures", format_markdown(header, results), source)
+    replace_block(OVERVIEW, "failures", format_markdown(header, results), source)
     header = ["problem", "difficulty", "reference", "origin"]
-    replace_block(TEXT, "origins of failures", format_markdown(header, origins), source)
+    replace_block(OVERVIEW, "origins of failures", format_markdown(header, origins), source)
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:

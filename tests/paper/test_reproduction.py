@@ -91,16 +91,16 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.ExitCode.CHECK_FAILED
     table = facts.compute_facts(broken)
-    assert f"{sum(fact.holds for fact in table)} of {len(table)} hold" in result.output
-    assert "26 that the paper publishes, 28 by independent code" in " ".join(result.output.split())
+    assert f"{sum(fact.holds for fact in table)} of {len(table)} facts hold" in result.output
+    assert "26 with published numbers, 28 with independent code" in " ".join(result.output.split())
     assert "does not" in result.output
     text = (tmp_path / "facts.md").read_text(encoding="utf-8")
     assert "**does not hold**" in text
-    assert "Not: λ4⁺ is gone at c = 220" in text
+    assert "Not: λ4⁺ is not positive at c = 220" in text
     with (tmp_path / "facts.csv").open(encoding="utf-8", newline="") as file:
         verdicts = {row["claim"]: row["holds"] for row in csv.DictReader(file)}
-    assert verdicts["λ4⁺ is gone at c = 220"] == "does not hold"
-    assert verdicts["λ2⁺ is gone at c = 4"] == "holds"
+    assert verdicts["λ4⁺ is not positive at c = 220"] == "does not hold"
+    assert verdicts["λ2⁺ is not positive at c = 4"] == "holds"
 
 
 def _scale_results(results: xr.Dataset, factor: float) -> xr.Dataset:

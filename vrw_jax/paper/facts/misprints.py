@@ -59,29 +59,29 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
 MISPRINT_CLAIMS = ClaimGroup(
     "Misprints of the paper, with the evidence", _compute_misprint_numbers, (
     Claim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)", "−L1 sin θ − L2 sin(θ+α)",
-          "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} mended (must be 0)",
+          "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} corrected (must be 0)",
           lambda n: n.wrong > 0.1 and n.right < 1e-12,
           "1e-12 m/s: rounding; as printed far from it"),
     Claim("eq. (35): the impulse is −X⁻¹ J q̇†", "eq. (35)", "the projector of eq. (20)",
-          "as printed five numbers, eq. (20)'s velocities; mended M Δq̇ = Jᵀ λ_I to "
+          "as printed five numbers, eq. (20)'s velocities; corrected M Δq̇ = Jᵀ λ_I to "
           "{residual:.0e} N·s, λ_I4 = {impulse:.4f}, here {here:.4f} N·s",
           lambda n: n.velocities and n.residual < 1e-10 and n.off <= STEP_ERROR_TOLERANCE,
           "1e-10 N·s: rounding; λ_I4 to the error of a step"),
-    Claim("eqs (16), (17): the bare L̇1 is L̇1⁻", "eqs (16), (17)", "L̇1",
+    Claim("eqs (16), (17): L̇1 without a superscript is L̇1⁻", "eqs (16), (17)", "L̇1",
           "landing foot's velocity off by {off_old:.0e} m/s with L̇1⁻, "
           "by {off_new:.2f} with the new L̇1 = 0",
           lambda n: n.off_old < 1e-8 and n.off_new > 1e-2,
           "1e-8 m/s: error of the difference quotient"),
-    Claim("§5.2 prints φ = 0.10 for Fig. 10: there gaits are nearly at rest", "§5.2",
+    Claim("§5.2 prints φ = 0.10 for Fig. 10, where gaits are nearly at rest", "§5.2",
           "c = 100: 96 % DLS, T ≈ 4.5 s (independent code)",
           "{share:.1f} % DLS, T = {period:.2f} s",
           lambda n: n.slow_settled and agrees_within(share=(96.0, 0.5), period=(4.5, 0.05))(n)),
-    Claim("and λ4⁺ does not vanish at c = 220 at φ = 0.10", "§5.2",
+    Claim("λ4⁺ does not vanish at c = 220 at φ = 0.10", "§5.2",
           "0 at 220 (at φ = 0.30 it is)",
           "λ4⁺ ≥ {rear:.0f} N up to c = {last:.0f}; at c = {end:.0f}: {end_outcome}",
           lambda n: n.rear > 10.0 and not n.end_walks,
           "10 N: far from zero; no gait left at 220 for λ4⁺ to vanish on"),
-    Claim("and λ2⁺ does not vanish at c = 4 at φ = 0.10", "§5.2", "0 at 4 (at φ = 0.30 it is)",
+    Claim("λ2⁺ does not vanish at c = 4 at φ = 0.10", "§5.2", "0 at 4 (at φ = 0.30 it is)",
           "λ2⁺ = {low:.1f} N at c = 4", lambda n: n.low > 1.0 and n.low_settled,
           "1 N: far from zero"),
 ))

@@ -20,9 +20,9 @@ from vrw_jax.printing import format_markdown_table
 INTRODUCTION = (
     "The paper is *Modeling and analysis of passive viscoelastic-legged rimless wheel that "
     "generates measurable period of double-limb support*. “Independent code” is a solver in the "
-    "paper's own five constrained coordinates; it provides the reference if the paper prints no "
+    "paper's five constrained coordinates. It provides the reference if the paper prints no "
     "number, or only a curve. A tolerance is half a unit of the last published digit unless the "
-    "row gives another reason."
+    "table gives another reason."
 )
 
 CLAIM_GROUPS = (
@@ -42,8 +42,8 @@ def compute_facts(evidence: Evidence) -> list[Fact]:
 def summarize_facts(facts: Sequence[Fact]) -> str:
     """Return a sentence on how many facts hold and where their numbers come from."""
     n, n_by_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
-    sources_text = f"{n - n_by_code} that the paper publishes, {n_by_code} by independent code"
-    return f"{sum(fact.holds for fact in facts)} of {n} hold: {sources_text}"
+    sources_text = f"{n - n_by_code} with published numbers, {n_by_code} with independent code"
+    return f"{sum(fact.holds for fact in facts)} of {n} facts hold: {sources_text}"
 
 
 def format_facts_page(facts: Sequence[Fact]) -> str:
@@ -52,8 +52,8 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
     lines = [
         "# The paper's facts",
         "",
-        "After reading this page you can compare every number that the paper publishes with the "
-        "computed one. `vrw reproduce --out results` computes this page and the figures again.",
+        "This page compares every number that the paper publishes with the computed number. "
+        "`vrw reproduce --out results` computes this page and the figures.",
         "",
         f"{summarize_facts(facts)}."
         + (
@@ -64,9 +64,9 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
         "",
         INTRODUCTION,
         "",
-        "Figure 10 is drawn at slope 0.30 rad, since Section 5.2 prints 0.10, at which the gaits "
-        "do not fit its numbers (last group). With Coulomb friction the rear foot would slip in "
-        "the landing; this model holds it, as the paper does.",
+        "Figure 10 uses the slope 0.30 rad. Section 5.2 prints 0.10, but at this slope the gaits "
+        "do not agree with the numbers of the figure (last group). With Coulomb friction the rear "
+        "foot would slip in the landing. In this model, as in the paper, it does not slip.",
     ]
     for title, group in itertools.groupby(facts, lambda fact: fact.group):
         rows = []
