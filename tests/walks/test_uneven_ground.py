@@ -192,7 +192,7 @@ def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
     edge = 0.21
     for _ in range(5):
         found = at([edge], derivatives=("next_slope",))
-        edge = edge - found.stopper_margin[0] / found.jacobian[0, 3, 0]
+        edge = edge - found.event_order_margin[0] / found.jacobian[0, 3, 0]
     near = at([edge - 1e-6, edge + 1e-6], derivatives=("next_slope",))
     early = vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
     assert near.outcome.tolist() == [early, vrw.Outcome.STEPPED]
@@ -200,7 +200,9 @@ def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
     assert abs(slopes[1] - slopes[0]) < 1e-5 * slopes[0]
     h, options = 1e-5, TIGHT
     ends = [at([0.29 + d], options=options) for d in (h, -h)]
-    rows = [np.array([*end.state[:, 0], *end.rear_impulse, *end.stopper_margin]) for end in ends]
+    rows = [
+        np.array([*end.state[:, 0], *end.rear_impulse, *end.event_order_margin]) for end in ends
+    ]
     jacobian = at([0.29], derivatives=("next_slope",)).jacobian[0, :, 0]
     np.testing.assert_allclose(jacobian, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
 

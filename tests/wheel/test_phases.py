@@ -76,7 +76,7 @@ def test_dependent_coordinates_follow_those_of_the_phase(index):
 @each
 def test_phase_coordinates_reproduce_the_motion(index):
     phase, q, v = make_state_at(index)
-    assert phase.own_coordinates(q[0], phase.motion_at(q, v)) == (q, v)
+    assert phase.select_coordinates(q[0], phase.motion_at(q, v)) == (q, v)
 
 
 def test_forces_agree_with_the_equations_of_motion():

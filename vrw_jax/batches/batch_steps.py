@@ -34,7 +34,7 @@ from vrw_jax.batches.walk_batch import (
     StepwiseParameter,
     WalkBatch,
     complete_batch_slopes,
-    lane_index,
+    make_lane_index,
 )
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models import (
@@ -68,7 +68,7 @@ BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
 BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngine)
 
 PAPER_STEP_INPUTS = (START_NAME, *PARAMETER_NAMES)
-"""Inputs with respect to which a step of the paper's model can be differentiated."""
+"""Inputs of a step of the paper's model with respect to which derivatives are available."""
 
 SLOPE_INDEX = PARAMETER_NAMES.index("slope")
 """Index of the slope among the inputs of a step: parameters, section state, slope of the next
@@ -144,10 +144,18 @@ def step_batch(
     n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
     checked_states: np.ndarray = check_section_state(states, "states", check_numpy_reals)
-    columns = _check_parameters(params, checked_states, checked_model, options, n_steps)
-    checked_states = checked_states.astype(columns[0].dtype, copy=False)
+    parameter_columns = _check_parameters(params, checked_states, checked_model, options, n_steps)
+    checked_states = checked_states.astype(parameter_columns[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
-    arguments = checked_model, columns, checked_states, n_steps, options, engine, params.n_legs
+    arguments = (
+        checked_model,
+        parameter_columns,
+        checked_states,
+        n_steps,
+        options,
+        engine,
+        params.n_legs,
+    )
     derivative_names = _check_derivatives(
         derivatives, CONTACT_STEP_INPUTS if has_contact_kernel else PAPER_STEP_INPUTS, engine
     )
@@ -161,7 +169,10 @@ def step_batch(
 def _check_derivatives(
     derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
 ) -> list[str]:
-    """Return the requested derivatives, or raise a ValueError if one is not available."""
+    """Return the requested derivatives as a list.
+
+    Raises `ValueError` if one is not available.
+    """
     names = list(derivatives)
     for name in names:
         if name not in known_names:
@@ -184,34 +195,38 @@ def _check_parameters(
     options: StepOptions,
     n_steps: int,
 ) -> list[np.ndarray]:
-    """Return the parameters, one value for all or one per element, with slopes of each step too.
+    """Return the parameters, one array for all elements or per element, with slopes over steps too.
 
-    Raises: ValueError: the shapes of states or parameters do not fit.
+    Raises `ValueError` if the shapes of states or parameters do not fit.
     """
-    sizes = [3]
+    section_sizes = [3]
     if states.ndim != 2 or states.shape[1] != 3:
-        sizes = sorted({3, model.section_size(params)})
-    if states.ndim != 2 or states.shape[1] not in sizes:
+        section_sizes = sorted({3, model.section_size(params)})
+    if states.ndim != 2 or states.shape[1] not in section_sizes:
         raise ValueError(
             f"states have shape {states.shape}, but section states have the shape (elements, "
-            f"{' or '.join(map(str, sizes))}): write states[None] for a single one."
+            f"{' or '.join(map(str, section_sizes))}): write states[None] for a single one."
         )
-    n_states, columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
-    parameter_dtype = np.result_type(*(column.dtype for column in columns))
+    n_states, parameter_columns = len(states), [getattr(params, name) for name in PARAMETER_NAMES]
+    parameter_dtype = np.result_type(
+        *(parameter_values.dtype for parameter_values in parameter_columns)
+    )
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
     friction = getattr(model, FRICTION_NAME, np.zeros(()))
-    for name, column in zip((*PARAMETER_NAMES, FRICTION_NAME), (*columns, friction), strict=True):
-        varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(column) == 2
-        over_steps = [(n_states, n_steps), (n_states, n_steps + 1)] * varies_by_step
-        if np.shape(column) not in ((), (n_states,), *over_steps):
+    for name, parameter_values in zip(
+        (*PARAMETER_NAMES, FRICTION_NAME), (*parameter_columns, friction), strict=True
+    ):
+        varies_by_step = name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
+        shapes_over_steps = [(n_states, n_steps), (n_states, n_steps + 1)] * varies_by_step
+        if np.shape(parameter_values) not in ((), (n_states,), *shapes_over_steps):
             raise ValueError(
-                f"{name} has shape {np.shape(column)}, but there are {n_states} states"
+                f"{name} has shape {np.shape(parameter_values)}, but there are {n_states} states"
                 f"{f' and {n_steps} steps' * varies_by_step}: give one value for all, or one for "
                 "each"
                 f"{f' and {n_steps} or {n_steps + 1} of each over its steps' * varies_by_step}."
             )
     dtype = np.promote_types(parameter_dtype, states.dtype)
-    return [np.asarray(column, dtype) for column in columns]
+    return [np.asarray(parameter_values, dtype) for parameter_values in parameter_columns]
 
 
 def _step_paper_model(
@@ -224,85 +239,103 @@ def _step_paper_model(
     n_legs: int,
     durations: Any,
     derivative_names: Sequence[str],
-    selection: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
+    selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> StepBatchResult:
-    """Return `step_batch` of the paper's wheel, or of another model by the diffrax engine."""
-    slopes, stepwise = _split_slopes_by_step(parameter_columns[SLOPE_INDEX], n_steps, engine)
+    """Return the result of `step_batch` for the paper's wheel, or for another model by diffrax."""
+    slopes, stepwise_parameters = _split_slopes_by_step(
+        parameter_columns[SLOPE_INDEX], n_steps, engine
+    )
     parameter_columns = [
         slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameter_columns)
     ]
-    order = sort_by_work(parameter_columns, states)
-    wheels = np.empty((len(parameter_columns), len(states)), states.dtype)
-    for row, column in zip(wheels, parameter_columns, strict=True):
-        row[:] = column[order] if column.ndim else column
-    is_uneven = bool(stepwise)
-    slopes = slopes.take(order, -1) if is_uneven else slopes
-    walks = WalkBatch(states.T.take(order, -1), derivative_names, PARAMETER_NAMES, stepwise)
-    settings = n_legs, walks.input_indices
-    engines = {SolverIndex.NAMED: _select_engine(engine, model, options, *settings)}
-    solver_index = np.full(len(states), SolverIndex.NAMED, np.int32)
+    work_order = sort_by_work(parameter_columns, states)
+    parameter_rows = np.empty((len(parameter_columns), len(states)), states.dtype)
+    for parameter_row, column in zip(parameter_rows, parameter_columns, strict=True):
+        parameter_row[:] = column[work_order] if column.ndim else column
+    is_uneven = bool(stepwise_parameters)
+    slopes = slopes.take(work_order, -1) if is_uneven else slopes
+    walks = WalkBatch(
+        states.T.take(work_order, -1), derivative_names, PARAMETER_NAMES, stepwise_parameters
+    )
+    engine_settings = n_legs, walks.input_indices
+    engine_by_solver = {
+        SolverIndex.REQUESTED: _select_engine(engine, model, options, *engine_settings)
+    }
+    solver_index = np.full(len(states), SolverIndex.REQUESTED, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
-    engine_name = engines[SolverIndex.NAMED].name
+    engine_name = engine_by_solver[SolverIndex.REQUESTED].name
     if engine == "auto" and engine_name == "lanes":
-        solver_names = (options.solver, selection.stable_solver, selection.implicit_solver)
-        actual_options = options.with_derivative_tolerances() if derivative_names else options
-        solver_index = select_solver(wheels, actual_options, selection)
-    if np.any(solver_index != SolverIndex.NAMED):
-        implicit_options = dataclasses.replace(options, solver=selection.implicit_solver)
-        stable_options = dataclasses.replace(options, solver=selection.stable_solver)
-        stable_options = stable_options.with_tightened_tolerances(selection.stable_tolerance_factor)
-        engines[SolverIndex.STABLE] = _select_engine("lanes", model, stable_options, *settings)
-        engines[SolverIndex.IMPLICIT] = _select_engine(
-            "diffrax", model, implicit_options, *settings
+        solver_names = (
+            options.solver,
+            selection_options.stable_solver,
+            selection_options.implicit_solver,
+        )
+        tightened_options = options.with_derivative_tolerances() if derivative_names else options
+        solver_index = select_solver(parameter_rows, tightened_options, selection_options)
+    if np.any(solver_index != SolverIndex.REQUESTED):
+        implicit_options = dataclasses.replace(options, solver=selection_options.implicit_solver)
+        stable_options = dataclasses.replace(options, solver=selection_options.stable_solver)
+        stable_options = stable_options.with_tightened_tolerances(
+            selection_options.stable_tolerance_factor
+        )
+        engine_by_solver[SolverIndex.STABLE] = _select_engine(
+            "lanes", model, stable_options, *engine_settings
+        )
+        engine_by_solver[SolverIndex.IMPLICIT] = _select_engine(
+            "diffrax", model, implicit_options, *engine_settings
         )
     if engine == "collocation":
         engine_name = engine
         if durations is None or np.shape(durations) != states.shape:
-            shape = None if durations is None else np.shape(durations)
+            durations_shape = None if durations is None else np.shape(durations)
             raise ValueError(
-                f"durations have shape {shape}, but collocation needs those of DLS, SLS-I and "
-                "SLS-II to some per cent, shape (elements, 3): give those of a limit cycle, or "
-                "take 'lanes'."
+                f"durations have shape {durations_shape}, but collocation needs those of DLS, "
+                "SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a limit "
+                "cycle, or take 'lanes'."
             )
         expected_durations = check_numpy_reals("durations", durations)
-        walks.durations[:] = expected_durations.astype(wheels.dtype).T.take(order, -1)
+        walks.durations[:] = expected_durations.astype(parameter_rows.dtype).T.take(work_order, -1)
     for k in range(n_steps):
-        active = walks.active_lanes()
+        active_lanes = walks.active_lanes()
         if is_uneven:
-            wheels[SLOPE_INDEX] = slopes[k]
-        if engine == "collocation" and len(active):
-            index = lane_index(active, walks)
-            lane_arrays = wheels[:, index], walks.section_state[:, index], walks.durations[:, index]
-            collocated = _step_by_collocation(
-                engines[SolverIndex.NAMED], model, n_legs, *lane_arrays
+            parameter_rows[SLOPE_INDEX] = slopes[k]
+        if engine == "collocation" and len(active_lanes):
+            lane_index = make_lane_index(active_lanes, walks)
+            lane_arrays = (
+                parameter_rows[:, lane_index],
+                walks.section_state[:, lane_index],
+                walks.durations[:, lane_index],
             )
-            walks.record_step(active, *collocated)
+            collocation_result = _step_by_collocation(
+                engine_by_solver[SolverIndex.REQUESTED], model, n_legs, *lane_arrays
+            )
+            walks.record_step(active_lanes, *collocation_result)
             continue
-        for engine_index, selected_engine in engines.items():
-            lane_indices = active[solver_index[active] == engine_index]
+        for engine_index, selected_engine in engine_by_solver.items():
+            lane_indices = active_lanes[solver_index[active_lanes] == engine_index]
             if len(lane_indices) > 0:
-                index = lane_index(lane_indices, walks)
-                next_slopes = (slopes[k + 1][index],) if is_uneven else ()
+                lane_index = make_lane_index(lane_indices, walks)
+                next_slopes = (slopes[k + 1][lane_index],) if is_uneven else ()
                 result = selected_engine.take_step(
-                    wheels[:, index], walks.section_state[:, index], *next_slopes
+                    parameter_rows[:, lane_index], walks.section_state[:, lane_index], *next_slopes
                 )
                 if engine_index == SolverIndex.STABLE:
                     # A phase may last longer than `select_solver` assumes. The implicit solver,
-                    # whose turn is next, then repeats the step.
+                    # which is next, then repeats the step.
                     has_failed = result[2] == Outcome.SOLVER_FAILED
                     solver_index[lane_indices[has_failed]] = SolverIndex.IMPLICIT
                     lane_indices = lane_indices[~has_failed]
                     result = tuple(part[..., ~has_failed] for part in result)
                 walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
-    return walks.to_result(order, solver_index, engine_name, solver_names)
+    return walks.to_result(work_order, solver_index, engine_name, solver_names)
 
 
 def _split_slopes_by_step(
     slope: np.ndarray, n_steps: int, engine: str
 ) -> tuple[Any, dict[str, StepwiseParameter]]:
-    """Return the slopes of the lines of all steps, and how they enter the steps.
+    """Return the slopes of the lines of all steps, and the role of the slope in the steps.
 
-    On flat ground they are a list with the slope, and an empty mapping.
+    On flat ground the results are a list with the slope, and an empty mapping.
     """
     if slope.ndim < 2:
         return [slope], {}
@@ -312,38 +345,42 @@ def _split_slopes_by_step(
             "take 'auto', 'lanes' or 'diffrax'."
         )
     n_values = slope.shape[1]
-    terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_values - 1), 1.0))
-    stepwise_slope = StepwiseParameter((SLOPE_INDEX, NEXT_SLOPE_INDEX), n_values, terms)
+    chain_rule_terms = lambda k: ((0, k, 1.0), (1, min(k + 1, n_values - 1), 1.0))
+    stepwise_slope = StepwiseParameter((SLOPE_INDEX, NEXT_SLOPE_INDEX), n_values, chain_rule_terms)
     return complete_batch_slopes(slope, n_steps), {"slope": stepwise_slope}
 
 
-def sort_by_work(columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
+def sort_by_work(parameter_columns: list[np.ndarray], states: np.ndarray) -> np.ndarray:
     """Return an order of the batch in which wheels of similar work are side by side.
 
-    A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There
-    stability limits the solver's steps by m/c, and Leg 2 extends at the rate k (Ls - L)/c from its
-    length at release. The exponents are rounded from a fit to the solver's steps of wheels near
-    their gaits and away from them (`python -m experiments.speed.straggler_steps`).
+    A group of lanes takes as long as its slowest lane. Most of a step's work is in SLS-I. There,
+    stability limits the solver's steps by m/c. Leg 2 extends at the rate k (Ls - L)/c from its
+    length at release. The exponents are rounded from a fit to solver steps of wheels near and away
+    from their gaits (`python -m experiments.speed.straggler_steps`).
     """
-    values_by_name = dict(zip(PARAMETER_NAMES, columns, strict=True))
-    single_precision = lambda name: np.asarray(values_by_name[name], np.float32)
+    values_by_name = dict(zip(PARAMETER_NAMES, parameter_columns, strict=True))
+    as_float32 = lambda name: np.asarray(values_by_name[name], np.float32)
     with np.errstate(all="ignore"):
         theta, dtheta = states.T[:2].astype(np.float32)
-        length, mass = single_precision("locked_length"), single_precision("leg_mass")
-        work = np.log(single_precision("damping") / mass) - 0.25 * np.log(
-            single_precision("stiffness") / mass
+        leg_length, leg_mass = as_float32("locked_length"), as_float32("leg_mass")
+        log_work = np.log(as_float32("damping") / leg_mass) - 0.25 * np.log(
+            as_float32("stiffness") / leg_mass
         )
-        work = work + 0.8 * np.log(dtheta) + 0.65 * np.log(length / single_precision("gravity"))
-        work = work + theta - 7.0 * single_precision("natural_length") / length
-    return np.argsort(work)
+        log_work = (
+            log_work + 0.8 * np.log(dtheta) + 0.65 * np.log(leg_length / as_float32("gravity"))
+        )
+        log_work = log_work + theta - 7.0 * as_float32("natural_length") / leg_length
+    return np.argsort(log_work)
 
 
 class _BatchEngine(NamedTuple):
-    """One gait step of any number of lanes, from numpy to numpy, lanes on the last axis."""
+    """Engine that takes one gait step of any number of lanes, in numpy arrays with lanes on the
+    last axis.
+    """
 
     name: str
     take_step: Callable[..., tuple[np.ndarray, ...]]
-    """A function of parameters, section states and, on uneven ground, slopes of the next lines. It
+    """Function of parameters, section states and, on uneven ground, slopes of the next lines. It
     returns section state, durations, outcome, solver steps and, if requested, the Jacobian."""
 
 
@@ -379,14 +416,14 @@ def _step_by_lanes(
     states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Take one gait step by the lane engine; see `_BatchEngine.take_step`."""
-    option_leaves, structure = jax.tree.flatten(options)
-    uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    """Return one gait step by the lane engine; see `_BatchEngine.take_step`."""
+    option_leaves, options_structure = jax.tree.flatten(options)
+    lane_independent = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
     tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
-    assert tableau is not None  # checked by `_select_engine`
+    assert tableau is not None  # `_select_engine` has checked the solver.
 
-    def lane_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
-        current_options = jax.tree.unflatten(structure, uniform)
+    def lane_step(lane_independent: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+        current_options = jax.tree.unflatten(options_structure, lane_independent)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
 
@@ -400,28 +437,30 @@ def _step_by_lanes(
             return jnp.stack([*result.section_state, *result.durations]), diagnostics
 
         if not input_indices:
-            values, diagnostics = step_outputs(*lanes)
-            return (*diagnostics, values)
+            step_values, diagnostics = step_outputs(*lanes)
+            return (*diagnostics, step_values)
         # With respect to all inputs, two columns follow from the units.
-        needs_all = len(input_indices) == len(lanes)
-        compute_columns = complete_jacobian_columns if needs_all else compute_jacobian_columns
-        jacobian, values, diagnostics = compute_columns(step_outputs, lanes, input_indices)
-        return (*diagnostics, values, jacobian)
+        needs_all_inputs = len(input_indices) == len(lanes)
+        compute_columns = (
+            complete_jacobian_columns if needs_all_inputs else compute_jacobian_columns
+        )
+        jacobian, step_values, diagnostics = compute_columns(step_outputs, lanes, input_indices)
+        return (*diagnostics, step_values, jacobian)
 
-    settings = (
+    cache_key = (
         "gait step",
         n_legs,
         stop_at_lift_off,
-        structure,
+        options_structure,
         input_indices,
         *("uneven" for _ in next_slopes),
     )
     n_inputs = N_STEP_INPUTS + len(next_slopes)
-    limits = simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_LIMITS
+    register_limits = simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_LIMITS
     lane_arrays = [*wheels, *states, *next_slopes]
-    results = run_compiled(lane_step, uniform, lane_arrays, settings, limits)
-    _, outcome, n_solver_steps, values, *jacobian = results
-    return values[:3], values[3:], outcome, n_solver_steps, *jacobian
+    results = run_compiled(lane_step, lane_independent, lane_arrays, cache_key, register_limits)
+    _, outcome, n_solver_steps, step_values, *jacobian = results
+    return step_values[:3], step_values[3:], outcome, n_solver_steps, *jacobian
 
 
 def _step_by_collocation(
@@ -432,30 +471,35 @@ def _step_by_collocation(
     states: np.ndarray,
     durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Take one step by collocation, and by the lane engine for lanes that fail the check.
+    """Return one step by collocation, and which lanes passed its check.
 
-    Returns the results as `_BatchEngine.take_step` does, and which lanes passed the check.
+    Lanes that failed are stepped by the lane engine. The results are those of
+    `_BatchEngine.take_step`.
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def lane_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+    def lane_step(lane_independent: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
         params = wheel_from_parameters(lanes[:n_parameters], n_legs)
         x, expected_durations = tuple(lanes[n_parameters:-3]), tuple(lanes[-3:])
         result = collocation_gait_step(params, x, expected_durations, stop_at_lift_off)
         is_unfinished = jnp.zeros_like(result.is_trusted)
-        values = jnp.stack([*result.section_state, *result.durations])
-        return is_unfinished, result.is_trusted, values
+        step_values = jnp.stack([*result.section_state, *result.durations])
+        return is_unfinished, result.is_trusted, step_values
 
-    settings = ("gait step by collocation", n_legs, stop_at_lift_off)
-    _, is_trusted, values = run_compiled(lane_step, [], [*wheels, *states, *durations], settings)
+    cache_key = ("gait step by collocation", n_legs, stop_at_lift_off)
+    _, is_trusted, step_values = run_compiled(
+        lane_step, [], [*wheels, *states, *durations], cache_key
+    )
     outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
-    result = values[:3], values[3:], outcome, n_solver_steps
-    untrusted = np.flatnonzero(~is_trusted)
-    if len(untrusted) > 0:
-        repeated = lane_engine.take_step(wheels[:, untrusted], states[:, untrusted])
-        for all_values, new_values in zip(result, repeated, strict=True):
-            all_values[..., untrusted] = new_values
-    return result, is_trusted
+    step_results = step_values[:3], step_values[3:], outcome, n_solver_steps
+    untrusted_lanes = np.flatnonzero(~is_trusted)
+    if len(untrusted_lanes) > 0:
+        repeated_results = lane_engine.take_step(
+            wheels[:, untrusted_lanes], states[:, untrusted_lanes]
+        )
+        for all_values, new_values in zip(step_results, repeated_results, strict=True):
+            all_values[..., untrusted_lanes] = new_values
+    return step_results, is_trusted
 
 
 def _step_by_diffrax(
@@ -467,44 +511,48 @@ def _step_by_diffrax(
     states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Take one step by the model's own step under `jax.vmap`; see `_BatchEngine.take_step`."""
-    convert = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, wheels.dtype))
-    tight_options = convert(options.with_derivative_tolerances())
-    options = convert(options)
-    rows = np.concatenate([wheels, states, *(row[None] for row in next_slopes)]).T
+    """Return one step by the model's step under `jax.vmap`; see `_BatchEngine.take_step`."""
+    convert_leaves = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, wheels.dtype))
+    tight_options = convert_leaves(options.with_derivative_tolerances())
+    options = convert_leaves(options)
+    input_rows = np.concatenate(
+        [wheels, states, *(slope_values[None] for slope_values in next_slopes)]
+    ).T
 
-    def step_rows(rows: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]) -> Any:
-        step = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
-        results = map_in_batches(step, (batch_sizes.DIFFRAX_BATCH_SIZE,), rows)
+    def step_rows(
+        input_rows: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
+    ) -> Any:
+        step_block = functools.partial(_vmapped_step, model, options, n_legs, input_indices)
+        results = map_in_batches(step_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), input_rows)
         return jax.tree.map(lambda x: np.array(x).T, results)
 
-    def differentiate_rows(rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the step with derivatives; these are zeros for elements without them.
+    def differentiate_rows(input_rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the step with derivatives, which are zero for elements without derivatives.
 
-        diffrax raises for the whole batch if the linear equations of an implicit solver's
-        derivative cannot be solved for one element. That element is isolated by bisection.
+        diffrax raises an error for the whole batch if the linear equations of an implicit solver's
+        derivative cannot be solved for one element. Bisection isolates that element.
         """
         try:
-            results: tuple[np.ndarray, ...] = step_rows(rows, options, input_indices)
+            results: tuple[np.ndarray, ...] = step_rows(input_rows, options, input_indices)
         except eqx.EquinoxRuntimeError:
-            *values, n_solver_steps = step_rows(rows, tight_options, ())
-            outcome = values[2]
-            jacobian = np.zeros((len(input_indices), 6, len(rows)), wheels.dtype)
-            results = (*values, n_solver_steps, jacobian)
+            *step_values, n_solver_steps = step_rows(input_rows, tight_options, ())
+            outcome = step_values[2]
+            jacobian = np.zeros((len(input_indices), 6, len(input_rows)), wheels.dtype)
+            results = (*step_values, n_solver_steps, jacobian)
             has_stepped = np.flatnonzero(outcome == Outcome.STEPPED)
-            if len(has_stepped) < len(rows):
-                parts = [has_stepped]
-            elif len(rows) > 1:
-                parts = np.array_split(has_stepped, 2)
+            if len(has_stepped) < len(input_rows):
+                row_parts = [has_stepped]
+            elif len(input_rows) > 1:
+                row_parts = np.array_split(has_stepped, 2)
             else:
-                parts, outcome[:] = [], Outcome.SOLVER_FAILED
-            for part in (part for part in parts if len(part)):
-                own_results = differentiate_rows(rows[part])
-                for all_values, own_values in zip(results, own_results, strict=True):
-                    all_values[..., part] = own_values
+                row_parts, outcome[:] = [], Outcome.SOLVER_FAILED
+            for row_part in (row_part for row_part in row_parts if len(row_part)):
+                part_results = differentiate_rows(input_rows[row_part])
+                for all_values, part_values in zip(results, part_results, strict=True):
+                    all_values[..., row_part] = part_values
         return results
 
-    return differentiate_rows(rows) if input_indices else step_rows(rows, options, ())
+    return differentiate_rows(input_rows) if input_indices else step_rows(input_rows, options, ())
 
 
 @eqx.filter_jit
@@ -513,7 +561,7 @@ def _vmapped_step(
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    rows: Array,
+    input_rows: Array,
 ) -> tuple[Array, ...]:
     """Return one step of each row of inputs, with the Jacobian if requested."""
     n_parameters = len(PARAMETER_NAMES)
@@ -532,7 +580,7 @@ def _vmapped_step(
             _, result = step_from_inputs(varied_inputs)
             return result.section_state, result.durations, result.outcome, result.solver_steps
         jacobian, result = jax.jacfwd(step_from_inputs, has_aux=True)(varied_inputs)
-        values = result.section_state, result.durations, result.outcome, result.solver_steps
-        return *values, jacobian
+        step_values = result.section_state, result.durations, result.outcome, result.solver_steps
+        return *step_values, jacobian
 
-    return jax.vmap(step_one)(rows)
+    return jax.vmap(step_one)(input_rows)

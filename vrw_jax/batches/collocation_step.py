@@ -1,15 +1,16 @@
 """Gait steps of many wheels by collocation, in a fixed amount of work, near known gaits.
 
-The method is Gauss collocation of order 8 on a few graded steps. The unknowns are the accelerations
-at the four nodes of a step. The airborne leg's fast mode, near c/m, which forces an explicit method
-to small steps, needs no extra work here. The node equations are solved by a fixed number of Newton
-sweeps with one Jacobian. In the eigenvectors of the rule they are two complex systems of the
-phase's size. In the last step the duration is corrected too, towards the event.
+The method is Gauss collocation of order 8 on a few graded mesh intervals. The unknowns are the
+accelerations at the four nodes of an interval. The airborne leg's fast mode, near c/m, forces an
+explicit method to small steps and needs no extra work here. The node equations are solved by a
+fixed number of Newton iterations ("sweeps") with one Jacobian. In the eigenvectors of the Gauss
+rule they are two complex systems of the phase's size. In the last interval the duration is also
+corrected, towards the event.
 
 All lanes do the same work. A fixed amount of work does not detect its own errors, so each phase
-returns indicators of its accuracy. They are the last corrections, the mismatch with the equations
-of motion at each step's start, and the minimum of all guards. The start of a step is not a node. A
-lane that fails these checks is stepped again by the adaptive engine.
+returns indicators of its accuracy. These are the last corrections, the residual of the equations of
+motion at each interval's start, which is no node, and the minimum of all guards. A lane that fails
+these checks is stepped again by the adaptive engine.
 """
 
 import functools
@@ -41,101 +42,98 @@ from vrw_jax.numerics import Vector, value_and_partials
 from vrw_jax.wheel import AbstractPhase, PhaseInstant, WheelParams, make_phases, transitions
 
 _EIGENVALUES, _EIGENVECTORS = np.linalg.eig(INTEGRATION_MATRIX)
-_UPPER_HALF = np.flatnonzero(_EIGENVALUES.imag > 0.0)
-RULE_EIGENVALUES = _EIGENVALUES[_UPPER_HALF]
-"""One eigenvalue of each conjugate pair of the rule."""
-TO_EIGENVECTORS = np.linalg.inv(_EIGENVECTORS)[_UPPER_HALF]
-"""Rows that project node values onto the eigenvectors of these eigenvalues."""
-FROM_EIGENVECTORS = _EIGENVECTORS[:, _UPPER_HALF]
-"""The eigenvectors of these eigenvalues, as columns."""
+_UPPER_HALF_PLANE_INDICES = np.flatnonzero(_EIGENVALUES.imag > 0.0)
+GAUSS_EIGENVALUES = _EIGENVALUES[_UPPER_HALF_PLANE_INDICES]
+"""One eigenvalue of each conjugate pair of the Gauss rule's integration matrix."""
+EIGENVECTOR_PROJECTION = np.linalg.inv(_EIGENVECTORS)[_UPPER_HALF_PLANE_INDICES]
+"""Matrix that projects node values onto the eigenvectors of `GAUSS_EIGENVALUES`, one row each."""
+EIGENVECTOR_COLUMNS = _EIGENVECTORS[:, _UPPER_HALF_PLANE_INDICES]
+"""Eigenvectors of `GAUSS_EIGENVALUES`, as columns."""
 
 START_WEIGHTS = lagrange_weights(0.0)
-"""Weights that interpolate node values to the start of a step."""
+"""Weights that extrapolate node values to the start of a mesh interval."""
 MIDDLE_WEIGHTS = lagrange_weights(0.5)
-"""Weights that interpolate node values to the middle of a step."""
+"""Weights that interpolate node values to the middle of a mesh interval."""
 END_NODE_WEIGHTS = lagrange_weights(1.0)
-"""Weights that interpolate node values to the end of a step."""
+"""Weights that extrapolate node values to the end of a mesh interval."""
 MIDDLE_INTEGRATION_WEIGHTS = integration_weights(0.5)
-"""Weights that integrate node values once and twice from the start to the middle of a step."""
+"""Weights that integrate node values once and twice from the start to the middle of an interval."""
 _DIFFERENTIATION_MATRIX = differentiation_matrix()
 STRETCH_WEIGHTS = GAUSS_NODES[:, None] * _DIFFERENTIATION_MATRIX
-"""Weights of the first derivative of the node values by the length of the step, relative to it."""
+"""Weights of the first derivative of the node values by the relative length of the interval."""
 CURVATURE_WEIGHTS = (
     0.5 * (GAUSS_NODES * GAUSS_NODES)[:, None] * (_DIFFERENTIATION_MATRIX @ _DIFFERENTIATION_MATRIX)
 )
-"""Weights of half of the second derivative of the same."""
+"""Weights of half of the second derivative of the node values by the relative length."""
 
 PHASE_MESHES = PhaseMesh(4, 1.0), PhaseMesh(5, 4.0), PhaseMesh(2, 1.0)
 
 
 @dataclass(frozen=True)
 class CollocationStepOptions:
-    """Amount of work of a collocated step, and limits of the indicators of a trusted lane."""
+    """Options of the amount of work of a collocated step, and limits for trusted lanes."""
 
     meshes: tuple[PhaseMesh, ...] = PHASE_MESHES
     """Meshes of DLS, SLS-I and SLS-II.
 
     They are chosen because they are the cheapest of those tried with errors below 1e-8. The errors
-    are the 99th percentile over lanes near their gaits. The cost includes that of the lanes left to
-    the adaptive engine (experiments/speed/engine_benchmark.py).
-    """
-    sweeps_per_step: int = 3
-    """Number of sweeps in each step except the last of a phase."""
+    are the 99th percentile over lanes near their gaits. The cost includes the lanes that the
+    adaptive engine repeats (experiments/speed/engine_benchmark.py)."""
+    n_sweeps_per_step: int = 3
+    """Number of Newton sweeps in each mesh interval except the last one of a phase."""
     n_event_rounds: int = 2
-    """Number of corrections of the duration in the last step."""
-    sweeps_per_round: int = 2
-    """Number of sweeps after each of these corrections."""
+    """Number of corrections of the duration in the last mesh interval."""
+    n_sweeps_per_event_round: int = 2
+    """Number of Newton sweeps after each of these corrections."""
     max_correction: float = 5e-8
-    """Limit of `CollocatedPhase.correction`, rad/s and m/s."""
+    """Largest accepted `CollocatedPhase.correction`, rad/s and m/s."""
     max_event_shift: float = 1e-5
-    """Limit of `CollocatedPhase.event_shift`, s.
+    """Largest accepted `CollocatedPhase.event_shift`, s.
 
-    The end is extrapolated by the last shift, with an error of half of its square times a rate.
-    """
+    The end is extrapolated by the last shift, with an error of half of its square times a rate."""
     max_mismatch: tuple[float, float, float] = (2e-3, 1.2e-1, 8e-5)
-    """Limits of `CollocatedPhase.mismatch` in DLS, SLS-I and SLS-II.
+    """Largest accepted `CollocatedPhase.mismatch` in DLS, SLS-I and SLS-II.
 
-    They are chosen because errors are at most the square of a mismatch. One in a hundred lanes near
-    its gait exceeds one of the limits.
-    """
+    The values are chosen because errors are at most the square of a mismatch. One in a hundred
+    lanes near its gait exceeds one of the limits."""
 
 
 COLLOCATION_STEP_OPTIONS = CollocationStepOptions()
 
 
 class CollocatedPhase(NamedTuple):
-    """End of a phase, with indicators of its accuracy."""
+    """End of a phase by collocation, with indicators of its accuracy."""
 
     q: Vector
     v: Vector
     duration: Array  # s
     correction: Array  # estimated change of a rate by one more sweep, rad/s and m/s
     event_shift: Array  # last correction of the duration, s
-    mismatch: Array  # largest error of the polynomial's rate at the start of a step
-    min_guard: Array  # over all guards but the event, at ends and middles; positive if valid
+    mismatch: Array  # largest error of a rate at the start of an interval
+    min_guard: Array  # lowest guard at ends and middles; positive if valid
 
 
 NodeAccelerations = tuple[Vector, ...]
-"""Accelerations at the nodes of a step."""
+"""Accelerations at the nodes of a mesh interval."""
 
 
 class _SweepState(NamedTuple):
-    """State of the Newton sweeps of one step."""
+    """State of the Newton sweeps of one mesh interval."""
 
     h: Array
-    nodes: NodeAccelerations
+    node_accelerations: NodeAccelerations
     correction: Array
     previous_correction: Array  # correction of the previous sweep
 
 
 class _SolvedStep(NamedTuple):
-    """Solution of one step."""
+    """Solution of one mesh interval."""
 
-    step: _SweepState
-    end: tuple[Vector, Vector]
+    sweep_state: _SweepState
+    end_state: tuple[Vector, Vector]
     event_shift: Array  # s
     mismatch: Array
-    nonlinear_part: NodeAccelerations  # part that the equations linearized about its middle omit
+    nonlinear_part: NodeAccelerations  # part that the linearized equations omit
 
 
 def collocate_phase(
@@ -146,79 +144,107 @@ def collocate_phase(
     mesh: PhaseMesh,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocatedPhase:
-    """Integrate from (q, v) to the phase's own end, its first guard, near the expected duration."""
-    fractions, zero = mesh.interval_fractions, jnp.zeros_like(expected_duration)
-    # Squared ratio of successive step lengths: the growth of the nonlinear part.
-    growth_factor = float(fractions[-1] / fractions[0]) ** (2.0 / max(mesh.n_intervals - 1, 1))
+    """Return the end of a phase from (q, v), at its first guard near the expected duration."""
+    interval_fractions, float_zeros = mesh.interval_fractions, jnp.zeros_like(expected_duration)
+    # The nonlinear part grows with the squared ratio of successive interval lengths.
+    growth_factor = float(interval_fractions[-1] / interval_fractions[0]) ** (
+        2.0 / max(mesh.n_intervals - 1, 1)
+    )
 
-    def march(carry: tuple, fraction: Array) -> tuple[tuple, None]:
-        q, v, correction, mismatch, min_guard, guards, nonlinear_part = carry
-        h = fraction * expected_duration
+    def advance_interval(carry: tuple, interval_fraction: Array) -> tuple[tuple, None]:
+        q, v, correction, mismatch, min_guard, end_guards, nonlinear_part = carry
+        h = interval_fraction * expected_duration
         solved_step = _solve_step(phase, q, v, h, nonlinear_part, options)
-        low_guard, guards = _min_guard(phase, q, v, solved_step, guards, 0)
+        lowest_guard, end_guards = _min_guard(phase, q, v, solved_step, end_guards, 0)
         carry = (
-            *solved_step.end,
-            jnp.maximum(correction, _estimate_correction(solved_step.step)),
+            *solved_step.end_state,
+            jnp.maximum(correction, _estimate_correction(solved_step.sweep_state)),
             jnp.maximum(mismatch, solved_step.mismatch),
-            jnp.minimum(min_guard, low_guard),
-            guards,
+            jnp.minimum(min_guard, lowest_guard),
+            end_guards,
             tuple(tuple(growth_factor * x for x in node) for node in solved_step.nonlinear_part),
         )
         return carry, None
 
     guards = phase.guards(PhaseInstant(phase, phase.motion_at(q, v), None))
-    carry = (q, v, zero, zero, zero + jnp.inf, guards, ((zero,) * len(q),) * N_GAUSS_NODES)
-    if len(fractions) > 1:
-        carry, _ = lax.scan(march, carry, jnp.asarray(fractions[:-1], expected_duration.dtype))
+    carry = (
+        q,
+        v,
+        float_zeros,
+        float_zeros,
+        float_zeros + jnp.inf,
+        guards,
+        ((float_zeros,) * len(q),) * N_GAUSS_NODES,
+    )
+    if len(interval_fractions) > 1:
+        carry, _ = lax.scan(
+            advance_interval, carry, jnp.asarray(interval_fractions[:-1], expected_duration.dtype)
+        )
     q, v, correction, mismatch, min_guard, guards, nonlinear_part = carry
-    h = float(fractions[-1]) * expected_duration
+    h = float(interval_fractions[-1]) * expected_duration
     last_step = _solve_step(phase, q, v, h, nonlinear_part, options, ends_at_event=True)
-    low_guard, _ = _min_guard(phase, q, v, last_step, guards, 1)
+    lowest_guard, _ = _min_guard(phase, q, v, last_step, guards, 1)
     return CollocatedPhase(
-        *last_step.end,
-        duration=float(1.0 - fractions[-1]) * expected_duration
-        + last_step.step.h
+        *last_step.end_state,
+        duration=float(1.0 - interval_fractions[-1]) * expected_duration
+        + last_step.sweep_state.h
         + last_step.event_shift,
-        correction=jnp.maximum(correction, _estimate_correction(last_step.step)),
+        correction=jnp.maximum(correction, _estimate_correction(last_step.sweep_state)),
         event_shift=jnp.abs(last_step.event_shift),
         mismatch=jnp.maximum(mismatch, last_step.mismatch),
-        min_guard=jnp.minimum(jnp.minimum(min_guard, low_guard), last_step.step.h),
+        min_guard=jnp.minimum(jnp.minimum(min_guard, lowest_guard), last_step.sweep_state.h),
     )
 
 
-def _estimate_correction(step: _SweepState) -> Array:
-    """Estimate the correction of a further sweep from the last two."""
-    ratio = step.correction / jnp.maximum(step.previous_correction, 1e-300)
-    return step.correction * jnp.minimum(ratio, 1.0)
+def _estimate_correction(sweep_state: _SweepState) -> Array:
+    """Return the estimated correction of one more sweep, from the last two."""
+    correction_ratio = sweep_state.correction / jnp.maximum(sweep_state.previous_correction, 1e-300)
+    return sweep_state.correction * jnp.minimum(correction_ratio, 1.0)
 
 
-def _weighted_sum(weights: np.ndarray, nodes: NodeAccelerations, coordinate: int) -> Any:
+def _weighted_sum(
+    weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate: int
+) -> Any:
     """Return the weighted sum of one coordinate over the nodes."""
     return sum(
         float(weight) * acceleration[coordinate]
-        for weight, acceleration in zip(weights, nodes, strict=True)
+        for weight, acceleration in zip(weights, node_accelerations, strict=True)
     )
 
 
-def _end_state(q: Vector, v: Vector, h: Array, nodes: NodeAccelerations) -> tuple[Vector, Vector]:
-    """Return coordinates and rates at the end of a step."""
+def _end_state(
+    q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
+) -> tuple[Vector, Vector]:
+    """Return coordinates and rates at the end of a mesh interval."""
     n = range(len(q))
     return (
-        tuple(q[d] + h * (v[d] + h * _weighted_sum(DOUBLE_END_WEIGHTS, nodes, d)) for d in n),
-        tuple(v[d] + h * _weighted_sum(END_WEIGHTS, nodes, d) for d in n),
+        tuple(
+            q[d] + h * (v[d] + h * _weighted_sum(DOUBLE_END_WEIGHTS, node_accelerations, d))
+            for d in n
+        ),
+        tuple(v[d] + h * _weighted_sum(END_WEIGHTS, node_accelerations, d) for d in n),
     )
 
 
-def _node_state(node_index: int, q: Vector, v: Vector, h: Array, nodes: NodeAccelerations) -> tuple:
-    """Return coordinates and rates at a node of a step."""
-    n, node = range(len(q)), float(GAUSS_NODES[node_index])
+def _node_state(
+    node_index: int, q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
+) -> tuple:
+    """Return coordinates and rates at a node of a mesh interval."""
+    n, node_position = range(len(q)), float(GAUSS_NODES[node_index])
     return (
         tuple(
             q[d]
-            + h * (node * v[d] + h * _weighted_sum(DOUBLE_INTEGRATION_MATRIX[node_index], nodes, d))
+            + h
+            * (
+                node_position * v[d]
+                + h * _weighted_sum(DOUBLE_INTEGRATION_MATRIX[node_index], node_accelerations, d)
+            )
             for d in n
         ),
-        tuple(v[d] + h * _weighted_sum(INTEGRATION_MATRIX[node_index], nodes, d) for d in n),
+        tuple(
+            v[d] + h * _weighted_sum(INTEGRATION_MATRIX[node_index], node_accelerations, d)
+            for d in n
+        ),
     )
 
 
@@ -231,122 +257,155 @@ def _solve_step(
     options: CollocationStepOptions,
     ends_at_event: bool = False,
 ) -> _SolvedStep:
-    """Solve for the node accelerations of one step by sweeps, and for its length if it ends at an
-    event.
+    """Return the solution of one mesh interval by Newton sweeps.
 
-    The Jacobian is taken at the step's middle; a sweep then gains some two digits. The sweeps start
-    from the solution of the equations linearized there, plus `nonlinear_part`, the omitted part of
-    the previous step. If the length changes, the nodes move along the polynomial through them.
+    If the interval ends at an event, its length is also an unknown. The Jacobian is taken at the
+    middle of the interval; a sweep then gains some two digits. The sweeps start from the solution
+    of the equations linearized there, plus `nonlinear_part`, the omitted part of the previous
+    interval. If the length changes, the nodes move along the polynomial through them.
     """
-    dimension = len(q)
-    start_acceleration = phase.acceleration(phase.motion_at(q, v))[:dimension]
-    coordinates = range(dimension)
+    n_dof = len(q)
+    start_acceleration = phase.acceleration(phase.motion_at(q, v))[:n_dof]
+    coordinate_indices = range(n_dof)
     middle_state = (
-        tuple(q[d] + 0.5 * h * (v[d] + 0.25 * h * start_acceleration[d]) for d in coordinates),
-        tuple(v[d] + 0.5 * h * start_acceleration[d] for d in coordinates),
+        tuple(
+            q[d] + 0.5 * h * (v[d] + 0.25 * h * start_acceleration[d]) for d in coordinate_indices
+        ),
+        tuple(v[d] + 0.5 * h * start_acceleration[d] for d in coordinate_indices),
     )
     residual, residual_by_q, residual_by_v, residual_by_a = _linearize_residual(
         phase, *middle_state, start_acceleration
     )
-    inverses = [
+    inverse_stage_matrices = [
         _invert_stage_matrix(complex(value), h, residual_by_q, residual_by_v, residual_by_a)
-        for value in RULE_EIGENVALUES
+        for value in GAUSS_EIGENVALUES
     ]
 
-    def correct(
-        nodes: NodeAccelerations, h: Array, projections: list
+    def apply_correction(
+        node_accelerations: NodeAccelerations, h: Array, projections: list
     ) -> tuple[NodeAccelerations, Array]:
         corrections = []
-        for inverse, projection in zip(inverses, projections, strict=True):
+        for inverse_matrix, projection in zip(inverse_stage_matrices, projections, strict=True):
             products = [
                 [_multiply(entry, x) for entry, x in zip(row, projection, strict=True)]
-                for row in inverse
+                for row in inverse_matrix
             ]
             corrections.append([_add_terms(row) for row in products])
-        return _correct_nodes(nodes, corrections, h)
+        return _correct_nodes(node_accelerations, corrections, h)
 
-    def sweep(step: _SweepState, _: None) -> tuple[_SweepState, None]:
+    def run_sweep(sweep_state: _SweepState, _: None) -> tuple[_SweepState, None]:
         residuals = []
         for node_index in range(N_GAUSS_NODES):
-            Q, V = _node_state(node_index, q, v, step.h, step.nodes)
-            residuals.append(phase.dynamics_residual(phase.motion_at(Q, V), step.nodes[node_index]))
-        projections = [_project_residuals(weights, tuple(residuals)) for weights in TO_EIGENVECTORS]
-        nodes, largest_correction = correct(step.nodes, step.h, projections)
-        return _SweepState(step.h, nodes, largest_correction, step.correction), None
+            Q, V = _node_state(node_index, q, v, sweep_state.h, sweep_state.node_accelerations)
+            residuals.append(
+                phase.dynamics_residual(
+                    phase.motion_at(Q, V), sweep_state.node_accelerations[node_index]
+                )
+            )
+        projections = [
+            _project_residuals(weights, tuple(residuals)) for weights in EIGENVECTOR_PROJECTION
+        ]
+        node_accelerations, largest_correction = apply_correction(
+            sweep_state.node_accelerations, sweep_state.h, projections
+        )
+        return _SweepState(
+            sweep_state.h, node_accelerations, largest_correction, sweep_state.correction
+        ), None
 
     def evaluate_event(q: Vector, v: Vector) -> tuple[Array, Vector]:
         instant = PhaseInstant(phase, phase.motion_at(q, v), None)
         return phase.end_guard(instant), instant.acceleration[: phase.n_dof]
 
-    def shift_to_event(step: _SweepState) -> Array:
-        """Return the time from the step's end to the event, by Newton's method."""
-        end_q, end_v = _end_state(q, v, step.h, step.nodes)
+    def shift_to_event(sweep_state: _SweepState) -> Array:
+        """Return the time from the interval's end to the event, by Newton's method, s."""
+        end_q, end_v = _end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
         _, acceleration = evaluate_event(end_q, end_v)
-        (value, _), (rate, _) = jax.jvp(evaluate_event, (end_q, end_v), (end_v, acceleration))
-        event_shift = -value / jnp.where(rate < 0.0, rate, -jnp.inf)
-        return jnp.clip(event_shift, -0.5 * step.h, 0.5 * step.h)
-
-    def run_round(
-        step_and_shift: tuple[_SweepState, Array], _: None
-    ) -> tuple[tuple[_SweepState, Array], None]:
-        step, event_shift = step_and_shift
-        step = step._replace(
-            h=step.h + event_shift, nodes=_stretch_step(step.nodes, event_shift / step.h)
+        (guard_value, _), (guard_rate, _) = jax.jvp(
+            evaluate_event, (end_q, end_v), (end_v, acceleration)
         )
-        step, _ = lax.scan(sweep, step, None, length=options.sweeps_per_round)
-        return (step, shift_to_event(step)), None
+        event_shift = -guard_value / jnp.where(guard_rate < 0.0, guard_rate, -jnp.inf)
+        return jnp.clip(event_shift, -0.5 * sweep_state.h, 0.5 * sweep_state.h)
 
-    linear_nodes, largest_correction = correct(
+    def correct_duration(
+        sweep_state_and_shift: tuple[_SweepState, Array], _: None
+    ) -> tuple[tuple[_SweepState, Array], None]:
+        sweep_state, event_shift = sweep_state_and_shift
+        sweep_state = sweep_state._replace(
+            h=sweep_state.h + event_shift,
+            node_accelerations=_stretch_nodes(
+                sweep_state.node_accelerations, event_shift / sweep_state.h
+            ),
+        )
+        sweep_state, _ = lax.scan(
+            run_sweep, sweep_state, None, length=options.n_sweeps_per_event_round
+        )
+        return (sweep_state, shift_to_event(sweep_state)), None
+
+    linear_accelerations, largest_correction = apply_correction(
         (start_acceleration,) * N_GAUSS_NODES,
         h,
         _project_linear_residuals(residual, residual_by_q, residual_by_v, v, start_acceleration, h),
     )
-    first_nodes = _add_nodes(linear_nodes, nonlinear_part, 1.0)
-    step = _SweepState(h, first_nodes, largest_correction, largest_correction)
+    initial_accelerations = _add_nodes(linear_accelerations, nonlinear_part, 1.0)
+    sweep_state = _SweepState(h, initial_accelerations, largest_correction, largest_correction)
     event_shift = jnp.zeros_like(h)
     if ends_at_event:
-        (step, event_shift), _ = lax.scan(
-            run_round, (step, shift_to_event(step)), None, length=options.n_event_rounds
+        (sweep_state, event_shift), _ = lax.scan(
+            correct_duration,
+            (sweep_state, shift_to_event(sweep_state)),
+            None,
+            length=options.n_event_rounds,
         )
     else:
-        step, _ = lax.scan(sweep, step, None, length=options.sweeps_per_step)
+        sweep_state, _ = lax.scan(run_sweep, sweep_state, None, length=options.n_sweeps_per_step)
     mismatches = [
-        jnp.abs(_weighted_sum(START_WEIGHTS, step.nodes, d) - start_acceleration[d])
-        for d in coordinates
+        jnp.abs(
+            _weighted_sum(START_WEIGHTS, sweep_state.node_accelerations, d) - start_acceleration[d]
+        )
+        for d in coordinate_indices
     ]
-    mismatch = step.h * functools.reduce(jnp.maximum, mismatches)
+    mismatch = sweep_state.h * functools.reduce(jnp.maximum, mismatches)
     # The end is extrapolated by the last shift, whose square is negligible.
-    Q, V = _end_state(q, v, step.h, step.nodes)
+    Q, V = _end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
     end_state = (
-        tuple(Q[d] + event_shift * V[d] for d in coordinates),
+        tuple(Q[d] + event_shift * V[d] for d in coordinate_indices),
         tuple(
-            V[d] + event_shift * _weighted_sum(END_NODE_WEIGHTS, step.nodes, d) for d in coordinates
+            V[d] + event_shift * _weighted_sum(END_NODE_WEIGHTS, sweep_state.node_accelerations, d)
+            for d in coordinate_indices
         ),
     )
     return _SolvedStep(
-        step, end_state, event_shift, mismatch, _add_nodes(step.nodes, linear_nodes, -1.0)
+        sweep_state,
+        end_state,
+        event_shift,
+        mismatch,
+        _add_nodes(sweep_state.node_accelerations, linear_accelerations, -1.0),
     )
 
 
 def _add_nodes(
-    nodes: NodeAccelerations, other_nodes: NodeAccelerations, factor: float
+    node_accelerations: NodeAccelerations, other_accelerations: NodeAccelerations, factor: float
 ) -> NodeAccelerations:
-    """Return the accelerations plus a factor times other ones."""
-    pairs = zip(nodes, other_nodes, strict=True)
+    """Return the accelerations plus a factor times other accelerations."""
+    pairs = zip(node_accelerations, other_accelerations, strict=True)
     return tuple(tuple(x + factor * y for x, y in zip(*pair, strict=True)) for pair in pairs)
 
 
-def _stretch_step(nodes: NodeAccelerations, relative_growth: Array) -> NodeAccelerations:
-    """Return the accelerations at the nodes of a step that is longer by a small fraction of its
-    length."""
-    coordinates = range(len(nodes[0]))
+def _stretch_nodes(
+    node_accelerations: NodeAccelerations, relative_growth: Array
+) -> NodeAccelerations:
+    """Return the node accelerations of an interval that is longer by a small fraction of its
+    length.
+    """
+    coordinates = range(len(node_accelerations[0]))
     return tuple(
         tuple(
-            nodes[node_index][coordinate]
+            node_accelerations[node_index][coordinate]
             + relative_growth
             * (
-                _weighted_sum(STRETCH_WEIGHTS[node_index], nodes, coordinate)
-                + relative_growth * _weighted_sum(CURVATURE_WEIGHTS[node_index], nodes, coordinate)
+                _weighted_sum(STRETCH_WEIGHTS[node_index], node_accelerations, coordinate)
+                + relative_growth
+                * _weighted_sum(CURVATURE_WEIGHTS[node_index], node_accelerations, coordinate)
             )
             for coordinate in coordinates
         )
@@ -362,31 +421,31 @@ def _linearize_residual(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -
         q, v, a = (arguments[i * n : (i + 1) * n] for i in range(3))
         return phase.dynamics_residual(phase.motion_at(q, v), a)
 
-    residual, rows = value_and_partials(evaluate_residual, (*q, *v, *a))
-    columns = list(zip(*rows, strict=True))
-    return residual, *(columns[i * n : (i + 1) * n] for i in range(3))
+    residual, partial_rows = value_and_partials(evaluate_residual, (*q, *v, *a))
+    derivative_columns = list(zip(*partial_rows, strict=True))
+    return residual, *(derivative_columns[i * n : (i + 1) * n] for i in range(3))
 
 
 ComplexPair = tuple[Array, Array]
 
 
 def _multiply(x: ComplexPair, y: ComplexPair) -> ComplexPair:
-    """Return the product of complex numbers."""
+    """Return the product of two complex numbers."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
 def _subtract(x: ComplexPair, y: ComplexPair) -> ComplexPair:
-    """Return the difference of complex numbers."""
+    """Return the difference of two complex numbers."""
     return x[0] - y[0], x[1] - y[1]
 
 
 def _add_terms(terms: Sequence[ComplexPair]) -> ComplexPair:
     """Return the sum of complex numbers."""
     first, *others = terms
-    real, imaginary = first
+    real_part, imaginary_part = first
     for term in others:
-        real, imaginary = real + term[0], imaginary + term[1]
-    return real, imaginary
+        real_part, imaginary_part = real_part + term[0], imaginary_part + term[1]
+    return real_part, imaginary_part
 
 
 def _invert_stage_matrix(
@@ -394,13 +453,13 @@ def _invert_stage_matrix(
 ) -> Any:
     """Return the inverse of A + h e V + (h e)^2 Q.
 
-    e is the eigenvalue. A, V and Q are the derivatives of the residual by accelerations, rates and
-    coordinates.
+    Here e is the eigenvalue. A, V and Q are the derivatives of the residual by accelerations, rates
+    and coordinates.
     """
-    n, square = len(residual_by_q), eigenvalue * eigenvalue
+    n, squared_eigenvalue = len(residual_by_q), eigenvalue * eigenvalue
     scaled_value = (h * eigenvalue.real, h * eigenvalue.imag)
-    scaled_square = (h * h * square.real, h * h * square.imag)
-    matrix: list[list[ComplexPair]] = [
+    scaled_square = (h * h * squared_eigenvalue.real, h * h * squared_eigenvalue.imag)
+    stage_matrix: list[list[ComplexPair]] = [
         [
             (
                 residual_by_a[j][i]
@@ -412,7 +471,7 @@ def _invert_stage_matrix(
         ]
         for i in range(n)
     ]
-    adjugate, determinant = _adjugate_and_determinant(matrix)
+    adjugate, determinant = _adjugate_and_determinant(stage_matrix)
 
     squared_modulus = determinant[0] * determinant[0] + determinant[1] * determinant[1]
     reciprocal = (determinant[0] / squared_modulus, -determinant[1] / squared_modulus)
@@ -423,12 +482,12 @@ def _adjugate_and_determinant(matrix: list[list[ComplexPair]]) -> tuple[Any, Com
     """Return adjugate and determinant of a matrix of one to three rows."""
     n = len(matrix)
     if n == 1:
-        unit = (jnp.ones_like(matrix[0][0][0]), jnp.zeros_like(matrix[0][0][0]))
-        return [[unit]], matrix[0][0]
+        complex_one = (jnp.ones_like(matrix[0][0][0]), jnp.zeros_like(matrix[0][0][0]))
+        return [[complex_one]], matrix[0][0]
     if n == 2:
         negate = lambda x: (-x[0], -x[1])
-        rows = [[matrix[1][1], negate(matrix[0][1])], [negate(matrix[1][0]), matrix[0][0]]]
-        return rows, _subtract(
+        adjugate_rows = [[matrix[1][1], negate(matrix[0][1])], [negate(matrix[1][0]), matrix[0][0]]]
+        return adjugate_rows, _subtract(
             _multiply(matrix[0][0], matrix[1][1]), _multiply(matrix[0][1], matrix[1][0])
         )
 
@@ -438,14 +497,16 @@ def _adjugate_and_determinant(matrix: list[list[ComplexPair]]) -> tuple[Any, Com
             _multiply(matrix[a][c], matrix[b][d]), _multiply(matrix[a][d], matrix[b][c])
         )
 
-    rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
-    products = [_multiply(matrix[0][k], rows[k][0]) for k in range(3)]
-    return rows, _add_terms(products)
+    adjugate_rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
+    products = [_multiply(matrix[0][k], adjugate_rows[k][0]) for k in range(3)]
+    return adjugate_rows, _add_terms(products)
 
 
 def _project_residuals(weights: np.ndarray, residuals: NodeAccelerations) -> list[ComplexPair]:
-    """Project the residuals of the nodes onto one pair of eigenvectors, with the sign of a
-    correction."""
+    """Return the projection of the nodes' residuals onto one pair of eigenvectors.
+
+    The sign is that of a correction.
+    """
     return [
         (_weighted_sum(-weights.real, residuals, d), _weighted_sum(-weights.imag, residuals, d))
         for d in range(len(residuals[0]))
@@ -456,14 +517,15 @@ def _project_linear_residuals(
     residual: Vector, residual_by_q: Any, residual_by_v: Any, v: Vector, a: Vector, h: Array
 ) -> list[list[ComplexPair]]:
     """Return `_project_residuals` for accelerations `a` and the equations linearized about the
-    middle."""
+    middle.
+    """
     n = range(len(v))
     multiply_columns = lambda columns, x: tuple(sum(columns[j][i] * x[j] for j in n) for i in n)
     damping_term = multiply_columns(residual_by_v, a)
     stiffness_rate_term = multiply_columns(residual_by_q, v)
     stiffness_acceleration_term = multiply_columns(residual_by_q, a)
     projections = []
-    for weights in TO_EIGENVECTORS:
+    for weights in EIGENVECTOR_PROJECTION:
         constant_weight, linear_weight, quadratic_weight = (
             -complex(np.sum(weights * power))
             for power in (
@@ -475,13 +537,13 @@ def _project_linear_residuals(
         projections.append(
             [
                 tuple(
-                    part(constant_weight) * residual[i]
+                    select_part(constant_weight) * residual[i]
                     + h
                     * (
-                        part(linear_weight) * (stiffness_rate_term[i] + damping_term[i])
-                        + part(quadratic_weight) * h * stiffness_acceleration_term[i]
+                        select_part(linear_weight) * (stiffness_rate_term[i] + damping_term[i])
+                        + select_part(quadratic_weight) * h * stiffness_acceleration_term[i]
                     )
-                    for part in (lambda x: x.real, lambda x: x.imag)
+                    for select_part in (lambda x: x.real, lambda x: x.imag)
                 )
                 for i in n
             ]
@@ -490,21 +552,23 @@ def _project_linear_residuals(
 
 
 def _correct_nodes(
-    nodes: NodeAccelerations, corrections: list[list[ComplexPair]], h: Array
+    node_accelerations: NodeAccelerations, corrections: list[list[ComplexPair]], h: Array
 ) -> tuple[NodeAccelerations, Array]:
-    """Return the accelerations after the correction, and the largest rate that it changed."""
+    """Return the corrected accelerations, and the largest change of a rate."""
     corrected_nodes, largest_change = [], jnp.zeros_like(h)
     for node_index in range(N_GAUSS_NODES):
-        row = []
-        for coordinate in range(len(nodes[0])):
+        corrected_node = []
+        for coordinate in range(len(node_accelerations[0])):
             change = sum(
-                float(2.0 * FROM_EIGENVECTORS[node_index, pair_index].real) * pair[coordinate][0]
-                - float(2.0 * FROM_EIGENVECTORS[node_index, pair_index].imag) * pair[coordinate][1]
-                for pair_index, pair in enumerate(corrections)
+                float(2.0 * EIGENVECTOR_COLUMNS[node_index, pair_index].real)
+                * complex_pair[coordinate][0]
+                - float(2.0 * EIGENVECTOR_COLUMNS[node_index, pair_index].imag)
+                * complex_pair[coordinate][1]
+                for pair_index, complex_pair in enumerate(corrections)
             )
-            row.append(nodes[node_index][coordinate] + change)
+            corrected_node.append(node_accelerations[node_index][coordinate] + change)
             largest_change = jnp.maximum(largest_change, jnp.abs(change))
-        corrected_nodes.append(tuple(row))
+        corrected_nodes.append(tuple(corrected_node))
     return tuple(corrected_nodes), h * largest_change
 
 
@@ -516,43 +580,53 @@ def _min_guard(
     start_guards: Vector,
     n_skipped: int,
 ) -> tuple[Array, Vector]:
-    """Return the smallest guard at the step's middle and end, and all guards at the end.
+    """Return the smallest guard at the interval's middle and end, and all guards at the end.
 
-    The smallest guard is -1 if a guard may be negative in between. Between the three points a guard
-    may dip by a quarter of its second difference. `start_guards` are those at the start.
-    `n_skipped` is 1 in the last step, whose first guard is the event itself and zero at the end.
+    The smallest guard is -1 if a guard may be negative between the points. There, a guard may be
+    lower by a quarter of its second difference.
+
+    - `start_guards`: guards at the start;
+    - `n_skipped`: 1 in the last interval, whose first guard is the event and zero at the end.
     """
-    step, coordinates = solved_step.step, range(len(q))
-    middle_acceleration = tuple(_weighted_sum(MIDDLE_WEIGHTS, step.nodes, i) for i in coordinates)
-    end_acceleration = tuple(_weighted_sum(END_NODE_WEIGHTS, step.nodes, i) for i in coordinates)
+    sweep_state, coordinate_indices = solved_step.sweep_state, range(len(q))
+    middle_acceleration = tuple(
+        _weighted_sum(MIDDLE_WEIGHTS, sweep_state.node_accelerations, i) for i in coordinate_indices
+    )
+    end_acceleration = tuple(
+        _weighted_sum(END_NODE_WEIGHTS, sweep_state.node_accelerations, i)
+        for i in coordinate_indices
+    )
     velocity_integral, position_integral = (
-        tuple(_weighted_sum(w, step.nodes, i) for i in coordinates)
+        tuple(_weighted_sum(w, sweep_state.node_accelerations, i) for i in coordinate_indices)
         for w in MIDDLE_INTEGRATION_WEIGHTS
     )
     middle_state = (
-        tuple(q[i] + step.h * (0.5 * v[i] + step.h * position_integral[i]) for i in coordinates),
-        tuple(v[i] + step.h * velocity_integral[i] for i in coordinates),
+        tuple(
+            q[i] + sweep_state.h * (0.5 * v[i] + sweep_state.h * position_integral[i])
+            for i in coordinate_indices
+        ),
+        tuple(v[i] + sweep_state.h * velocity_integral[i] for i in coordinate_indices),
     )
     evaluate_guards = lambda q, v, a: phase.guards(PhaseInstant(phase, phase.motion_at(q, v), a))
     middle_guards = evaluate_guards(*middle_state, middle_acceleration)
-    end_guards = evaluate_guards(*solved_step.end, end_acceleration)
-    min_guard = jnp.full_like(step.h, jnp.inf)
+    end_guards = evaluate_guards(*solved_step.end_state, end_acceleration)
+    min_guard = jnp.full_like(sweep_state.h, jnp.inf)
     for i, (start_value, middle_value, end_value) in enumerate(
         zip(start_guards, middle_guards, end_guards, strict=True)
     ):
-        low_guard = jnp.minimum(start_value, middle_value)
+        lowest_guard = jnp.minimum(start_value, middle_value)
         if i >= n_skipped:
-            low_guard = jnp.minimum(low_guard, end_value)
-            possible_dip = 0.25 * jnp.abs(start_value - 2.0 * middle_value + end_value)
-            low_guard = jnp.where(low_guard > possible_dip, low_guard, -1.0)
-        min_guard = jnp.minimum(min_guard, low_guard)
+            lowest_guard = jnp.minimum(lowest_guard, end_value)
+            possible_decrease = 0.25 * jnp.abs(start_value - 2.0 * middle_value + end_value)
+            lowest_guard = jnp.where(lowest_guard > possible_decrease, lowest_guard, -1.0)
+        min_guard = jnp.minimum(min_guard, lowest_guard)
     return min_guard, end_guards
 
 
 class CollocationStep(NamedTuple):
-    """One gait step of a block of lanes, with the lanes that pass the checks."""
+    """Result of one gait step of a block of lanes, and whether each lane passes the checks."""
 
-    section_state: Vector  # three arrays
+    section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
     is_trusted: Bool[Array, " lanes"]
 
@@ -564,7 +638,9 @@ def collocation_gait_step(
     stop_at_lift_off: bool,
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocationStep:
-    """Take one gait step of every lane, near the expected durations of DLS, SLS-I and SLS-II."""
+    """Return one gait step of every lane, near the expected durations of DLS, SLS-I and
+    SLS-II (s).
+    """
     has_valid_duration = [(duration > 0.0) & (duration < 10.0) for duration in expected_durations]
     is_valid = functools.reduce(operator.and_, has_valid_duration, is_valid_start(params, x))
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
@@ -580,16 +656,18 @@ def collocation_gait_step(
     for phase, duration, mesh, max_mismatch in zip(
         phases, expected_durations, options.meshes, options.max_mismatch, strict=True
     ):
-        start = phase.own_coordinates(theta, motion)
-        end = collocate_phase(phase, *start, duration, mesh, options)
+        start_state = phase.select_coordinates(theta, motion)
+        phase_end = collocate_phase(phase, *start_state, duration, mesh, options)
         is_trusted = (
             is_trusted
-            & (end.correction <= options.max_correction)
-            & (end.event_shift <= options.max_event_shift)
-            & (end.mismatch <= max_mismatch)
-            & (end.min_guard > 0.0)
+            & (phase_end.correction <= options.max_correction)
+            & (phase_end.event_shift <= options.max_event_shift)
+            & (phase_end.mismatch <= max_mismatch)
+            & (phase_end.min_guard > 0.0)
         )
-        theta, motion = end.q[0], phase.reset_map(phase.motion_at(end.q, end.v))
-        durations.append(end.duration)
-    mask = lambda values: tuple(jnp.where(is_trusted, value, 0.0) for value in values)
-    return CollocationStep(mask((theta, motion.dtheta, motion.dL1)), mask(durations), is_trusted)
+        theta, motion = phase_end.q[0], phase.reset_map(phase.motion_at(phase_end.q, phase_end.v))
+        durations.append(phase_end.duration)
+    zero_untrusted = lambda values: tuple(jnp.where(is_trusted, value, 0.0) for value in values)
+    return CollocationStep(
+        zero_untrusted((theta, motion.dtheta, motion.dL1)), zero_untrusted(durations), is_trusted
+    )

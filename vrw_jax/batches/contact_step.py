@@ -1,7 +1,7 @@
 """Steps of batches with unilateral contact.
 
-Machine code takes the steps. On uneven ground with restitution, or by the diffrax engine, they are
-those of `walk` under `jax.vmap`.
+Machine code takes the steps. On uneven ground, `walk` under `jax.vmap` takes them if restitution is
+given or the engine is diffrax.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ which the next line is steeper, rad."""
 SLOPE_INDEX = CONTACT_PARAMETERS.index("slope")
 FRICTION_INDEX = CONTACT_PARAMETERS.index("friction")
 CONTACT_STEP_INPUTS = (START_NAME, *CONTACT_PARAMETERS)
-"""Inputs with respect to which a step can be differentiated."""
+"""Inputs of a step with respect to which derivatives are available."""
 
 
 def step_batch_with_contact(
@@ -45,7 +45,7 @@ def step_batch_with_contact(
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
-    """Return `step_batch` with unilateral contact.
+    """Return the result of `step_batch` with unilateral contact.
 
     Without derivatives, all steps of an element on flat ground are one walk of the kernel.
     """
@@ -62,14 +62,16 @@ def step_batch_with_contact(
         )
     ground = _GroundBySteps.from_arrays(parameters[SLOPE_INDEX], friction, len(states), n_steps)
     parameters = [ground.slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameters)]
-    columns = np.stack([np.broadcast_to(x, len(states)) for x in (*parameters, ground.friction[0])])
-    states = embed_section_states(columns, states, n_legs)
-    zeros = np.zeros(len(states), np.int32)
+    input_columns = np.stack(
+        [np.broadcast_to(x, len(states)) for x in (*parameters, ground.friction[0])]
+    )
+    states = embed_section_states(input_columns, states, n_legs)
+    int_zeros = np.zeros(len(states), np.int32)
     if not derivative_names and not is_uneven:
-        walk_result = walk_batch(columns, states, n_steps, model, options, n_legs)
+        walk_result = walk_batch(input_columns, states, n_steps, model, options, n_legs)
         x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, walk_result)
-        results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
-        return StepBatchResult(*results, engine="lanes", solver_names=(options.solver,))
+        result_arrays = x, durations, outcome, n_stepped, n_solver_steps, int_zeros > 0, int_zeros
+        return StepBatchResult(*result_arrays, engine="lanes", solver_names=(options.solver,))
     parameter_names: tuple[str, ...] = CONTACT_PARAMETERS
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_uneven:
@@ -77,19 +79,27 @@ def step_batch_with_contact(
         stepwise_parameters = ground.stepwise_parameters()
     walks = WalkBatch(states.T.copy(), derivative_names, parameter_names, stepwise_parameters)
     for k in range(n_steps):
-        active = walks.active_lanes()
-        if not len(active):
+        active_lanes = walks.active_lanes()
+        if not len(active_lanes):
             break
-        columns = ground.parameters_of_step(k, columns) if is_uneven else columns
-        arguments = columns[:, active], walks.section_state[:, active].T, model, options, n_legs
+        input_columns = ground.parameters_of_step(k, input_columns) if is_uneven else input_columns
+        step_arguments = (
+            input_columns[:, active_lanes],
+            walks.section_state[:, active_lanes].T,
+            model,
+            options,
+            n_legs,
+        )
         if not derivative_names:
-            walk_result = walk_batch(arguments[0], arguments[1], 1, *arguments[2:])
+            walk_result = walk_batch(step_arguments[0], step_arguments[1], 1, *step_arguments[2:])
             x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, walk_result)
             walks.record_step(
-                active, (x.T, durations.T, outcome, n_solver_steps), zeros[active] > 0
+                active_lanes,
+                (x.T, durations.T, outcome, n_solver_steps),
+                int_zeros[active_lanes] > 0,
             )
             continue
-        step_result, step_jacobian = step_batch_with_jacobian(*arguments, walks.input_indices)
+        step_result, step_jacobian = step_batch_with_jacobian(*step_arguments, walks.input_indices)
         full_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)
         input_jacobian = full_jacobian[:, :, list(walks.input_indices)]
         step_values = (
@@ -99,45 +109,47 @@ def step_batch_with_contact(
             step_result.solver_steps,
         )
         walks.record_step(
-            active,
+            active_lanes,
             tuple(np.asarray(x).T for x in (*step_values, input_jacobian)),
-            zeros[active] > 0,
+            int_zeros[active_lanes] > 0,
         )
-    return walks.to_result(np.arange(len(states)), zeros, "lanes", (options.solver,))
+    return walks.to_result(np.arange(len(states)), int_zeros, "lanes", (options.solver,))
 
 
 class _GroundBySteps(NamedTuple):
-    """Slope and friction of the ground, step by step."""
+    """Slope and friction of the ground of each step."""
 
     slopes: np.ndarray  # (n_steps + 1, elements), rad
     friction: np.ndarray  # (n_steps, elements)
-    n_slopes: int | None  # number of given slopes of an element; None: no array over steps
+    n_slopes: int | None  # number of given slopes of an element; None without steps
     n_frictions: int | None
 
     @classmethod
     def from_arrays(
         cls, slope: np.ndarray, friction: np.ndarray, n_elements: int, n_steps: int
     ) -> "_GroundBySteps":
-        """Return the ground; scalars and arrays over the batch are repeated for each step."""
-        sizes = (x.shape[1] if x.ndim == 2 else None for x in (slope, friction))
+        """Return the ground, with scalars and arrays over the batch repeated for each step."""
+        n_given_by_quantity = (x.shape[1] if x.ndim == 2 else None for x in (slope, friction))
 
-        def expand(x: np.ndarray, n_rows: int) -> np.ndarray:
+        def expand_over_steps(x: np.ndarray, n_rows: int) -> np.ndarray:
             return x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_rows, 1)).T
 
-        slopes = complete_batch_slopes(expand(slope, n_steps + 1), n_steps)
-        return cls(slopes, expand(friction, n_steps).T[:n_steps], *sizes)
+        slopes = complete_batch_slopes(expand_over_steps(slope, n_steps + 1), n_steps)
+        return cls(slopes, expand_over_steps(friction, n_steps).T[:n_steps], *n_given_by_quantity)
 
-    def parameters_of_step(self, k: int, columns: np.ndarray) -> np.ndarray:
-        """Return the parameters of step k, with those of `UNEVEN_GROUND_PARAMETERS`."""
-        columns = np.concatenate(
-            [columns[: len(CONTACT_PARAMETERS)], np.empty((2, columns.shape[1]))]
+    def parameters_of_step(self, k: int, input_columns: np.ndarray) -> np.ndarray:
+        """Return the parameters of step k, with those of `UNEVEN_GROUND_PARAMETERS`, (parameters,
+        elements).
+        """
+        input_columns = np.concatenate(
+            [input_columns[: len(CONTACT_PARAMETERS)], np.empty((2, input_columns.shape[1]))]
         )
-        columns[SLOPE_INDEX], columns[FRICTION_INDEX] = self.slopes[k], self.friction[k]
-        columns[-2:] = self.friction[max(k - 1, 0)], self.slopes[k + 1] - self.slopes[k]
-        return columns
+        input_columns[SLOPE_INDEX], input_columns[FRICTION_INDEX] = self.slopes[k], self.friction[k]
+        input_columns[-2:] = self.friction[max(k - 1, 0)], self.slopes[k + 1] - self.slopes[k]
+        return input_columns
 
     def stepwise_parameters(self) -> dict[str, StepwiseParameter]:
-        """Return how slopes and friction enter the steps."""
+        """Return the roles of slopes and friction in the steps, by name."""
         previous_friction_index = len(CONTACT_PARAMETERS)
         tilt_index = previous_friction_index + 1
         n_slopes, n_frictions = self.n_slopes, self.n_frictions
@@ -169,7 +181,9 @@ def _walk_with_diffrax(
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
-    """Return `step_batch` on uneven ground by `walk` under `jax.vmap`, without derivatives."""
+    """Return the result of `step_batch` on uneven ground by `walk` under `jax.vmap`, without
+    derivatives.
+    """
     if engine not in ("auto", "diffrax") or len(derivative_names):
         raise ValueError(
             "uneven ground with restitution, or by engine 'diffrax', is available without "
@@ -178,27 +192,27 @@ def _walk_with_diffrax(
     n_states = len(states)
     parameter_columns = (*parameters, np.asarray(model.friction, states.dtype))
     full_columns = [np.broadcast_to(x, (n_states, *x.shape[1:])) for x in parameter_columns]
-    walk_rows = lambda x, *full_columns: _vmapped_walk(
+    walk_elements = lambda x, *full_columns: _vmapped_walk(
         model, options, n_legs, n_steps, x, full_columns
     )
     x, durations, outcome, n_stepped, n_solver_steps = map_in_numpy_batches(
-        walk_rows, batch_sizes.UNEVEN_GROUND_BATCH_SIZES, states, *full_columns
+        walk_elements, batch_sizes.UNEVEN_GROUND_BATCH_SIZES, states, *full_columns
     )
-    zeros = np.zeros(n_states, np.int32)
-    results = x, durations, outcome, n_stepped, n_solver_steps, zeros > 0, zeros
-    return StepBatchResult(*results, engine="diffrax", solver_names=(options.solver,))
+    int_zeros = np.zeros(n_states, np.int32)
+    result_arrays = x, durations, outcome, n_stepped, n_solver_steps, int_zeros > 0, int_zeros
+    return StepBatchResult(*result_arrays, engine="diffrax", solver_names=(options.solver,))
 
 
 @eqx.filter_jit
 def _vmapped_walk(
-    model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, columns: Any
+    model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, input_columns: Any
 ) -> tuple:
-    """Return the last step of a walk from each state, and its outcome and counts."""
+    """Return the last step of a walk from each state, with outcome and counts."""
 
-    def walk_one(x: Any, columns: Any) -> tuple:
-        *values, friction = columns
+    def walk_one(x: Any, input_columns: Any) -> tuple:
+        *parameter_values, friction = input_columns
         model_with_friction = eqx.tree_at(lambda model: model.friction, model, friction)
-        params = wheel_from_parameters(tuple(values), n_legs)
+        params = wheel_from_parameters(tuple(parameter_values), n_legs)
         walk_result = walk(
             params, x, n_steps, model=model_with_friction, options=options, engine="diffrax"
         )
@@ -215,4 +229,4 @@ def _vmapped_walk(
         )
 
     narrow_integers = lambda x: x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
-    return jax.tree.map(narrow_integers, jax.vmap(walk_one)(states, columns))
+    return jax.tree.map(narrow_integers, jax.vmap(walk_one)(states, input_columns))

@@ -25,32 +25,32 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
 
 LANDING_STEP_INPUTS = (*PARAMETER_NAMES, "theta", "dtheta", "next_slope")
-"""Inputs with respect to which a step can be differentiated."""
+"""Inputs of a step with respect to which derivatives are available."""
 
 
 class LandingSteps(NamedTuple):
-    """Steps of a batch; lanes are the last axis.
+    """Results of a batch of steps, with lanes on the last axis.
 
-    If a step failed, its values are zero, except `stopper_margin`.
+    If a step failed, its values are zero, except `event_order_margin`.
     """
 
     state: np.ndarray
     """(theta+, dtheta+) just after the next landing with both feet held, in the frame of the next
     line, (2, lanes), rad, rad/s."""
     rear_impulse: np.ndarray
-    """Normal impulse of the rear foot in that landing, N s. If it is negative, the landing releases
-    the foot, and `state` is not the motion of the wheel."""
-    stopper_margin: np.ndarray
+    """Normal impulse of the rear foot in that landing, N s. If the impulse is negative, the landing
+    releases the foot, and `state` is not the motion of the wheel."""
+    event_order_margin: np.ndarray
     """Margin of the order of events, m^2/s; NaN if SLS-I was not reached.
 
-    It is positive if Leg 2 meets its stopper before the next foot lands, and negative if that foot
-    lands first. The margin and its first derivatives are continuous where both happen at once.
-    """
+    The margin is positive if Leg 2 meets its stopper before the next foot lands, and negative if
+    that foot lands first. The margin and its first derivatives are continuous where both happen at
+    once."""
     outcome: np.ndarray  # an Outcome
     durations: np.ndarray  # of DLS, SLS-I, SLS-II, (3, lanes), s
     jacobian: np.ndarray | None
-    """Jacobian of (theta+, dtheta+, rear_impulse, stopper_margin) by the requested inputs, shape
-    (inputs, 4, lanes); None if no derivatives were requested."""
+    """Jacobian of (theta+, dtheta+, rear_impulse, event_order_margin) by the requested inputs,
+    shape (inputs, 4, lanes); None if no derivatives were requested."""
 
 
 def step_batch_after_landing(
@@ -85,13 +85,15 @@ def step_batch_after_landing(
         raise ValueError(
             f"solver is {options.solver}, but lanes need an explicit one: take Dopri8."
         )
-    option_leaves, structure = jax.tree.flatten(options)
-    uniform = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    option_leaves, options_structure = jax.tree.flatten(options)
+    lane_independent = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
     n_parameters, stop_at_lift_off = len(PARAMETER_NAMES), model.stop_at_lift_off
     input_indices = tuple(LANDING_STEP_INPUTS.index(name) for name in derivatives)
 
-    def take_step(uniform: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
-        current_options = jax.tree.unflatten(structure, uniform)
+    def step_lanes_after_landing(
+        lane_independent: Any, lanes: Any, straggler_count: Array | None = None
+    ) -> tuple:
+        current_options = jax.tree.unflatten(options_structure, lane_independent)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
 
@@ -105,23 +107,25 @@ def step_batch_after_landing(
             return result.landing_quantities, diagnostics
 
         if not input_indices:
-            values, diagnostics = landing_outputs(*lanes)
-            return (*diagnostics, values)
-        columns, values, diagnostics = compute_jacobian_columns(
+            landing_quantities, diagnostics = landing_outputs(*lanes)
+            return (*diagnostics, landing_quantities)
+        jacobian_columns, landing_quantities, diagnostics = compute_jacobian_columns(
             landing_outputs, lanes, input_indices
         )
-        return (*diagnostics, values, columns)
+        return (*diagnostics, landing_quantities, jacobian_columns)
 
-    settings = ("step after landing", n_legs, stop_at_lift_off, structure, input_indices)
-    limits = simd.RegisterLimits(N_STEP_INPUTS) if input_indices else simd.DEFAULT_LIMITS
+    cache_key = ("step after landing", n_legs, stop_at_lift_off, options_structure, input_indices)
+    register_limits = simd.RegisterLimits(N_STEP_INPUTS) if input_indices else simd.DEFAULT_LIMITS
     lane_arrays = [*wheels, *states, next_slopes]
-    results = run_compiled(take_step, uniform, lane_arrays, settings, limits)
-    _, outcome, durations, values, *columns = results
+    results = run_compiled(
+        step_lanes_after_landing, lane_independent, lane_arrays, cache_key, register_limits
+    )
+    _, outcome, durations, landing_quantities, *jacobian_columns = results
     return LandingSteps(
-        state=values[:2],
-        rear_impulse=values[2],
-        stopper_margin=np.where(durations[1] > 0.0, values[3], np.nan),
+        state=landing_quantities[:2],
+        rear_impulse=landing_quantities[2],
+        event_order_margin=np.where(durations[1] > 0.0, landing_quantities[3], np.nan),
         outcome=outcome,
         durations=durations,
-        jacobian=columns[0] if columns else None,
+        jacobian=jacobian_columns[0] if jacobian_columns else None,
     )

@@ -21,7 +21,7 @@ from vrw_jax.wheel import Outcome
 class StepSensitivity(eqx.Module):
     """Derivatives of the end of a walk with respect to its start or a parameter.
 
-    The start, and a parameter that is an array over steps, have an axis of their own, the last one.
+    The start, and a parameter that is an array over steps, have their own axis, the last one.
     """
 
     section_state: Float[np.ndarray, "lanes section *start"]
@@ -65,10 +65,11 @@ class StepBatchResult(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how the walks ended, as a sentence; a batch has an array of sentences."""
+        """Description of how each walk ended, as an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:
+        """Return label and text of each row of the printed result."""
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
         solver_texts = (
             f"{count:,} by {name}"
@@ -89,25 +90,26 @@ START_NAME = "section_state"
 class StepwiseParameter(NamedTuple):
     """Role of a parameter in the steps of a walk, for the chain rule.
 
-    It may be several inputs of one step, and its values may differ from step to step.
+    The parameter may be several inputs of one step, and its values may differ from step to step.
     """
 
-    input_indices: tuple[int, ...]  # indices of its inputs among those of a step
+    input_indices: tuple[int, ...]  # indices among the inputs of a step
     n_values: int | None  # number of values of one lane; None for a single number
-    terms: Callable[[int], tuple[tuple[int, int, float], ...]]
-    """Return for a step its terms (which of the inputs, which value, derivative of the first by the
-    second)."""
+    chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
+    """Function from a step to its terms (position of the input, index of the value, derivative of
+    the input by the value)."""
 
 
 def complete_batch_slopes(slopes: np.ndarray, n_steps: int) -> np.ndarray:
-    """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad; the last of n given
-    slopes is used twice.
+    """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad.
+
+    If `slopes` has n entries per lane, the last one is repeated.
     """
     return slopes.T if slopes.shape[1] > n_steps else np.concatenate([slopes.T, slopes.T[-1:]])
 
 
 class WalkBatch:
-    """Batch of walks in progress. Lanes are the last axis of every array."""
+    """Batch of walks in progress, with lanes on the last axis of every array."""
 
     def __init__(
         self,
@@ -116,17 +118,17 @@ class WalkBatch:
         parameters: tuple[str, ...],
         stepwise_parameters: Mapping[str, StepwiseParameter],
     ) -> None:
-        """Begin the walks.
+        """Start the walks from `states`, (section, lanes).
 
         - `derivative_names`: requested derivatives: `START_NAME` and names of `parameters`;
         - `parameters`: names of the first inputs of a step; the section state follows them;
-        - `stepwise_parameters`: those that do not enter every step as one equal input.
+        - `stepwise_parameters`: parameters that do not enter every step as one equal input.
         """
         state_size, n_lanes = states.shape
         self.section_state, self.durations = states, np.zeros((3, n_lanes), states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.is_collocated = np.zeros(n_lanes, bool)
-        # Inputs of the Jacobian: the requested parameters, then the start.
+        # The inputs of the Jacobian are the requested parameters, then the start.
         self.derivative_names = derivative_names
         self.parameter_names = [name for name in derivative_names if name != START_NAME]
         self.is_flat_ground = not stepwise_parameters
@@ -140,26 +142,26 @@ class WalkBatch:
         state_inputs = range(len(parameters), len(parameters) + state_size)
         self.input_indices = (*parameter_inputs, *state_inputs) if derivative_names else ()
         n_rows_by_parameter = [parameter.n_values or 1 for parameter in self.parameters]
-        # First row of the Jacobian of each parameter, and then that of the start.
-        self.first_rows = np.cumsum([0, *n_rows_by_parameter])
-        n_rows = self.first_rows[-1] + state_size if derivative_names else 0
+        # This is the first row of each parameter in the Jacobian, and then that of the start.
+        self.first_jacobian_rows = np.cumsum([0, *n_rows_by_parameter])
+        n_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
         self.jacobian = np.zeros((n_rows, state_size + 3, n_lanes), states.dtype)
 
     def active_lanes(self) -> np.ndarray:
-        """Return the indices of the lanes that continue."""
+        """Return the indices of the lanes whose walk continues."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
     def to_result(
         self,
-        order: np.ndarray,
+        lane_order: np.ndarray,
         solver_index: np.ndarray,
         engine: str,
         solver_names: tuple[str, ...],
     ) -> StepBatchResult:
-        """Return the result, with each lane at its index before sorting by `order`."""
-        inverse_order = np.empty_like(order)
-        inverse_order[order] = np.arange(len(order))
-        reorder = lambda x: x.take(inverse_order, -1).T
+        """Return the result, with each lane at its index before sorting by `lane_order`."""
+        inverse_lane_order = np.empty_like(lane_order)
+        inverse_lane_order[lane_order] = np.arange(len(lane_order))
+        reorder = lambda x: x.take(inverse_lane_order, -1).T
         return StepBatchResult(
             reorder(self.section_state),
             reorder(self.durations),
@@ -170,18 +172,18 @@ class WalkBatch:
             reorder(solver_index),
             engine,
             solver_names,
-            self.named_derivatives(inverse_order),
+            self.derivatives_by_name(inverse_lane_order),
         )
 
-    def named_derivatives(self, inverse_order: np.ndarray) -> dict[str, StepSensitivity]:
-        """Return the derivatives of the walk by name of the input; zero where it failed."""
+    def derivatives_by_name(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
+        """Return the derivatives of the walk by name of the input; zero for failed walks."""
         if not self.derivative_names:
             return {}
         self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian, state_size = self.jacobian.take(inverse_order, -1).T, len(self.section_state)
-        rows_by_name: dict[str, Any] = {START_NAME: slice(self.first_rows[-1], None)}
+        jacobian, state_size = self.jacobian.take(inverse_lane_order, -1).T, len(self.section_state)
+        rows_by_name: dict[str, Any] = {START_NAME: slice(self.first_jacobian_rows[-1], None)}
         for name, parameter, first_row in zip(
-            self.parameter_names, self.parameters, self.first_rows[:-1], strict=True
+            self.parameter_names, self.parameters, self.first_jacobian_rows[:-1], strict=True
         ):
             n_values = parameter.n_values
             rows_by_name[name] = (
@@ -200,75 +202,83 @@ class WalkBatch:
     ) -> None:
         """Record a step of these lanes: state, durations, outcome, solver steps and Jacobian."""
         section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
-        index = lane_index(lanes, self)
+        lane_index = make_lane_index(lanes, self)
         if step_jacobian:
             self.jacobian = _replace_lanes(
-                self.jacobian, index, self._chain_jacobian(index, *step_jacobian)
+                self.jacobian, lane_index, self._chain_jacobian(lane_index, *step_jacobian)
             )
-        self.section_state = _replace_lanes(self.section_state, index, section_state)
-        self.durations = _replace_lanes(self.durations, index, durations)
-        self.outcome = _replace_lanes(self.outcome, index, outcome)
-        self.is_collocated = _replace_lanes(self.is_collocated, index, is_collocated)
-        self.n_stepped[index] += outcome == Outcome.STEPPED
-        self.solver_steps[index] += n_solver_steps
+        self.section_state = _replace_lanes(self.section_state, lane_index, section_state)
+        self.durations = _replace_lanes(self.durations, lane_index, durations)
+        self.outcome = _replace_lanes(self.outcome, lane_index, outcome)
+        self.is_collocated = _replace_lanes(self.is_collocated, lane_index, is_collocated)
+        self.n_stepped[lane_index] += outcome == Outcome.STEPPED
+        self.solver_steps[lane_index] += n_solver_steps
 
-    def _chain_jacobian(self, index: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk from that of its last step, (columns, rows, lanes).
+    def _chain_jacobian(self, lane_index: Any, step_jacobian: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the walk from that of its last step, (inputs, outputs, lanes).
 
         Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
         if not self.is_flat_ground:
-            return self._chain_stepwise_jacobian(index, step_jacobian)
+            return self._chain_stepwise_jacobian(lane_index, step_jacobian)
         n_parameters, state_size = len(self.parameter_names), len(self.section_state)
-        if not self.n_stepped[index].any():
+        if not self.n_stepped[lane_index].any():
             return step_jacobian
-        previous_jacobian = self.jacobian[:, :state_size, index]
-        chained = sum(
+        previous_jacobian = self.jacobian[:, :state_size, lane_index]
+        chained_jacobian = sum(
             step_jacobian[n_parameters + i] * previous_jacobian[:, i, None]
             for i in range(state_size)
         )
-        chained[:n_parameters] += step_jacobian[:n_parameters]
-        return chained
+        chained_jacobian[:n_parameters] += step_jacobian[:n_parameters]
+        return chained_jacobian
 
-    def _chain_stepwise_jacobian(self, index: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return `_chain_jacobian` with one row for each value over steps.
+    def _chain_stepwise_jacobian(self, lane_index: Any, step_jacobian: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the walk with one row for each value over steps.
 
         The values of later steps have no effect yet, and their rows are zero.
         """
-        state_size, first_start_row = len(self.section_state), self.first_rows[-1]
+        state_size, first_start_row = len(self.section_state), self.first_jacobian_rows[-1]
         n_inputs = len(step_jacobian) - state_size
-        k = int(np.max(self.n_stepped[index], initial=0))
-        shape = len(self.jacobian), *step_jacobian.shape[1:]
-        chained = np.zeros(shape, step_jacobian.dtype)
+        k = int(np.max(self.n_stepped[lane_index], initial=0))
+        jacobian_shape = len(self.jacobian), *step_jacobian.shape[1:]
+        chained_jacobian = np.zeros(jacobian_shape, step_jacobian.dtype)
         if k == 0:
-            chained[first_start_row:] = step_jacobian[n_inputs:]
+            chained_jacobian[first_start_row:] = step_jacobian[n_inputs:]
         else:
-            used_rows = [
+            used_row_ranges = [
                 range(first, min(first + k + 1, end))
-                for first, end in itertools.pairwise(self.first_rows)
+                for first, end in itertools.pairwise(self.first_jacobian_rows)
             ]
-            rows = np.array([*itertools.chain(*used_rows), *range(first_start_row, len(chained))])
-            previous_jacobian = self.jacobian[rows, :state_size][..., index]
-            chained[rows] = sum(
+            used_rows = np.array(
+                [*itertools.chain(*used_row_ranges), *range(first_start_row, len(chained_jacobian))]
+            )
+            previous_jacobian = self.jacobian[used_rows, :state_size][..., lane_index]
+            chained_jacobian[used_rows] = sum(
                 step_jacobian[n_inputs + i] * previous_jacobian[:, i, None]
                 for i in range(state_size)
             )
-        first_input = 0
-        for parameter, first_row in zip(self.parameters, self.first_rows[:-1], strict=True):
-            for which, value, factor in parameter.terms(k):
-                chained[first_row + value] += factor * step_jacobian[first_input + which]
-            first_input += len(parameter.input_indices)
-        return chained
+        first_input_row = 0
+        for parameter, first_row in zip(
+            self.parameters, self.first_jacobian_rows[:-1], strict=True
+        ):
+            for input_position, value_index, factor in parameter.chain_rule_terms(k):
+                chained_jacobian[first_row + value_index] += (
+                    factor * step_jacobian[first_input_row + input_position]
+                )
+            first_input_row += len(parameter.input_indices)
+        return chained_jacobian
 
 
-def lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
-    """Return an index of these lanes, which copies nothing if they are all lanes."""
+def make_lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
+    """Return an index of these lanes: a slice, which copies nothing, if they are all lanes."""
     return slice(None) if len(lanes) == len(walks.outcome) else lanes
 
 
-def _replace_lanes(values: np.ndarray, index: Any, new_values: np.ndarray) -> np.ndarray:
-    """Return the array with the values of the lanes at `index` replaced, in place if possible."""
-    if isinstance(index, slice):
+def _replace_lanes(values: np.ndarray, lane_index: Any, new_values: np.ndarray) -> np.ndarray:
+    """Return the array with the values of the lanes at `lane_index` replaced, in place if
+    possible.
+    """
+    if isinstance(lane_index, slice):
         return new_values
-    values[..., index] = new_values
+    values[..., lane_index] = new_values
     return values

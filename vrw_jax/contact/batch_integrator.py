@@ -39,7 +39,7 @@ from vrw_jax.integrator import (
     step_size_factor,
 )
 from vrw_jax.numerics import StepOptions, tree_where
-from vrw_jax.wheel import Outcome, Symbols, compute_own_units
+from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
 N_CONTACT_ROWS = 9
 """Number of dynamics rows that hold the contact quantities of the guards. They follow the
@@ -262,7 +262,7 @@ def init_interval(
     roundoff = compute_guard_scales(dynamics) * (
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
-    time_unit = compute_own_units(dynamics.s).time
+    time_unit = compute_wheel_units(dynamics.s).time
     min_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
     is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_rate))
     is_triggered = ~is_initiating & (
@@ -323,7 +323,7 @@ def integrate_interval(
     dynamics = dynamics_fn(input_columns)
     guard_scales, options = (
         compute_guard_scales(dynamics),
-        compute_own_units(dynamics.s).scale_times(options),
+        compute_wheel_units(dynamics.s).scale_times(options),
     )
 
     def try_step(state: IntervalState) -> IntervalState:

@@ -38,7 +38,7 @@ from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
 from vrw_jax.runtime import cached_lane_program
-from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_own_units_of_rows, compute_symbols
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols, compute_wheel_units_of_rows
 
 
 def walk_batch(
@@ -100,7 +100,7 @@ def step_batch_with_jacobian(
     if input_indices is not None:
         has_tangent &= np.isin(np.arange(step_inputs.shape[1]), input_indices)
     rate_indices = len(input_columns) + np.array([1, 2, 3, *range(4 + n, 4 + 2 * n)])
-    section_units = compute_section_units(compute_own_units_of_rows(input_columns.T, n), n)
+    section_units = compute_section_units(compute_wheel_units_of_rows(input_columns.T, n), n)
     rate_units = np.stack(section_units, -1)[:, rate_indices - len(input_columns)]
     projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n)]]  # as in `pack_coordinates`
     projection = _project_rates(input_columns, states, n) * (

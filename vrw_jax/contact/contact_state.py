@@ -37,7 +37,7 @@ from vrw_jax.contact.mechanics import (
     sum_over_legs,
 )
 from vrw_jax.numerics import Elementwise, Scalar
-from vrw_jax.wheel import Symbols, compute_own_units, is_at_rest, is_still
+from vrw_jax.wheel import Symbols, compute_wheel_units, is_at_rest, is_still
 
 PackedState = Float[Array, "dim ..."]
 """Hub (x, z, theta), their rates, leg lengths, their rates, then the accumulators: see
@@ -338,7 +338,7 @@ def compute_guard_scales(dynamics: ModeDynamics) -> Array:
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's own units of (hub x, z, theta, lengths) and of their rates."""
-    units, dimensionless = compute_own_units(s), jnp.ones_like(s.L0)
+    units, dimensionless = compute_wheel_units(s), jnp.ones_like(s.L0)
     position_units = [units.length, units.length, dimensionless, *[units.length] * s.n]
     rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
     return jnp.stack(position_units), jnp.stack(rate_units)
@@ -351,7 +351,7 @@ def is_wheel_at_rest(
 
     - `atol`: absolute tolerance in the wheel's own units.
     """
-    rate_units, time_unit = compute_state_units(s)[1], compute_own_units(s).time
+    rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time
     return is_at_rest(rates, accelerations, rate_units, time_unit, atol)
 
 
@@ -380,7 +380,7 @@ def choose_stopping_guard(
 
 def compute_packed_units(s: Symbols) -> PackedState:
     """Return the wheel's own unit of each entry of `pack_state`."""
-    units, (position_units, rate_units) = compute_own_units(s), compute_state_units(s)
+    units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
     accumulator_units = Accumulators(units.time, units.energy, units.energy, units.length)
     packed_units = (
         position_units[:3],

@@ -8,7 +8,7 @@ from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions
 from vrw_jax.models import PAPER_START, is_valid_slope, is_valid_start, replace_invalid
 from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import OwnUnits, Symbols, WheelParams, length_at_touchdown
+from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
 """State (theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
@@ -27,7 +27,7 @@ def full_section_size(n: int) -> int:
     return 4 + 3 * n
 
 
-def compute_section_units(units: OwnUnits, n: int) -> list[Elementwise]:
+def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
     """Return the wheel's own unit of each entry of a full section state, as a list.
 
     Angles and codes have the unit 1.

@@ -97,9 +97,9 @@ from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     Outcome,
-    OwnUnits,
     WheelParams,
-    compute_own_units,
+    WheelUnits,
+    compute_wheel_units,
     convert_friction,
 )
 
@@ -250,7 +250,7 @@ class UnilateralWheel(AbstractWheel):
     def n_continuous(self, params: WheelParams) -> int:
         return full_section_size(params.n_legs) - params.n_legs
 
-    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return compute_section_units(units, n_legs)
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:
@@ -374,7 +374,7 @@ class UnilateralWheel(AbstractWheel):
                 False,
                 ContactState(log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags),
             )
-            state_and_time_units = compute_packed_units(s), compute_own_units(s).time
+            state_and_time_units = compute_packed_units(s), compute_wheel_units(s).time
             sampling_arguments = (
                 partial(vector_field, dynamics),
                 log.state,
@@ -477,7 +477,7 @@ def _advance_to_event(
         layout.n_guards,
         guard_scales=compute_guard_scales(dynamics),
     )
-    units = compute_packed_units(dynamics.s), compute_own_units(dynamics.s).time
+    units = compute_packed_units(dynamics.s), compute_wheel_units(dynamics.s).time
     interval_end = integrate_in_units(
         partial(vector_field, dynamics), guard_spec, start_state, is_valid, options, *units
     )

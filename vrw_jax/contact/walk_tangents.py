@@ -43,7 +43,7 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.integrator import ButcherTableau, real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any, tree_where
-from vrw_jax.wheel import compute_own_units
+from vrw_jax.wheel import compute_wheel_units
 
 
 class _IntervalTangent(NamedTuple):
@@ -295,7 +295,7 @@ def _integrate_with_tangents(
     """Return the result of `integrate_interval`, and the tangent rows at the event."""
     dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(dynamics), len(tableau.nodes) - 1
-    options = compute_own_units(dynamics.s).scale_times(options)
+    options = compute_wheel_units(dynamics.s).scale_times(options)
     has_later_moving_legs = _has_later_moving_legs(
         tangents, tangent_template, initial_state.contact_state
     )

@@ -19,7 +19,7 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
     WheelParams,
-    compute_own_units_of_rows,
+    compute_wheel_units_of_rows,
     wheel_from_parameters,
 )
 
@@ -235,7 +235,7 @@ def _mark_missing_gaits(is_missing: np.ndarray, cycle: Any) -> Any:
 
 def stack_section_units(model: Any, values: np.ndarray, n_legs: int) -> np.ndarray:
     """Return each wheel's own units of its section state, (wheels, section)."""
-    return np.stack(model.section_units(compute_own_units_of_rows(values, n_legs), n_legs), -1)
+    return np.stack(model.section_units(compute_wheel_units_of_rows(values, n_legs), n_legs), -1)
 
 
 def _count_section_coordinates(finder: Any) -> int:

@@ -39,7 +39,7 @@ from vrw_jax.numerics import (
     zero_tangent,
 )
 from vrw_jax.runtime import cached_lane_function, cached_trace, with_default_settings
-from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_own_units, compute_symbols
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, compute_wheel_units
 
 
 def _collocation_tangents(
@@ -196,7 +196,7 @@ def _search_in_own_units(
     The section is (theta, dtheta) after a landing; the ends are (theta, L1) and their rates. Mass
     is not converted, because no unknown contains it.
     """
-    units = compute_own_units(compute_symbols(system.n_legs, *parameters))._replace(mass=1.0)
+    units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(mass=1.0)
     one, time = jnp.ones_like(units.time), units.time
     position_units = jnp.stack([one, units.length, units.length])
     section_units = jnp.stack([one, 1.0 / time])

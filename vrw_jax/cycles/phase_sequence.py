@@ -23,7 +23,7 @@ from vrw_jax.collocation import (
 from vrw_jax.numerics import Elementwise, Vector, sine_cosine
 from vrw_jax.wheel import (
     PAPER_PHASES,
-    SHARED_FAILURES,
+    SHARED_FAILURE_OUTCOMES,
     AbstractPhase,
     Motion,
     PhaseInstant,
@@ -92,7 +92,8 @@ def _make_collocation_phase(
     def to_next_phase(constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
         phase, motion = evaluate_phase(constants, point)
         return PhasePoint(
-            (), *PAPER_PHASES[phase_index + 1].own_coordinates(point.q[0], phase.reset_map(motion))
+            (),
+            *PAPER_PHASES[phase_index + 1].select_coordinates(point.q[0], phase.reset_map(motion)),
         )
 
     def to_section(constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
@@ -117,7 +118,7 @@ def _admissibility_checks() -> tuple[str, ...]:
     """Return the checks of all phases and transitions, each as a phrase."""
     checks: list[str] = []
     for phase_class in PAPER_PHASES:
-        other_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURES)
+        other_outcomes = (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
         checks += [f"{phase_class.name} lasts", f"{phase_class.name} ends only once"]
         checks += [f"no {outcome.name} in {phase_class.name}" for outcome in other_outcomes]
     return (*checks, "λ4⁺ says whether there is DLS", "λ_I4 holds the rear foot", "Leg 2 extends")

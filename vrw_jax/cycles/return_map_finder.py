@@ -34,7 +34,7 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
 from vrw_jax.printing import TextRow, format_numbers
 from vrw_jax.simulation import validate_arguments, walk_toward_gait
-from vrw_jax.wheel import Outcome, WheelParams, compute_own_units
+from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
 """Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
@@ -135,7 +135,7 @@ def find_return_map_cycle(
         if uses_jvp_rule
         else (model.advance, solve_fixed_point)
     )
-    units = jnp.stack(model.section_units(compute_own_units(params.symbols()), params.n_legs))
+    units = jnp.stack(model.section_units(compute_wheel_units(params.symbols()), params.n_legs))
     return_map = lambda section_state: (
         take_step(params, section_state * units, options).section_state / units
     )

@@ -64,7 +64,7 @@ from vrw_jax.wheel import (
     SingleSupport1,
     Symbols,
     WheelParams,
-    compute_own_units,
+    compute_wheel_units,
     transitions,
 )
 
@@ -235,7 +235,7 @@ def take_step_after_landing(
     landing_values = [jnp.where(has_stepped, row, 0.0) for row in landing_rows]
     sls1 = sequence.phases[1]
     order_margin = with_batched_jvp(_event_order_margin)(
-        sequence.s, sls1.turn, phase_ends[1].q, phase_ends[1].v
+        sequence.s, sls1.tilt_sin_cos, phase_ends[1].q, phase_ends[1].v
     )
     order_margin = jnp.where(sequence.phases_happened[1], order_margin, 0.0)
     return LandingStep(
@@ -290,7 +290,7 @@ def run_batch_phases(
         is_active: Array,
         previous_end: PhaseResult | None,
     ) -> PhaseResult:
-        scaled_options = compute_own_units(phase.s).scale_times(options)
+        scaled_options = compute_wheel_units(phase.s).scale_times(options)
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
         if previous_end is not None:
             engine_carry: _PhaseCarry = previous_end.engine_carry
@@ -301,11 +301,13 @@ def run_batch_phases(
                 max_transient_dt = transient_dt * phase.s.m / phase.s.c
                 dt0 = jnp.minimum(stiff_start.max_step_ratio * dt0, max_transient_dt)
                 dt0 = jnp.where(engine_carry.has_run, dt0, engine_carry.next_dt)
-        float_leaves, static_leaves = eqx.partition((phase.s, phase.turn), eqx.is_array)
+        float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sin_cos), eqx.is_array)
 
         def make_phase(float_leaves: Any, constants: Vector) -> BatchPhase:
-            s, turn = eqx.combine(float_leaves, static_leaves)
-            rebuilt_phase = dataclasses.replace(phase, s=s, constants=constants, turn=turn)
+            s, tilt_sin_cos = eqx.combine(float_leaves, static_leaves)
+            rebuilt_phase = dataclasses.replace(
+                phase, s=s, constants=constants, tilt_sin_cos=tilt_sin_cos
+            )
             return make_batch_phase(rebuilt_phase, records_margins, is_noinline)
 
         phase_end = integrate_batch_phase(
@@ -441,7 +443,7 @@ def build_step_sampler(
                 *start,
                 end.duration,
                 n_samples,
-                compute_own_units(phase.s).scale_times(options),
+                compute_wheel_units(phase.s).scale_times(options),
             )
             for phase, start, end in zip(
                 sequence.phases, sequence.phase_starts, sequence.phase_ends, strict=True

@@ -16,8 +16,8 @@ from vrw_jax.validation import is_traced
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
-    OwnUnits,
     WheelParams,
+    WheelUnits,
     wheel_from_parameters,
 )
 
@@ -149,7 +149,7 @@ class AbstractWheel(eqx.Module):
         """
         return self.section_size(params)
 
-    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the wheel's own unit of each entry of a section state, as a list."""
         return [units.length / units.length, units.rate, units.speed]
 

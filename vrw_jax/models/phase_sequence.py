@@ -114,7 +114,7 @@ def run_phases(
             safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_lengths_and_rates)
             theta, motion = tree_where(is_active, (theta, motion), safe_state)
             motion = previous_phase.reset_map(motion)
-        start_state = phase.own_coordinates(theta, motion)
+        start_state = phase.select_coordinates(theta, motion)
         phase_end = run_phase(
             phase, *start_state, is_active, phase_ends[-1] if phase_ends else None
         )

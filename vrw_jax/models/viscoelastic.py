@@ -44,7 +44,7 @@ from vrw_jax.wheel import (
     Motion,
     PhaseInstant,
     WheelParams,
-    compute_own_units,
+    compute_wheel_units,
     require_known_friction,
 )
 
@@ -153,7 +153,7 @@ class ViscoelasticWheel(AbstractWheel):
         ):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
             y = jnp.stack([*start[0], *start[1]])
-            units = jnp.stack(phase.coordinate_units), compute_own_units(phase.s).time
+            units = jnp.stack(phase.coordinate_units), compute_wheel_units(phase.s).time
             samples.append(
                 sample_in_units(vector_field, y, end.duration, n_samples, options, *units)
             )
@@ -175,7 +175,7 @@ class ViscoelasticWheel(AbstractWheel):
                 is_active,
                 options,
                 jnp.stack(phase.coordinate_units),
-                compute_own_units(phase.s).time,
+                compute_wheel_units(phase.s).time,
             )
             end_state = tuple(phase_end.state)
             return PhaseResult(

@@ -44,8 +44,8 @@ from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     Outcome,
-    OwnUnits,
     WheelParams,
+    WheelUnits,
     convert_friction,
 )
 
@@ -273,7 +273,7 @@ class LadderWheel(AbstractWheel):
     def n_continuous(self, params: WheelParams) -> int:
         return self.unilateral_model.n_continuous(params)
 
-    def section_units(self, units: OwnUnits, n_legs: int) -> list[Elementwise]:
+    def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return self.unilateral_model.section_units(units, n_legs)
 
     def embed_section(self, params: WheelParams, x: Array) -> FullState:

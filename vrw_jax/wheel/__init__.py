@@ -30,7 +30,7 @@ from vrw_jax.wheel.params import (
 )
 from vrw_jax.wheel.phases import (
     PAPER_PHASES,
-    SHARED_FAILURES,
+    SHARED_FAILURE_OUTCOMES,
     AbstractPhase,
     PhaseInstant,
     PhaseMargins,
@@ -39,4 +39,4 @@ from vrw_jax.wheel.phases import (
 )
 from vrw_jax.wheel.rest import is_at_rest, is_still, replace_rest_outcome
 from vrw_jax.wheel.transitions import Landing
-from vrw_jax.wheel.units import OwnUnits, compute_own_units, compute_own_units_of_rows
+from vrw_jax.wheel.units import WheelUnits, compute_wheel_units, compute_wheel_units_of_rows

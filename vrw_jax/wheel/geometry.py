@@ -1,6 +1,6 @@
-"""Positions of the wheel's points: hub, feet and the distances that guards use.
+"""Positions of the wheel's points: hub, feet and the distances in guards.
 
-The frame is tilted with the slope: x points downhill along it, z is normal to it. Angles are
+The frame is tilted with the slope: x points downhill along it, and z is normal to it. Angles are
 measured from the normal, and theta grows as the wheel rolls downhill. Leg j has the angle theta +
 (j - 1) alpha. Leg 1 is the fore leg on the ground, Leg 2 is the rear leg, and leg n, at theta -
 alpha, lands next. The origin is the foot of Leg 1. A posture depends on theta only through its sine
@@ -56,7 +56,9 @@ def landing_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> SineCos
 
 
 def rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the height of foot 2 above the slope, m; negative when it scuffs (Section 3.3.1)."""
+    """Return the height of foot 2 above the slope, m; negative if the foot scuffs (Section
+    3.3.1).
+    """
     return motion.L1 * motion.cos - motion.L2 * rear_direction(s, motion.sin, motion.cos).cos
 
 
@@ -66,15 +68,13 @@ def landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
 
 
 def length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
-    """Return the length of Leg 1 when the next foot meets the ground at angle theta, m."""
+    """Return the length of Leg 1 if the next foot meets the ground at the angle theta, m."""
     sin, cos = sine_cosine(theta)
     return s.L0 * landing_direction(s, sin, cos).cos / cos
 
 
 class DoubleSupportCircle(NamedTuple):
-    """Leg lengths and their derivatives with respect to theta on the hub's double-support
-    circle.
-    """
+    """Leg lengths, and their derivatives by theta, with the hub on its circle in double support."""
 
     L1: Elementwise  # m
     L2: Elementwise  # m
@@ -85,12 +85,12 @@ class DoubleSupportCircle(NamedTuple):
 def double_support_circle(
     s: Symbols, distance: Elementwise, sin: Elementwise, cos: Elementwise
 ) -> DoubleSupportCircle:
-    """Return the leg lengths with both feet planted `distance` m apart.
+    """Return the leg lengths and their derivatives with both feet planted `distance` m apart.
 
     The hub moves on a circle with the inscribed angle alpha (Section 2).
     """
     diameter = distance / s.sin_alpha
-    rear = rear_direction(s, sin, cos)
+    rear_leg = rear_direction(s, sin, cos)
     return DoubleSupportCircle(
-        diameter * rear.cos, diameter * cos, -diameter * rear.sin, -diameter * sin
+        diameter * rear_leg.cos, diameter * cos, -diameter * rear_leg.sin, -diameter * sin
     )

@@ -8,11 +8,12 @@ from vrw_jax.wheel.params import WheelParams
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """A named set of wheel parameters; parameters that it does not list have the values of Table 1.
+    """Named set of wheel parameters. Parameters that the set does not list have the values of Table
+    1.
 
-    - `values`: the parameters that differ from Table 1 at slope 0.30 rad, in SI units;
-    - `description`: what the wheel shows;
-    - `source`: where the numbers come from, and how they were confirmed.
+    - `values`: parameters that differ from Table 1 at slope 0.30 rad, in SI units;
+    - `description`: property of the wheel that the set demonstrates;
+    - `source`: source of the numbers, and how they were confirmed.
 
     Examples:
         >>> two_peaks = vrw.parameter_sets["two_peaks"]
@@ -26,7 +27,7 @@ class ParameterSet:
 
     @property
     def params(self) -> WheelParams:
-        """The wheel with these parameters."""
+        """Wheel with these parameters."""
         return WheelParams(**self.values)  # type: ignore[arg-type]
 
 
@@ -59,5 +60,5 @@ parameter_sets = MappingProxyType(
         ),
     }
 )
-"""Sets by name: `vrw.parameter_sets["two_peaks"].params`, or `parameter_set = "two_peaks"` in the
-table `[wheel]` of a configuration."""
+"""Parameter sets by name: `vrw.parameter_sets["two_peaks"].params`, or `parameter_set =
+"two_peaks"` in the table `[wheel]` of a configuration."""

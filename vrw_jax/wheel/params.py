@@ -1,4 +1,4 @@
-"""Wheel parameters with units and domains, and the symbols of the paper."""
+"""Parameters of the wheel with units and domains, and the symbols of the paper."""
 
 import functools
 import math
@@ -17,7 +17,7 @@ from vrw_jax.validation import check_int, check_known_name, check_reals, format_
 
 
 class ParameterDomain(NamedTuple):
-    """Unit, symbol and allowed open or closed range of one parameter."""
+    """Symbol, unit and allowed range of one parameter."""
 
     symbol: str
     unit: str
@@ -46,9 +46,10 @@ class ParameterDomain(NamedTuple):
 
 
 MIN_SI_VALUE = 1e-15
-"""Least SI number of a positive parameter, chosen because quotients of smaller ones overflow."""
+"""Smallest SI number of a positive parameter, chosen because quotients of smaller numbers
+overflow."""
 MAX_SI_VALUE = 1e9
-"""Bound of the SI numbers of a wheel, chosen because products of larger ones overflow."""
+"""Bound of the SI numbers of a wheel, chosen because products of larger numbers overflow."""
 
 PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
     "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
@@ -86,7 +87,7 @@ outputs."""
 
 
 class Symbols(NamedTuple):
-    """Symbols of the paper and the combinations shared by the formulas, for local unpacking."""
+    """Symbols of the paper, and quantities that several formulas share."""
 
     m: Elementwise
     a: Elementwise
@@ -98,11 +99,11 @@ class Symbols(NamedTuple):
     sin_phi: Elementwise
     cos_phi: Elementwise
     Mh: Elementwise
-    """Mass of the hub and the n - 1 legs other than Leg 1, kg."""
+    """Mass of the hub and of the n - 1 legs other than Leg 1, kg."""
     Mt: Elementwise
     """Total mass, kg."""
     c0: Elementwise
-    """Distance of the mass of a locked leg from the hub, L0 - a, m."""
+    """Distance from the hub to the mass of a locked leg, L0 - a, m."""
     n: int
     sin_alpha: float
     cos_alpha: float
@@ -110,7 +111,7 @@ class Symbols(NamedTuple):
 
 
 def _parameter_field(name: str, default: float) -> Any:
-    """Return the field of a float parameter."""
+    """Return the dataclass field of a float parameter."""
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
@@ -161,7 +162,7 @@ class WheelParams(AbstractPrintable):
     n_legs: int = eqx.field(static=True, converter=_convert_n_legs, default=8)
 
     def __new__(cls, *_: Any, **named_values: Any) -> "WheelParams":
-        """Refuse names that no parameter has, before the wheel is made."""
+        """Raise `TypeError` for names that no parameter has, before the wheel is made."""
         for name in named_values:
             try:
                 check_parameter_name(
@@ -212,7 +213,8 @@ class WheelParams(AbstractPrintable):
 
     @property
     def in_axes(self) -> "WheelParams":
-        """Return 0 for each parameter with an axis and None for the others, as `jax.vmap` expects.
+        """Argument `in_axes` of `jax.vmap`: 0 for each parameter with an axis and None for the
+        others.
 
         For example `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
         """
@@ -228,20 +230,21 @@ class WheelParams(AbstractPrintable):
 
     @property
     def title(self) -> str:
-        suffix = (
+        """Class name, with a note if a parameter is out of its domain."""
+        title_suffix = (
             "" if np.all(self.is_in_domain()) else " out of its domain: a gradient or a difference"
         )
-        return "WheelParams" + suffix
+        return "WheelParams" + title_suffix
 
     def summary_rows(self) -> list[TextRow]:
         """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
         values = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
         if not np.all(self.is_in_domain()):
-            denominator = lambda domain: (
+            denominator_text = lambda domain: (
                 f"{domain.symbol}, {domain.unit}" if domain.unit else domain.symbol
             )
             return [
-                (f"by {n} {denominator(PARAMETER_DOMAINS[n])}", format_quantity(value, ""))
+                (f"by {n} {denominator_text(PARAMETER_DOMAINS[n])}", format_quantity(value, ""))
                 for n, value in values.items()
             ]
         parameter_rows = [
@@ -257,11 +260,11 @@ class WheelParams(AbstractPrintable):
 
     def is_in_domain(self) -> Bool[Array, "..."]:
         """Return whether every parameter is finite and in its domain, elementwise."""
-        is_inside = self.leg_com < self.locked_length
+        is_in_all_domains = self.leg_com < self.locked_length
         for name, domain in PARAMETER_DOMAINS.items():
             value = getattr(self, name)
-            is_inside = is_inside & domain.contains(value) & jnp.isfinite(value)
-        return is_inside
+            is_in_all_domains = is_in_all_domains & domain.contains(value) & jnp.isfinite(value)
+        return is_in_all_domains
 
     def scaled(
         self,
@@ -304,14 +307,14 @@ class WheelParams(AbstractPrintable):
         scaled_values = {}
         for name, domain in PARAMETER_DOMAINS.items():
             powers = UNIT_POWERS[domain.unit]
-            scale = math.prod(
+            scale_factor = math.prod(
                 factor**power for factor, power in zip(factors.values(), powers, strict=True)
             )
-            scaled_values[name] = getattr(self, name) * scale
+            scaled_values[name] = getattr(self, name) * scale_factor
         return WheelParams(**scaled_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
-        """Return the symbols of the paper with the combinations shared by the formulas."""
+        """Return the symbols of the paper for this wheel, with shared quantities."""
         return compute_symbols(self.n_legs, *(getattr(self, name) for name in PARAMETER_DOMAINS))
 
 
@@ -327,7 +330,7 @@ def compute_symbols(
     slope: Elementwise,
     gravity: Elementwise,
 ) -> Symbols:
-    """Return the `Symbols` of plain numbers, which may be complex."""
+    """Return the `Symbols` of plain numbers in SI units, which may be complex."""
     alpha = 2.0 * math.pi / n_legs
     sin_phi, cos_phi = sine_cosine(slope)
     return Symbols(
@@ -352,7 +355,7 @@ def compute_symbols(
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
 FRICTION_NAME = "friction"
-"""Name of the ground's coefficient of friction, which designs and branches may vary as well."""
+"""Name of the ground's coefficient of friction, which designs and branches may also vary."""
 
 NAMES_OF_SYMBOLS: dict[str, str] = {
     **{domain.symbol: name for name, domain in PARAMETER_DOMAINS.items()},
@@ -363,15 +366,18 @@ NAMES_OF_SYMBOLS: dict[str, str] = {
 
 
 def refuse_symbol(name: Any, allowed_names: Iterable[str]) -> None:
-    """Raise if `name` is the symbol of a parameter whose name is allowed."""
+    """Raise `ValueError` if `name` is the symbol of a parameter whose name is allowed."""
     allowed_names = tuple(allowed_names)
-    parameter = NAMES_OF_SYMBOLS.get(name) if isinstance(name, str) else None
-    if name not in allowed_names and parameter in allowed_names:
-        raise ValueError(f"{name} is called {parameter}: write {parameter}.")
+    parameter_name = NAMES_OF_SYMBOLS.get(name) if isinstance(name, str) else None
+    if name not in allowed_names and parameter_name in allowed_names:
+        raise ValueError(f"{name} is called {parameter_name}: write {parameter_name}.")
 
 
 def check_parameter_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
-    """Refuse a name that is no allowed parameter; for a symbol, give the parameter's name."""
+    """Raise `ValueError` for a name that is no allowed parameter.
+
+    For a symbol of the paper, the message gives the parameter's name.
+    """
     refuse_symbol(name, allowed_names)
     check_known_name(name, allowed_names, description)
 
@@ -392,7 +398,8 @@ def convert_friction(value: object) -> Array:
 
 
 def require_known_friction(value: Any) -> float:
-    """Return the coefficient of friction as a float, for models whose motion is independent of it.
+    """Return the coefficient of friction as a float, for models whose motion is independent of
+    friction.
 
     Raises `TypeError` for an array with an axis or a traced value.
     """
@@ -414,8 +421,8 @@ def wheel_from_parameters(
 ) -> WheelParams:
     """Return the wheel with these float parameters, in the order of `PARAMETER_NAMES`.
 
-    - `next_slope`: on uneven ground the slope of the next line, rad, which joins the wheel's own
-      slope on a leading axis.
+    - `next_slope`: slope of the next line on uneven ground, rad. Both slopes are then on a leading
+      axis of `slope`.
     """
     wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
     if next_slope is None:

@@ -1,7 +1,7 @@
-"""Whether a wheel whose step has ended without a touchdown is at rest.
+"""Detection of wheels at rest among those whose step has ended without a touchdown.
 
-Rounding decides by which guard the step of such a wheel ends, or whether any guard ends it. The
-outcome therefore depends on the state at the end, and is the same from every engine.
+Round-off decides by which guard the step of such a wheel ends, or whether any guard ends the step.
+The outcome therefore depends on the state at the end, and is the same with every engine.
 """
 
 import functools
@@ -15,23 +15,28 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel.outcomes import Outcome
 
 OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
-"""Outcomes by which the step of a wheel at rest may end."""
+"""Outcomes by which the step of a wheel at rest can end."""
 
 MAX_REST_SPEED = 1e-8
-"""Largest speed of a wheel at rest, in own units. Chosen because it is a thousand times the error
-of a solver step at the default tolerances."""
+"""Largest speed of a wheel at rest, in the wheel's units, chosen because it is a thousand times the
+error of a solver step at the default tolerances."""
 REST_SPEED_PER_ATOL = 10.0
-"""Factor of the absolute tolerance that also bounds that speed. Chosen because the errors of solver
+"""Factor of the absolute tolerance that also bounds that speed, chosen because the errors of solver
 steps stay below one tolerance."""
 MAX_REST_ACCELERATION = 1e-4
-"""Largest acceleration of a wheel at rest, in own units. Chosen between the errors of the
-accelerations of stiff legs, below 1e-5, and the accelerations of wheels that fall back, near 1."""
+"""Largest acceleration of a wheel at rest, in the wheel's units. The value is chosen between two
+others. Errors of the accelerations of stiff legs are below 1e-5. Accelerations of wheels that fall
+back are near 1."""
 
 
 def is_still(
     rates: Iterable[Elementwise], rate_units: Iterable[Elementwise], atol: Elementwise
 ) -> Bool[Array, "..."]:
-    """Return whether no coordinate moves, to the accuracy of the solver steps."""
+    """Return whether no coordinate moves, to the accuracy of the solver steps.
+
+    - `rate_units`: the wheel's unit of each rate;
+    - `atol`: absolute tolerance in the wheel's units.
+    """
     max_speed = jnp.maximum(MAX_REST_SPEED, REST_SPEED_PER_ATOL * atol)
     return _are_bounded(rates, rate_units, max_speed)
 
@@ -43,7 +48,11 @@ def is_at_rest(
     time_unit: Elementwise,
     atol: Elementwise,
 ) -> Bool[Array, "..."]:
-    """Return whether the wheel is at rest, from the rates and accelerations of its coordinates."""
+    """Return whether the wheel is at rest, from rates and accelerations of its coordinates.
+
+    - `rate_units`, `time_unit`: the wheel's units of the rates and of time;
+    - `atol`: absolute tolerance in the wheel's units.
+    """
     max_acceleration = MAX_REST_ACCELERATION / time_unit
     return is_still(rates, rate_units, atol) & _are_bounded(
         accelerations, rate_units, max_acceleration
@@ -53,13 +62,14 @@ def is_at_rest(
 def _are_bounded(
     values: Iterable[Elementwise], units: Iterable[Elementwise], limit: Elementwise
 ) -> Bool[Array, "..."]:
-    conditions = [jnp.abs(x) <= limit * unit for x, unit in zip(values, units, strict=True)]
-    return functools.reduce(operator.and_, conditions)
+    """Return whether every value is at most `limit` times its unit."""
+    bounds_hold = [jnp.abs(x) <= limit * unit for x, unit in zip(values, units, strict=True)]
+    return functools.reduce(operator.and_, bounds_hold)
 
 
 def replace_rest_outcome(
     outcome: Int[Array, "..."], is_resting: Bool[Array, "..."]
 ) -> Int[Array, "..."]:
-    """Return the outcomes of a step's end, with CAME_TO_REST for wheels that are at rest."""
-    may_rest = functools.reduce(operator.or_, [outcome == code for code in OUTCOMES_AT_REST])
-    return jnp.where(may_rest & is_resting, jnp.int32(Outcome.CAME_TO_REST), outcome)
+    """Return the outcomes at the end of a step, with CAME_TO_REST for wheels that are at rest."""
+    can_be_rest = functools.reduce(operator.or_, [outcome == code for code in OUTCOMES_AT_REST])
+    return jnp.where(can_be_rest & is_resting, jnp.int32(Outcome.CAME_TO_REST), outcome)

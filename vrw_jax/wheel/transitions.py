@@ -1,8 +1,7 @@
-"""Collisions between the phases: each guard with its reset.
+"""Collisions between the phases: landing of a foot, and Leg 2 at its stopper.
 
-Guards are positive inside their phase and trigger when they fall through zero. Resets are the two
-collisions of the paper: landing (Section 3.4.1 with the procedure of Section 5.1) and stopper
-(Section 3.4.2).
+The landing follows Section 3.4.1 of the paper with the procedure of Section 5.1. The collision with
+the stopper follows Section 3.4.2.
 """
 
 from typing import NamedTuple
@@ -36,12 +35,12 @@ from vrw_jax.wheel.params import Symbols
 
 
 class Landing(NamedTuple):
-    """Result of the collision of the landing foot, with its impulses and energy loss."""
+    """Motion just after the landing of a foot, with impulses and energy loss."""
 
     theta: Elementwise  # rad, in the leg labels of the starting step
     motion: Motion  # just after the impact
     distance: Elementwise  # D, between both feet, m
-    keeps_rear_foot: Bool[Array, "..."]  # lambda_I4 >= 0: the rear foot stays (A4), else (A3)
+    keeps_rear_foot: Bool[Array, "..."]  # whether lambda_I4 >= 0: (A4), else (A3)
     fore_impulse: FootForce  # (lambda_I1, lambda_I2), N s, of the actual impact
     rear_impulse: FootForce  # (lambda_I3, lambda_I4), N s, with both feet held (A1)
     energy_lost: Elementwise  # J
@@ -51,8 +50,9 @@ class Landing(NamedTuple):
 def motion_before_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> Motion:
-    """Return the motion of the section state (theta-, dtheta-, dL1-): Leg 2 locked, next foot at z
-    = 0.
+    """Return the motion just before a landing, from (theta-, dtheta-, dL1-).
+
+    Leg 2 is locked, and the next foot is on the ground.
     """
     L1 = length_at_touchdown(s, theta)
     zero = 0.0 * (theta + s.L0)
@@ -60,14 +60,14 @@ def motion_before_landing(
 
 
 class _BothFeetLanding(NamedTuple):
-    """Landing that leaves both feet on the ground (A1), with its intermediate results."""
+    """Landing that leaves both feet on the ground (A1), with intermediate results."""
 
     motion_before: Motion
     motion_after: Motion
     distance: Elementwise
     foot_velocity: tuple[Elementwise, Elementwise]  # of the landing foot before the impact, m/s
     mass: MassMatrix  # in the leg labels of the starting step
-    momentum: tuple[Elementwise, ...]  # along its coordinates, about the new foot
+    momentum: tuple[Elementwise, ...]  # generalized momentum about the new foot
     circle_momentum: tuple[Elementwise, ...]  # mass matrix times the tangent of the hub's circle
 
 
@@ -77,30 +77,39 @@ def _solve_both_feet_landing(
     """Return the landing with both feet held on the ground (A1)."""
     motion_before = motion_before_landing(s, theta, dtheta, dL1)
     L1_before = motion_before.L1
-    # Velocity of the landing foot: eqs (16), (17) with the rate of L1 before the impact.
+    # The velocity of the landing foot follows eqs (16), (17) with the rate of L1 before the impact.
     sin, cos = landing_direction(s, motion_before.sin, motion_before.cos)
-    foot_x = (L1_before * motion_before.cos - s.L0 * cos) * dtheta + dL1 * motion_before.sin
-    foot_z = -(L1_before * motion_before.sin - s.L0 * sin) * dtheta + dL1 * motion_before.cos
+    foot_velocity_x = (
+        L1_before * motion_before.cos - s.L0 * cos
+    ) * dtheta + dL1 * motion_before.sin
+    foot_velocity_z = (
+        -(L1_before * motion_before.sin - s.L0 * sin) * dtheta + dL1 * motion_before.cos
+    )
 
     rear_leg = rear_direction(s, sin, cos)
     M = mass_matrix(s, s.L0, L1_before)
-    # Generalized momentum of (theta, L1, L2) about the new foot, including its velocity.
-    own_momentum = M.multiply((dtheta, 0.0 * dtheta, dL1))
+    # The generalized momentum of (theta, L1, L2) about the new foot includes the velocity of this
+    # foot.
+    relative_momentum = M.multiply((dtheta, 0.0 * dtheta, dL1))
     A, B = s.Mh * s.L0 + s.m * s.L0, s.m * (s.L0 - L1_before)
     p1 = (
-        own_momentum[0]
-        + (A * cos + B * rear_leg.cos) * foot_x
-        - (A * sin + B * rear_leg.sin) * foot_z
+        relative_momentum[0]
+        + (A * cos + B * rear_leg.cos) * foot_velocity_x
+        - (A * sin + B * rear_leg.sin) * foot_velocity_z
     )
-    p2 = own_momentum[1] + s.Mh * (sin * foot_x + cos * foot_z)
-    p3 = own_momentum[2] - s.m * (rear_leg.sin * foot_x + rear_leg.cos * foot_z)
+    p2 = relative_momentum[1] + s.Mh * (sin * foot_velocity_x + cos * foot_velocity_z)
+    p3 = relative_momentum[2] - s.m * (
+        rear_leg.sin * foot_velocity_x + rear_leg.cos * foot_velocity_z
+    )
 
-    # (A1) both feet held: the hub can only move on its circle.
+    # (A1) With both feet held, the hub can only move on its circle.
     distance = s.L0 * s.sin_alpha / rear_leg.cos
     circle = double_support_circle(s, distance, sin, cos)
     circle_momentum = M.multiply((jnp.ones_like(circle.G1), circle.G1, circle.G2))
-    inertia = circle_momentum[0] + circle.G1 * circle_momentum[1] + circle.G2 * circle_momentum[2]
-    dtheta_after = (p1 + circle.G1 * p2 + circle.G2 * p3) / inertia
+    circle_inertia = (
+        circle_momentum[0] + circle.G1 * circle_momentum[1] + circle.G2 * circle_momentum[2]
+    )
+    dtheta_after = (p1 + circle.G1 * p2 + circle.G2 * p3) / circle_inertia
     locked_length = s.L0 + 0.0 * L1_before
     motion_after = Motion(
         sin,
@@ -112,54 +121,66 @@ def _solve_both_feet_landing(
         circle.G2 * dtheta_after,
     )
     return _BothFeetLanding(
-        motion_before, motion_after, distance, (foot_x, foot_z), M, (p1, p2, p3), circle_momentum
+        motion_before,
+        motion_after,
+        distance,
+        (foot_velocity_x, foot_velocity_z),
+        M,
+        (p1, p2, p3),
+        circle_momentum,
     )
 
 
 def land_on_both_feet(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> tuple[Elementwise, Elementwise]:
-    """Return (theta+, dtheta+) of a landing that leaves both feet on the ground."""
+    """Return (theta+, dtheta+) of a landing that leaves both feet on the ground, rad and rad/s."""
     return theta - s.alpha, _solve_both_feet_landing(s, theta, dtheta, dL1).motion_after.dtheta
 
 
 def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
-    """Return the exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+    """Return the result of the exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
 
     The arguments theta, dtheta, dL1 are the section state just before touchdown, in the leg labels
     of the ending step. The result uses the leg labels of the starting step.
     """
-    motion_before, both_feet, distance, (foot_x, foot_z), M, (p1, p2, p3), circle_momentum = (
-        _solve_both_feet_landing(s, theta, dtheta, dL1)
-    )
-    sin, cos, L1_before = both_feet.sin, both_feet.cos, motion_before.L1
-    dtheta_both_feet = both_feet.dtheta
+    (
+        motion_before,
+        motion_on_both_feet,
+        distance,
+        (foot_velocity_x, foot_velocity_z),
+        M,
+        (p1, p2, p3),
+        circle_momentum,
+    ) = _solve_both_feet_landing(s, theta, dtheta, dL1)
+    sin, cos, L1_before = motion_on_both_feet.sin, motion_on_both_feet.cos, motion_before.L1
+    dtheta_both_feet = motion_on_both_feet.dtheta
     rear_impulse = foot_force_from_residual(
         s,
-        both_feet,
+        motion_on_both_feet,
         circle_momentum[1] * dtheta_both_feet - p2,
         circle_momentum[2] * dtheta_both_feet - p3,
     )
     keeps_rear_foot = rear_impulse.normal >= 0.0
 
-    # (A3) only the landing foot held: M rates = p.
+    # (A3) With only the landing foot held, M rates = p.
     free_rates = free_acceleration(s, s.L0, EquationTerms(M, p1, p2, p3))
-    motion_after = both_feet._replace(
+    motion_after = motion_on_both_feet._replace(
         dtheta=jnp.where(keeps_rear_foot, dtheta_both_feet, free_rates.ddtheta),
-        dL1=jnp.where(keeps_rear_foot, both_feet.dL1, free_rates.ddL1),
-        dL2=jnp.where(keeps_rear_foot, both_feet.dL2, free_rates.ddL2),
+        dL1=jnp.where(keeps_rear_foot, motion_on_both_feet.dL1, free_rates.ddL1),
+        dL2=jnp.where(keeps_rear_foot, motion_on_both_feet.dL2, free_rates.ddL2),
     )
-    # Impulses of the ground: the jump of total momentum minus the impulse at the rear foot.
+    # The impulse at the fore foot is the jump of total momentum minus the impulse at the rear foot.
     px, pz = momentum(s, motion_after)
     relabeled_motion = Motion(sin, cos, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
-    before_x, before_z = momentum(s, relabeled_motion)
+    momentum_before_x, momentum_before_z = momentum(s, relabeled_motion)
     applied_rear_impulse = FootForce(
         jnp.where(keeps_rear_foot, rear_impulse.tangential, 0.0),
         jnp.where(keeps_rear_foot, rear_impulse.normal, 0.0),
     )
     fore_impulse = FootForce(
-        px - before_x - s.Mt * foot_x - applied_rear_impulse.tangential,
-        pz - before_z - s.Mt * foot_z - applied_rear_impulse.normal,
+        px - momentum_before_x - s.Mt * foot_velocity_x - applied_rear_impulse.tangential,
+        pz - momentum_before_z - s.Mt * foot_velocity_z - applied_rear_impulse.normal,
     )
     return Landing(
         theta=theta - s.alpha,
@@ -176,21 +197,22 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
 def start_on_both_feet(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, _dL1: Elementwise
 ) -> Landing:
-    """Return a landing that left both feet on the ground, from the rate `dtheta` just after it.
+    """Return a landing that left both feet on the ground, from the rate `dtheta` just after the
+    landing.
 
     theta is the angle just before the landing, in the leg labels of the ending step, as in `land`.
-    Impulses and losses depend on the motion before the landing and are returned as zero.
+    Impulses and losses depend on the motion before the landing. They are returned as zero.
     """
-    before = motion_before_landing(s, theta, dtheta, 0.0 * dtheta)
-    sin, cos = landing_direction(s, before.sin, before.cos)
-    distance = s.L0 * s.sin_alpha / before.cos
+    motion_before = motion_before_landing(s, theta, dtheta, 0.0 * dtheta)
+    sin, cos = landing_direction(s, motion_before.sin, motion_before.cos)
+    distance = s.L0 * s.sin_alpha / motion_before.cos
     circle = double_support_circle(s, distance, sin, cos)
     rates = dtheta, circle.G1 * dtheta, circle.G2 * dtheta
     zero = 0.0 * (theta + dtheta)
     no_impulse = FootForce(zero, zero)
     return Landing(
         theta=theta - s.alpha,
-        motion=Motion(sin, cos, s.L0 + zero, before.L1, *rates),
+        motion=Motion(sin, cos, s.L0 + zero, motion_before.L1, *rates),
         distance=distance,
         keeps_rear_foot=zero == 0.0,
         fore_impulse=no_impulse,
@@ -211,7 +233,7 @@ def stop_leg_2(s: Symbols, motion_before: Motion) -> Motion:
 
 
 class StopperHit(NamedTuple):
-    """Result of the collision of Leg 2 with its stopper, with its impulses and energy loss."""
+    """Motion just after the collision of Leg 2 with its stopper, with impulses and energy loss."""
 
     motion: Motion  # just after the impact, L2 = L0 exactly
     stopper_impulse: Elementwise  # on the mass of Leg 2, towards the hub, N s
@@ -221,31 +243,35 @@ class StopperHit(NamedTuple):
 
 
 def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
-    """Return the inelastic collision of Leg 2 with its stopper at L2 = L0, eqs (22)-(25).
+    """Return the result of the inelastic collision of Leg 2 with its stopper at L2 = L0, eqs
+    (22)-(25).
 
     M12 vanishes there, so the impact needs only two divisions.
     """
     motion_before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
     motion_after = stop_leg_2(s, motion_before)
-    jump = hub_velocity_jump(motion_before, motion_after)
+    hub_jump = hub_velocity_jump(motion_before, motion_after)
     rear_leg = rear_direction(s, motion_before.sin, motion_before.cos)
-    before_x, before_z = momentum(s, motion_before)
-    after_x, after_z = momentum(s, motion_after)
+    momentum_before_x, momentum_before_z = momentum(s, motion_before)
+    momentum_after_x, momentum_after_z = momentum(s, motion_after)
     return StopperHit(
         motion=motion_after,
-        stopper_impulse=s.m * (motion_before.dL2 + jump[0] * rear_leg.sin + jump[1] * rear_leg.cos),
-        foot_impulse=FootForce(after_x - before_x, after_z - before_z),
+        stopper_impulse=s.m
+        * (motion_before.dL2 + hub_jump[0] * rear_leg.sin + hub_jump[1] * rear_leg.cos),
+        foot_impulse=FootForce(
+            momentum_after_x - momentum_before_x, momentum_after_z - momentum_before_z
+        ),
         energy_lost=kinetic_energy(s, motion_before) - kinetic_energy(s, motion_after),
-        hub_jump=jump,
+        hub_jump=hub_jump,
     )
 
 
 def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
     """Return the velocity of the hub along (x, z) with the foot of Leg 1 at rest, m/s."""
-    transverse = motion.L1 * motion.dtheta
+    transverse_velocity = motion.L1 * motion.dtheta
     return (
-        motion.dL1 * motion.sin + transverse * motion.cos,
-        motion.dL1 * motion.cos - transverse * motion.sin,
+        motion.dL1 * motion.sin + transverse_velocity * motion.cos,
+        motion.dL1 * motion.cos - transverse_velocity * motion.sin,
     )
 
 
@@ -253,8 +279,11 @@ def hub_velocity_jump(
     motion_before: Motion, motion_after: Motion
 ) -> tuple[Elementwise, Elementwise]:
     """Return the jump of the hub's velocity along (x, z), m/s."""
-    (x, z), (after_x, after_z) = hub_velocity(motion_before), hub_velocity(motion_after)
-    return after_x - x, after_z - z
+    (x, z), (velocity_after_x, velocity_after_z) = (
+        hub_velocity(motion_before),
+        hub_velocity(motion_after),
+    )
+    return velocity_after_x - x, velocity_after_z - z
 
 
 def locked_leg_impulses(
@@ -266,17 +295,19 @@ def locked_leg_impulses(
     """Return the stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N
     s.
 
-    It is negative where the collision throws the leg off its stopper: a preload resists no impulse.
+    The impulse is negative if the collision throws the leg off its stopper: a preload resists no
+    impulse.
     """
     leg_angles = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
-    radial = hub_jump[0] * motion.sin + hub_jump[1] * motion.cos
-    transverse = hub_jump[0] * motion.cos - hub_jump[1] * motion.sin
-    return s.m * (radial * np.cos(leg_angles) + transverse * np.sin(leg_angles))
+    radial_jump = hub_jump[0] * motion.sin + hub_jump[1] * motion.cos
+    transverse_jump = hub_jump[0] * motion.cos - hub_jump[1] * motion.sin
+    return s.m * (radial_jump * np.cos(leg_angles) + transverse_jump * np.sin(leg_angles))
 
 
 def landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
-    """Return the fore and rear foot force just after a landing with both feet planted, N (B1, eq.
-    38).
+    """Return the fore and rear foot force just after a landing with both feet planted, N.
+
+    The forces follow (B1) and eq. (38).
     """
     circle = double_support_circle(s, landing.distance, landing.motion.sin, landing.motion.cos)
     dtheta = landing.motion.dtheta
