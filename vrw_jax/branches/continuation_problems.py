@@ -154,7 +154,7 @@ class CollocationProblem(AbstractGaitProblem):
         """
         parameters = self._parameters_at(wheel, p)
         s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
-        _, steps = self.system.evaluate_passages(parameters, z)
+        _, steps = self.system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
         end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
         z_of_lane = jax.tree.map(lambda x: x[..., None], z)

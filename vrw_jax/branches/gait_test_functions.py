@@ -21,7 +21,7 @@ from vrw_jax.branches.continuation_problems import (
     linearize_with_quantities,
     measure_gait,
 )
-from vrw_jax.collocation import CollocationSolution, PhasePassage
+from vrw_jax.collocation import CollocationSolution, PhasePoints
 from vrw_jax.continuation import (
     BIFURCATION_NAMES,
     AbstractTestFunction,
@@ -287,7 +287,7 @@ def _continued_quantities(
 ) -> Array:
     """Return the `CONTINUED_QUANTITIES` of a collocated gait."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
-    (passages,) = system.evaluate_passages(parameters, z)[1]
+    (passages,) = system.evaluate_phase_points(parameters, z)[1]
     return jnp.stack(list(_continued_by_name(s, passages, z).values()))
 
 
@@ -307,7 +307,7 @@ def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dic
     return dict(zip(CONTINUED_QUANTITIES, values, strict=True))
 
 
-def _force_falls(s: Symbols, dls: PhasePassage, dls_duration: Array) -> tuple[Array, Array]:
+def _force_falls(s: Symbols, dls: PhasePoints, dls_duration: Array) -> tuple[Array, Array]:
     """Return the initial and the mean rate at which the rear foot's force falls in DLS, N/s."""
     phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 

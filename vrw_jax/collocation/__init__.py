@@ -1,4 +1,4 @@
-"""Gauss collocation of phases whose durations are unknowns."""
+"""Gauss collocation of limit cycles, with the durations of the phases among the unknowns."""
 
 from vrw_jax.collocation.gauss import (
     DOUBLE_END_WEIGHTS,
@@ -18,8 +18,8 @@ from vrw_jax.collocation.phase_collocation import (
     CollocationSolution,
     CycleLinearization,
     PhaseConstants,
-    PhasePassage,
     PhasePoint,
+    PhasePoints,
     PhaseSequence,
     estimate_mesh_error,
     linearize_cycle,

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.polynomial import legendre
 
 N_GAUSS_NODES = 4
-"""Number of Gauss nodes in a mesh interval, chosen because order 8 reaches errors of 1e-8 with few
-intervals."""
+"""Number of Gauss nodes in a mesh interval, chosen because order 8 reaches errors of 1e-8 with
+few intervals.
+"""
 
 GAUSS_NODES = (legendre.leggauss(N_GAUSS_NODES)[0] + 1.0) / 2.0
 """Nodes of the Gauss collocation on [0, 1]."""
@@ -17,7 +18,9 @@ _INTERPOLATION_MATRIX = np.linalg.inv(GAUSS_NODES[:, None] ** _MONOMIAL_POWERS)
 INTEGRATION_MATRIX = (
     GAUSS_NODES[:, None] ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
 ) @ _INTERPOLATION_MATRIX
-"""Matrix that integrates node values from an interval's start to its nodes."""
+"""Matrix that integrates node values from an interval's start to its nodes, for an interval of
+length 1.
+"""
 END_WEIGHTS = (1.0 / (_MONOMIAL_POWERS + 1)) @ _INTERPOLATION_MATRIX
 """Weights that integrate node values over an interval."""
 DOUBLE_INTEGRATION_MATRIX = INTEGRATION_MATRIX @ INTEGRATION_MATRIX
@@ -29,7 +32,7 @@ DOUBLE_END_WEIGHTS = END_WEIGHTS @ INTEGRATION_MATRIX
 class PhaseMesh(NamedTuple):
     """Mesh intervals of one phase as fractions of its duration.
 
-    Their lengths grow by the factor `grading` from first to last.
+    The length of the last interval is `grading` times that of the first.
     """
 
     n_intervals: int
@@ -37,7 +40,7 @@ class PhaseMesh(NamedTuple):
 
     @property
     def interval_fractions(self) -> np.ndarray:
-        """Length of each interval as a fraction of the phase's duration."""
+        """Return the length of each interval as a fraction of the phase's duration."""
         boundaries = np.linspace(0.0, 1.0, self.n_intervals + 1)
         log_grading = np.log(self.grading)
         if abs(log_grading) > 1e-12:
@@ -46,43 +49,49 @@ class PhaseMesh(NamedTuple):
 
     @property
     def node_fractions(self) -> np.ndarray:
-        """Times of all nodes, as fractions of the phase's duration."""
-        begins = np.cumsum(self.interval_fractions) - self.interval_fractions
-        return (begins[:, None] + self.interval_fractions[:, None] * GAUSS_NODES).ravel()
+        """Return the times of all nodes as fractions of the phase's duration."""
+        interval_starts = np.cumsum(self.interval_fractions) - self.interval_fractions
+        return (interval_starts[:, None] + self.interval_fractions[:, None] * GAUSS_NODES).ravel()
 
 
 def phase_integration_matrices(mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
-    """Return matrices from a phase's accelerations to rates and positions at its nodes and its end.
+    """Return matrices from a phase's accelerations to its rates and positions, at its nodes and its
+    end.
 
-    They hold for a phase of duration 1 from rest at the origin. Nodes are in order; the end is the
-    last row.
+    They hold for a phase of duration 1 that begins at rest at the origin. Nodes are in order, and
+    the end is the last row.
     """
     n = mesh.n_intervals * N_GAUSS_NODES
     rate_matrix, position_matrix = np.zeros((n + 1, n)), np.zeros((n + 1, n))
     times = np.ones(n + 1)
-    rate_row, position_row, time = np.zeros(n), np.zeros(n), 0.0
+    interval_rate_weights, interval_position_weights, time = np.zeros(n), np.zeros(n), 0.0
     for i, h in enumerate(mesh.interval_fractions):
         node_slice = slice(i * N_GAUSS_NODES, (i + 1) * N_GAUSS_NODES)
-        rate_matrix[node_slice] = rate_row
-        position_matrix[node_slice] = position_row + h * GAUSS_NODES[:, None] * rate_row
+        rate_matrix[node_slice] = interval_rate_weights
+        position_matrix[node_slice] = (
+            interval_position_weights + h * GAUSS_NODES[:, None] * interval_rate_weights
+        )
         rate_matrix[node_slice, node_slice] += h * INTEGRATION_MATRIX
         position_matrix[node_slice, node_slice] += h * h * DOUBLE_INTEGRATION_MATRIX
         times[node_slice] = time + h * GAUSS_NODES
-        position_row = position_row + h * rate_row
-        position_row[node_slice] += h * h * DOUBLE_END_WEIGHTS
-        rate_row = rate_row.copy()
-        rate_row[node_slice] += h * END_WEIGHTS
+        interval_position_weights = interval_position_weights + h * interval_rate_weights
+        interval_position_weights[node_slice] += h * h * DOUBLE_END_WEIGHTS
+        interval_rate_weights = interval_rate_weights.copy()
+        interval_rate_weights[node_slice] += h * END_WEIGHTS
         time += h
-    rate_matrix[n], position_matrix[n] = rate_row, position_row
+    rate_matrix[n], position_matrix[n] = interval_rate_weights, interval_position_weights
     return times, rate_matrix, position_matrix
 
 
 def lagrange_weights(location: float) -> np.ndarray:
-    """Return the weights of an interval's nodes for their polynomial at `location`,
-    in intervals.
+    """Return the weights of node values with which their polynomial is evaluated at `location`.
+
+    The location is the time from the interval's start in interval lengths.
     """
-    gaps = GAUSS_NODES[:, None] - GAUSS_NODES + np.eye(N_GAUSS_NODES)
-    factors = np.where(np.eye(N_GAUSS_NODES, dtype=bool), 1.0, (location - GAUSS_NODES) / gaps)
+    node_differences = GAUSS_NODES[:, None] - GAUSS_NODES + np.eye(N_GAUSS_NODES)
+    factors = np.where(
+        np.eye(N_GAUSS_NODES, dtype=bool), 1.0, (location - GAUSS_NODES) / node_differences
+    )
     return np.prod(factors, axis=1)
 
 
@@ -100,23 +109,25 @@ def mesh_transfer_matrix(source: PhaseMesh, target: PhaseMesh) -> np.ndarray:
         interval_ends(target)[:-1, None] + target.interval_fractions[:, None] * GAUSS_NODES
     ).ravel()
     matrix = np.zeros((times.size, source.n_intervals * N_GAUSS_NODES))
-    for row, time in enumerate(times):
+    for target_index, time in enumerate(times):
         interval = int(np.clip(np.searchsorted(source_ends, time) - 1, 0, source.n_intervals - 1))
         location = (time - source_ends[interval]) / source.interval_fractions[interval]
-        matrix[row, interval * N_GAUSS_NODES : (interval + 1) * N_GAUSS_NODES] = lagrange_weights(
-            location
+        matrix[target_index, interval * N_GAUSS_NODES : (interval + 1) * N_GAUSS_NODES] = (
+            lagrange_weights(location)
         )
     return matrix
 
 
 def differentiation_matrix() -> np.ndarray:
-    """Return the matrix from an interval's node values to the derivatives there, per interval."""
+    """Return the matrix from node values to the derivatives at the nodes, for an interval of
+    length 1.
+    """
     higher_powers = _MONOMIAL_POWERS[1:]
     return (higher_powers * GAUSS_NODES[:, None] ** (higher_powers - 1)) @ _INTERPOLATION_MATRIX[1:]
 
 
 def integration_weights(location: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return node weights for the once and twice integrated polynomial up to `location`."""
+    """Return the node weights that integrate a polynomial once and twice from 0 to `location`."""
     integrated_powers = location ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
     twice_integrated_powers = location * integrated_powers / (_MONOMIAL_POWERS + 2)
     return (

@@ -1,13 +1,14 @@
-"""Collocation of a limit cycle: all phases, their durations and the section state together.
+"""Collocation of a limit cycle: all phases, their durations and the section state are solved
+together.
 
 Each phase is divided into mesh intervals of four Gauss nodes (order 8). The unknowns are the
-section state, the durations of the phases and the accelerations at all nodes; positions and rates
+section state, the durations of the phases and the accelerations at all nodes. Positions and rates
 follow from them explicitly. One pass of `linearize_cycle` goes through the intervals once and
-propagates a few tangents: the Newton correction, one tangent for each entry of the section state,
-one for each requested parameter, and one for the duration of the running phase. The node equations
-of an interval are eliminated immediately, the duration of a phase at its event, the section state
-at the closing of the cycle. The monodromy matrix and the sensitivities of all unknowns to the
-parameters are therefore tangents of the same pass.
+propagates a few tangents. They are the Newton correction, one tangent for each entry of the section
+state, one for each requested parameter, and one for the duration of the running phase. The node
+equations of an interval are eliminated immediately, the duration of a phase at its event, and the
+section state at the closing of the cycle. The monodromy matrix and the sensitivities of all
+unknowns to the parameters are therefore tangents of the same pass.
 
 Arrays have batch elements (independent wheels) on their last axis, and no code branches.
 """
@@ -49,11 +50,11 @@ from vrw_jax.numerics import (
 )
 
 PhaseConstants = tuple[Elementwise, ...]
-"""The constants of the phases' equations, one array for each."""
+"""Constants of the phases' equations, one array for each."""
 
 
 class PhasePoint(NamedTuple):
-    """State within a phase: its held constants, coordinates and rates."""
+    """State within a phase: the constants held since its start, coordinates and rates."""
 
     held_constants: Vector
     q: Vector
@@ -61,13 +62,13 @@ class PhasePoint(NamedTuple):
 
 
 class CollocationPhase(NamedTuple):
-    """One phase as data, whose functions are elementwise over the batch.
+    """One phase as functions that are elementwise over the batch.
 
     `residual` is the residual of the equations of motion at (constants, point, acceleration), which
-    is linear in the acceleration; this form costs far less to differentiate than the solved form.
-    `event` (zero at the end) and `guards` (positive inside) take (constants, point). `reset` maps
-    the end of the phase to the start of the next phase, and the end of the last phase to the
-    section state (in `q`).
+    is linear in the acceleration. This form costs far less to differentiate than the solved form.
+    The functions `event`, zero at the end, and `guards`, positive inside, take (constants, point).
+    `reset` maps the end of the phase to the start of the next phase, and the end of the last phase
+    to the section state (in `q`).
     """
 
     name: str
@@ -76,47 +77,48 @@ class CollocationPhase(NamedTuple):
     event: Callable[[PhaseConstants, PhasePoint], Elementwise]
     reset: Callable[[PhaseConstants, PhasePoint], PhasePoint]
     guards: Callable[[PhaseConstants, PhasePoint], Vector]
-    is_smooth: bool = True  # False: the first interval leaves a fast decaying mode unresolved
+    is_smooth: bool = True  # False if the first interval leaves a fast decaying mode unresolved
 
 
 class PhaseSequence(NamedTuple):
-    """The phases between two crossings of the section, which has `section_size` unknowns.
+    """The phases between two crossings of the section, which has `section_size` coordinates.
 
     `start` maps the section state to the start of the first phase. `admissibility_margins` takes
-    the passages of a gait step and the flags of active phases, and returns the quantities that must
-    be positive there.
+    the constants, the points of all phases and the flags of active phases. It returns the
+    quantities that must be positive in a gait.
     """
 
     section_size: int
     start: Callable[[PhaseConstants, Vector], PhasePoint]
     phases: tuple[CollocationPhase, ...]
-    admissibility_margins: Callable[[PhaseConstants, "tuple[PhasePassage, ...]", Array], Vector]
+    admissibility_margins: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
 
 
 class CollocationSolution(NamedTuple):
-    """The unknowns of a cycle of n gait steps, batch last; a gait step is one run of
-    the sequence.
+    """The unknowns of a cycle of n gait steps, batch last; each gait step runs the whole phase
+    sequence.
     """
 
     section_state: LaneArray  # (section_size, batch), at the start of the first gait step
     durations: LaneArray  # (n, n_phases, batch), s
     accelerations: tuple[
         LaneArray, ...
-    ]  # by phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
+    ]  # for each phase, (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
 
 
 class CycleLinearization(NamedTuple):
-    """Results of one pass at a trial solution."""
+    """Results of one linearized pass at a trial solution."""
 
-    correction: CollocationSolution  # of Newton's method
+    correction: CollocationSolution  # correction of Newton's method
     tangents: (
-        CollocationSolution  # leading axis: derivatives with respect to each requested parameter
+        # derivatives with respect to each requested parameter, on a leading axis
+        CollocationSolution
     )
     step_ends: (
         LaneArray  # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
     )
     step_end_tangents: (
-        LaneArray  # leading axis: their derivatives with respect to each parameter requested
+        LaneArray  # their derivatives with respect to each requested parameter, on a leading axis
     )
     monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
 
@@ -124,28 +126,28 @@ class CycleLinearization(NamedTuple):
 class _PassContext(NamedTuple):
     """Inputs of a whole pass, and the layout of the tangents that it propagates.
 
-    The order is: the correction; one tangent for each entry of the section state; one for each
-    parameter in `parameter_indices`; and, within a phase, one for its duration.
+    The order of the tangents is: the correction; one for each entry of the section state; one for
+    each parameter in `parameter_indices`; and, within a phase, one for its duration.
     """
 
     section_size: int
     parameter_indices: tuple[int, ...]
     parameters: LaneArray
-    constants_of: Callable[..., PhaseConstants]
+    compute_constants: Callable[..., PhaseConstants]
     constants: PhaseConstants
     constants_tangents: tuple[
         LaneArray, ...
-    ]  # the tangents of each, only with respect to the parameters
-    hold: HoldFn
+    ]  # the tangents of each constant, with respect to the parameters only
+    prevent_fusion: HoldFn
 
     @property
     def n_tangents(self) -> int:
-        """Number of tangents outside of a phase."""
+        """Return the number of tangents outside of a phase."""
         return 1 + self.section_size + len(self.parameter_indices)
 
     @property
     def section_slice(self) -> slice:
-        """Slice of the tangents with respect to the section state."""
+        """Return the slice of the tangents with respect to the section state."""
         return slice(1, 1 + self.section_size)
 
     def value_and_tangents(self, function: Callable, point: tuple, point_tangents: tuple) -> tuple:
@@ -154,9 +156,14 @@ class _PassContext(NamedTuple):
             return value_and_jvps(
                 lambda *point: function(*point, *self.constants), point, point_tangents
             )
-        n_trailing = point_tangents[0].shape[0] - self.n_tangents
-        padding = ((self.section_slice.stop, n_trailing), *((0, 0),) * (self.parameters.ndim - 1))
-        constants_tangents = (jnp.pad(tangent, padding) for tangent in self.constants_tangents)
+        n_trailing_axes = point_tangents[0].shape[0] - self.n_tangents
+        zero_tangents = (
+            (self.section_slice.stop, n_trailing_axes),
+            *((0, 0),) * (self.parameters.ndim - 1),
+        )
+        constants_tangents = (
+            jnp.pad(tangent, zero_tangents) for tangent in self.constants_tangents
+        )
         return value_and_jvps(
             function, (*point, *self.constants), (*point_tangents, *constants_tangents)
         )
@@ -166,10 +173,10 @@ def _make_context(
     section_size: int,
     parameter_indices: tuple[int, ...],
     parameters: LaneArray,
-    constants_of: Callable[..., PhaseConstants],
+    compute_constants: Callable[..., PhaseConstants],
 ) -> _PassContext:
-    """Return the context of a pass with the constants and their tangents."""
-    hold = fusion_barrier(parameters)
+    """Return the context of a pass, with the constants and their tangents."""
+    prevent_fusion = fusion_barrier(parameters)
     dtype, lanes = parameters.dtype, parameters.shape[1:]
     units = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
     parameter_tangents = tuple(
@@ -177,18 +184,18 @@ def _make_context(
     )
     if parameter_indices:
         constants, constants_tangents = value_and_jvps(
-            constants_of, tuple(parameters), parameter_tangents
+            compute_constants, tuple(parameters), parameter_tangents
         )
     else:
-        constants, constants_tangents = constants_of(*parameters), ()
+        constants, constants_tangents = compute_constants(*parameters), ()
     return _PassContext(
         section_size,
         parameter_indices,
         parameters,
-        constants_of,
+        compute_constants,
         constants,
         constants_tangents,
-        hold,
+        prevent_fusion,
     )
 
 
@@ -199,7 +206,7 @@ def _stack_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
 
 
 class _PassState(NamedTuple):
-    """State of the pass with its tangents (leading axis: tangents)."""
+    """State of the pass with its tangents, on a leading axis."""
 
     held_constants: LaneArray
     q: LaneArray
@@ -212,44 +219,44 @@ class _PassState(NamedTuple):
 class _MeshInterval(NamedTuple):
     """One mesh interval of a phase."""
 
-    duration_fraction: Array  # of the phase's duration
+    duration_fraction: Array  # length as a fraction of the phase's duration
     h: LaneArray  # length, s
-    accelerations: LaneArray  # accelerations, (node, coordinate, batch)
+    accelerations: LaneArray  # (node, coordinate, batch)
 
 
-def _unit_tangent(n_tangents: int, index: int, dtype: Any) -> np.ndarray:
+def _unit_tangent(n_tangents: int, tangent_index: int, dtype: Any) -> np.ndarray:
     """Return a unit vector over the tangents, with trailing axes for multiplication."""
-    return np.eye(n_tangents, dtype=dtype)[index][:, None, None, None]
+    return np.eye(n_tangents, dtype=dtype)[tangent_index][:, None, None, None]
 
 
 def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Array, ...]:
     """Return coordinates and rates at the nodes of an interval, and their tangents."""
-    fraction, h, a = interval
+    duration_fraction, h, accelerations = interval
     v, q_tangents, v_tangents = pass_state.v, pass_state.q_tangents, pass_state.v_tangents
-    c = GAUSS_NODES.astype(h.dtype)[:, None, None]
+    nodes = GAUSS_NODES.astype(h.dtype)[:, None, None]
     duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)
-    rate_increments = apply_matrix(INTEGRATION_MATRIX, a)
-    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, a)
-    Q = pass_state.q + h * (c * v + h * position_increments)
-    V = v + h * rate_increments
+    rate_increments = apply_matrix(INTEGRATION_MATRIX, accelerations)
+    position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, accelerations)
+    node_q = pass_state.q + h * (nodes * v + h * position_increments)
+    node_v = v + h * rate_increments
     node_q_tangents = (
         q_tangents[:, None]
-        + (h * c) * v_tangents[:, None]
-        + duration_unit * (fraction * (c * v + 2.0 * h * position_increments))
+        + (h * nodes) * v_tangents[:, None]
+        + duration_unit * (duration_fraction * (nodes * v + 2.0 * h * position_increments))
     )
-    node_v_tangents = v_tangents[:, None] + duration_unit * (fraction * rate_increments)
-    return Q, V, node_q_tangents, node_v_tangents
+    node_v_tangents = v_tangents[:, None] + duration_unit * (duration_fraction * rate_increments)
+    return node_q, node_v, node_q_tangents, node_v_tangents
 
 
 def _evaluate_end(
     pass_state: _PassState, interval: _MeshInterval, acceleration_tangents: LaneArray
 ) -> _PassState:
     """Return the state at the end of an interval from its accelerations and their tangents."""
-    fraction, h, a = interval
+    duration_fraction, h, accelerations = interval
     _, q, v, _, q_tangents, v_tangents = pass_state
     duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
-    rate_increment = weighted_sum(END_WEIGHTS, a)
-    position_increment = weighted_sum(DOUBLE_END_WEIGHTS, a)
+    rate_increment = weighted_sum(END_WEIGHTS, accelerations)
+    position_increment = weighted_sum(DOUBLE_END_WEIGHTS, accelerations)
     rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
     position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents)
     position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
@@ -257,10 +264,12 @@ def _evaluate_end(
         q_tangents
         + h * v_tangents
         + h * h * position_increment_tangents
-        + duration_unit * (fraction * (v + 2.0 * h * position_increment))
+        + duration_unit * (duration_fraction * (v + 2.0 * h * position_increment))
     )
     v_tangents = (
-        v_tangents + h * rate_increment_tangents + duration_unit * (fraction * rate_increment)
+        v_tangents
+        + h * rate_increment_tangents
+        + duration_unit * (duration_fraction * rate_increment)
     )
     q, v = q + h * v + h * h * position_increment, v + h * rate_increment
     return pass_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
@@ -270,15 +279,15 @@ def _linearize_residual(
     context: _PassContext,
     phase: CollocationPhase,
     pass_state: _PassState,
-    Q: LaneArray,
-    V: LaneArray,
-    a: LaneArray,
+    node_q: LaneArray,
+    node_v: LaneArray,
+    accelerations: LaneArray,
 ) -> tuple[Array, Array, Any]:
-    """Return the residual at the nodes and its partial derivatives.
+    """Return the residual of the equations at the nodes and its partial derivatives.
 
-    The Jacobian is with respect to (q, v, acceleration, held constants); the derivatives with
-    respect to the parameters are separate. Axes: node, equation, argument, batch; the axis of the
-    parameters leads.
+    The Jacobian, with axes (node, equation, argument, batch), is with respect to (q, v,
+    acceleration, held constants). The derivatives with respect to the parameters are separate, with
+    the parameters on a leading axis.
     """
     dim, n_held_constants = phase.n_coordinates, pass_state.held_constants.shape[0]
 
@@ -287,17 +296,28 @@ def _linearize_residual(
         held_constants = arguments[3 * dim :][:n_held_constants]
         parameters = arguments[3 * dim :][n_held_constants:]
         constants = (
-            context.constants_of(*parameters) if context.parameter_indices else context.constants
+            context.compute_constants(*parameters)
+            if context.parameter_indices
+            else context.constants
         )
         return phase.residual(constants, PhasePoint(held_constants, q, v), a)
 
-    arguments = [x[:, i] for x in (Q, V, a) for i in range(dim)]
-    arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in pass_state.held_constants]
+    arguments = [
+        argument[:, argument_offset]
+        for argument in (node_q, node_v, accelerations)
+        for argument_offset in range(dim)
+    ]
+    arguments += [
+        jnp.broadcast_to(argument, node_q[:, 0].shape) for argument in pass_state.held_constants
+    ]
     n_state_arguments = len(arguments)
     if context.parameter_indices:
-        arguments += [jnp.broadcast_to(x, Q[:, 0].shape) for x in context.parameters]
-    # The partials stay separate arrays first: each is a small kernel; stacking them is a copy.
-    value, partials = context.hold(value_and_partials(evaluate_residual, arguments))
+        arguments += [
+            jnp.broadcast_to(argument, node_q[:, 0].shape) for argument in context.parameters
+        ]
+    # The partial derivatives stay separate arrays at first, because each is a small kernel and
+    # stacking them is a copy.
+    value, partials = context.prevent_fusion(value_and_partials(evaluate_residual, arguments))
     partials_by_argument = list(zip(*partials, strict=True))
     jacobian = jnp.stack(
         [
@@ -307,9 +327,10 @@ def _linearize_residual(
         2,
     )
     parameter_partials = [
-        jnp.stack(partials_by_argument[n_state_arguments + i], 1) for i in context.parameter_indices
+        jnp.stack(partials_by_argument[n_state_arguments + argument_offset], 1)
+        for argument_offset in context.parameter_indices
     ]
-    return context.hold(
+    return context.prevent_fusion(
         (jnp.stack(value, 1), jacobian, jnp.stack(parameter_partials) if parameter_partials else ())
     )
 
@@ -321,17 +342,21 @@ def _assemble_node_system(
     linearization: tuple,
     state_tangents: LaneArray,
 ) -> tuple[Array, Array]:
-    """Return matrix and right-hand sides, one per tangent, for the corrections of the
-    accelerations.
+    """Return the matrix and the right-hand sides, one for each tangent, of the equations for the
+    corrections of the accelerations.
     """
     value, jacobian, parameter_partials = linearization
     n_tangents, dim, dtype = state_tangents.shape[0], value.shape[1], h.dtype
-    terms = [jacobian[:, :, s] * state_tangents[:, :, s, None] for s in range(2 * dim)]
-    terms += [
-        jacobian[:, :, 3 * dim + s] * pass_state.held_tangents[:, s, None, None]
-        for s in range(pass_state.held_constants.shape[0])
+    tangent_terms = [
+        jacobian[:, :, argument_index] * state_tangents[:, :, argument_index, None]
+        for argument_index in range(2 * dim)
     ]
-    rhs = sum(terms, start=_unit_tangent(n_tangents, 0, dtype) * value)
+    tangent_terms += [
+        jacobian[:, :, 3 * dim + argument_index]
+        * pass_state.held_tangents[:, argument_index, None, None]
+        for argument_index in range(pass_state.held_constants.shape[0])
+    ]
+    rhs = sum(tangent_terms, start=_unit_tangent(n_tangents, 0, dtype) * value)
     if context.parameter_indices:
         n_leading = context.n_tangents - len(context.parameter_indices)
         rhs = rhs + jnp.pad(parameter_partials, ((n_leading, 1), *((0, 0),) * 3))
@@ -342,8 +367,8 @@ def _assemble_node_system(
     jacobian_q, jacobian_v, jacobian_a = (
         jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3)
     )
-    same_node = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
-    system_matrix = same_node * jacobian_a + h * (
+    node_diagonal = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
+    system_matrix = node_diagonal * jacobian_a + h * (
         h * double_matrix * jacobian_q + single_matrix * jacobian_v
     )
     return system_matrix, -jnp.moveaxis(rhs, 0, 2)
@@ -370,30 +395,34 @@ def _linearize_phase(
     )
 
     def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:
-        a, fraction = inputs
-        interval = _MeshInterval(fraction, fraction * duration, a)
+        accelerations, duration_fraction = inputs
+        interval = _MeshInterval(duration_fraction, duration_fraction * duration, accelerations)
         start_state = pass_state._replace(
             **dict(zip(INTERVAL_STATE_FIELDS, interval_state, strict=True))
         )
-        Q, V, node_q_tangents, node_v_tangents = context.hold(
+        node_q, node_v, node_q_tangents, node_v_tangents = context.prevent_fusion(
             _evaluate_nodes(start_state, interval)
         )
-        linearization = _linearize_residual(context, phase, start_state, Q, V, a)
+        linearization = _linearize_residual(
+            context, phase, start_state, node_q, node_v, accelerations
+        )
         # Axes: (tangent, node, argument, batch).
         state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
-        node_system = context.hold(
+        node_system = context.prevent_fusion(
             _assemble_node_system(context, start_state, interval.h, linearization, state_tangents)
         )
         # Axes: (node, row, tangent, batch).
-        acceleration_tangents = context.hold(solve_node_equations(*node_system, context.parameters))
+        acceleration_tangents = context.prevent_fusion(
+            solve_node_equations(*node_system, context.parameters)
+        )
         end_state = _evaluate_end(start_state, interval, acceleration_tangents)
         next_state = tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS)
         return next_state, jnp.moveaxis(acceleration_tangents, 2, 0)
 
     start_state = tuple(getattr(pass_state, name) for name in INTERVAL_STATE_FIELDS)
-    fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
+    interval_fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
     end_state, acceleration_tangents = lax.scan(
-        linearize_interval, start_state, (accelerations, fractions)
+        linearize_interval, start_state, (accelerations, interval_fractions)
     )
     end_fields = dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
     return pass_state._replace(**end_fields), acceleration_tangents
@@ -412,7 +441,7 @@ def _eliminate_duration(
 ) -> tuple[_PassState, LaneArray, Callable[[Array], Array]]:
     """Eliminate the duration of a phase by its event, and apply the reset.
 
-    Returns the state of the next phase, the tangents of the duration, and the function that
+    Return the state of the next phase, the tangents of the duration, and the function that
     eliminates the duration's tangent from other tangents. An inactive phase has duration zero.
     """
 
@@ -448,11 +477,11 @@ def _linearize_step(
     context: _PassContext,
     sequence: PhaseSequence,
     meshes: tuple[PhaseMesh, ...],
-    carry: tuple,
+    section_and_tangents: tuple,
     inputs: tuple,
 ) -> tuple:
-    """Propagate the section state and its tangents through one gait step."""
-    section_state, section_tangents = carry
+    """Propagate the section state and its tangents through one gait step, and return them."""
+    section_state, section_tangents = section_and_tangents
     durations, accelerations, phase_active = inputs
 
     def evaluate_start(section_state: Array, *constants: Array) -> tuple:
@@ -477,7 +506,7 @@ def _linearize_step(
         acceleration_tangents.append(
             eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
         )
-        pass_state = context.hold(pass_state)
+        pass_state = context.prevent_fusion(pass_state)
     # The end state and its tangents are those of the last phase.
     outputs = (
         end_state,
@@ -491,7 +520,7 @@ def _linearize_step(
 def linearize_cycle(
     sequence: PhaseSequence,
     meshes: tuple[PhaseMesh, ...],
-    constants_of: Callable[..., PhaseConstants],
+    compute_constants: Callable[..., PhaseConstants],
     parameters: LaneArray,
     solution: CollocationSolution,
     phase_active: Bool[Array, "n n_phases lanes"],
@@ -499,10 +528,10 @@ def linearize_cycle(
 ) -> CycleLinearization:
     """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
 
-    `phase_active` marks the phases that take place: an inactive phase has duration zero and only
+    `phase_active` marks the phases that take place. An inactive phase has duration zero and only
     applies its reset.
     """
-    context = _make_context(sequence.section_size, parameter_indices, parameters, constants_of)
+    context = _make_context(sequence.section_size, parameter_indices, parameters, compute_constants)
     section_state, dtype, n_tangents = solution.section_state, parameters.dtype, context.n_tangents
     section_units = np.eye(n_tangents, dtype=dtype)[:, context.section_slice, None]
     carry = section_state, jnp.broadcast_to(section_units, (n_tangents, *section_state.shape))
@@ -528,23 +557,24 @@ def linearize_cycle(
     )
 
     def close_cycle(tangents: Array) -> Array:
-        """Return (tangent, n, ...) from (n, tangent, ...), without the tangents of the section
-        state.
+        """Return (tangent, n, ...) from (n, tangent, ...), with the tangents of the section
+        state eliminated.
         """
         tangents = jnp.swapaxes(tangents, 0, 1)
         shape = (-1, *(1,) * (tangents.ndim - 2), *section_state.shape[1:])
         section_tangents = tangents[context.section_slice]
         section_terms = [
-            closed_section_tangents[:, s].reshape(shape) * section_tangents[s]
-            for s in range(len(section_state))
+            closed_section_tangents[:, section_index].reshape(shape)
+            * section_tangents[section_index]
+            for section_index in range(len(section_state))
         ]
         return drop_section_tangents(tangents) + sum(section_terms[1:], start=section_terms[0])
 
-    step_ends, *open_tangents = context.hold(outputs)
+    step_ends, *uncorrected_tangents = context.prevent_fusion(outputs)
     step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
-        close_cycle, tuple(open_tangents)
+        close_cycle, tuple(uncorrected_tangents)
     )
-    step_end_tangents, solution_tangents = context.hold(
+    step_end_tangents, solution_tangents = context.prevent_fusion(
         (
             step_end_tangents,
             CollocationSolution(closed_section_tangents, duration_tangents, acceleration_tangents),
@@ -559,7 +589,7 @@ def linearize_cycle(
     )
 
 
-class PhasePassage(NamedTuple):
+class PhasePoints(NamedTuple):
     """Points of one phase: its start, its end and all nodes (on a leading axis)."""
 
     start: PhasePoint
@@ -574,31 +604,37 @@ def reconstruct_step(
     section_state: Vector,
     durations: Array,
     accelerations: tuple[Array, ...],
-) -> tuple[Vector, tuple[PhasePassage, ...]]:
+) -> tuple[Vector, tuple[PhasePoints, ...]]:
     """Return the section state after a gait step of known durations and accelerations, and the
-    passages of its phases.
+    points of its phases.
 
     No equation is solved. Any trailing axes are allowed.
     """
     point = sequence.start(constants, section_state)
-    passages = []
+    phase_points = []
     for i, phase in enumerate(sequence.phases):
         times, rate_matrix, position_matrix = (
             weights.astype(durations.dtype) for weights in phase_integration_matrices(meshes[i])
         )
-        a, T = accelerations[i], durations[i]
-        a = a.reshape(-1, *a.shape[2:])
+        accelerations_of_phase, duration = accelerations[i], durations[i]
+        accelerations_of_phase = accelerations_of_phase.reshape(
+            -1, *accelerations_of_phase.shape[2:]
+        )
         q, v = jnp.stack(point.q), jnp.stack(point.v)
         times = times.reshape(-1, *(1,) * q.ndim)
-        Q = q + T * (times * v + T * jnp.tensordot(position_matrix, a, 1))
-        V = v + T * jnp.tensordot(rate_matrix, a, 1)
-        nodes = PhasePoint(
-            point.held_constants, tuple(Q[:-1].swapaxes(0, 1)), tuple(V[:-1].swapaxes(0, 1))
+        node_q = q + duration * (
+            times * v + duration * jnp.tensordot(position_matrix, accelerations_of_phase, 1)
         )
-        end = PhasePoint(point.held_constants, tuple(Q[-1]), tuple(V[-1]))
-        passages.append(PhasePassage(point, nodes, end))
+        node_v = v + duration * jnp.tensordot(rate_matrix, accelerations_of_phase, 1)
+        nodes = PhasePoint(
+            point.held_constants,
+            tuple(node_q[:-1].swapaxes(0, 1)),
+            tuple(node_v[:-1].swapaxes(0, 1)),
+        )
+        end = PhasePoint(point.held_constants, tuple(node_q[-1]), tuple(node_v[-1]))
+        phase_points.append(PhasePoints(point, nodes, end))
         point = phase.reset(constants, end)
-    return point.q, tuple(passages)
+    return point.q, tuple(phase_points)
 
 
 def estimate_mesh_error(
@@ -608,24 +644,26 @@ def estimate_mesh_error(
     error_per_jump: float = 0.05,
 ) -> LaneArray:
     """Return an estimate of the discretization error of a cycle, in rad, m and fractions of the
-    period.
+    period, (batch,).
 
     The accelerations of each interval are a separate polynomial. At an interval boundary the two
-    polynomials differ by their errors. That jump times the longer interval squared is a
+    polynomials differ by their errors. That jump times the square of the longer interval is a
     displacement, which is multiplied by `error_per_jump`. Phases with `is_smooth` False do not
-    count, because their error in one interval hardly affects the next.
+    count, because their error in one interval hardly affects the next phase.
 
-    - `error_per_jump`: chosen because the estimate then bounds the error except for round-off. It
-      was tested with 346 random gaits of periods to 10 s on two meshes; for most of them the
-      estimate is far above the error.
+    - `error_per_jump`: factor chosen because the estimate then bounds the error except for
+      round-off. It was tested with 346 random gaits of periods to 10 s on two meshes. For most of
+      them the estimate is far above the error.
     """
-    max_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
+    largest_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
     for i, mesh in enumerate(meshes):
         if mesh.n_intervals == 1 or not sequence.phases[i].is_smooth:
             continue
         left_limits, right_limits = (
             jnp.tensordot(
-                jnp.asarray(lagrange_weights(location), max_jump.dtype), node_accelerations, (0, 2)
+                jnp.asarray(lagrange_weights(location), largest_jump.dtype),
+                node_accelerations,
+                (0, 2),
             )
             for location, node_accelerations in (
                 (1.0, solution.accelerations[i][:, :-1]),
@@ -634,9 +672,9 @@ def estimate_mesh_error(
         )
         max_fraction = np.maximum(mesh.interval_fractions[1:], mesh.interval_fractions[:-1])
         length = (
-            max_fraction[:, None, None].astype(max_jump.dtype)
+            max_fraction[:, None, None].astype(largest_jump.dtype)
             * solution.durations[:, None, None, i]
         )
         jump = jnp.abs(left_limits - right_limits) * length * length
-        max_jump = jnp.maximum(max_jump, jnp.max(jump, axis=(0, 1, 2)))
-    return error_per_jump * max_jump
+        largest_jump = jnp.maximum(largest_jump, jnp.max(jump, axis=(0, 1, 2)))
+    return error_per_jump * largest_jump

@@ -1,4 +1,4 @@
-"""Limit cycles: finders, checks and derivatives for each model."""
+"""Limit cycles: finders, admissibility checks and derivatives for each model."""
 
 from vrw_jax.cycles import (
     collocation_search,

@@ -1,4 +1,6 @@
-"""Gaits of the paper's model: one algebraic system for the cycle, and one step as a check."""
+"""Finder of the gaits of the paper's model: one algebraic system for the cycle, and one step as
+a check.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -95,8 +97,8 @@ class CollocationFinder(AbstractGaitFinder):
             self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
         )
 
-    def finer(self) -> "CollocationFinder":
-        """Return the finder on a finer mesh."""
+    def with_finer_mesh(self) -> "CollocationFinder":
+        """Return this finder with a finer mesh."""
         return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod
@@ -104,12 +106,12 @@ class CollocationFinder(AbstractGaitFinder):
         """Return a measure of a gait by name.
 
         If the foot scuffs at take-off, the clearance in SLS-I is that in SLS-II, because it would
-        jump otherwise. Callers must check `takeoff_acceleration` too.
+        otherwise jump. Callers must check `takeoff_acceleration` too.
         """
         value = cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
         if name == "clearance_sls1":
-            scuffs = cycle.measure("takeoff_acceleration") < 0.0
-            return jnp.where(scuffs, step.measures()["clearance_sls2"], value)
+            is_scuffing = cycle.measure("takeoff_acceleration") < 0.0
+            return jnp.where(is_scuffing, step.measures()["clearance_sls2"], value)
         return value
 
     def find_cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
@@ -121,32 +123,37 @@ class CollocationFinder(AbstractGaitFinder):
             guess = self.guess_from_state(*lax.stop_gradient((params, state)))
         return dataclasses.replace(find_limit_cycle(params, self.system, guess), model=self.model)
 
-    def guess_from_state(self, params: WheelParams, x: SectionState) -> CollocationState:
-        """Return a start of the search: the next `period_n` steps of a walk from section
-        state `x`."""
-        walk = sample_walk(self.model, params, x, self.period_n)
+    def guess_from_state(
+        self, params: WheelParams, section_state: SectionState
+    ) -> CollocationState:
+        """Return a start of the search from a walk: the next `period_n` steps from a section
+        state.
+        """
+        walk = sample_walk(self.model, params, section_state, self.period_n)
         return guess_from_walk(self.system, params, walk)
 
     @eqx.filter_jit
     def shift_first_step(
         self, step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return the same cycle with another of its steps as the first one."""
-        end_before = collocation_state.ends[step_index - 1]
-        landing = transitions.land(params.symbols(), end_before[0], *end_before[2:])
+        """Return the same cycle with the step of this index as the first one."""
+        previous_end = collocation_state.ends[step_index - 1]
+        landing = transitions.land(params.symbols(), previous_end[0], *previous_end[2:])
         solution, is_active, ends = jax.tree.map(
             lambda x: jnp.roll(x, -step_index, 0),
             (collocation_state.solution, collocation_state.phase_active, collocation_state.ends),
         )
-        section = jnp.stack([landing.theta, landing.motion.dtheta])
+        section_state = jnp.stack([landing.theta, landing.motion.dtheta])
         return collocation_state._replace(
-            solution=solution._replace(section_state=section), phase_active=is_active, ends=ends
+            solution=solution._replace(section_state=section_state),
+            phase_active=is_active,
+            ends=ends,
         )
 
     def transfer_to_mesh(
         self, system: CollocationSystem, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return a start on the mesh of `system` from a solution on this finder's mesh."""
+        """Return a start on this finder's mesh from a solution on the mesh of `system`."""
         solution = transfer_to_mesh(system, self.system, collocation_state.solution)
         return collocation_state._replace(solution=solution)
 
@@ -157,16 +164,23 @@ class CollocationFinder(AbstractGaitFinder):
 
     def find_gait(self, values: Values, guess: CollocationState) -> Gait:
         cycle, d_cycle = cycle_with_jacobian(self.system, values, guess)
-        x, dx = cycle.section_state, d_cycle.section_state
-        step, d_step = step_with_jacobian(self.model, self.n_legs, values, x, dx, self.step_options)
+        section_state, section_state_derivatives = cycle.section_state, d_cycle.section_state
+        step, d_step = step_with_jacobian(
+            self.model,
+            self.n_legs,
+            values,
+            section_state,
+            section_state_derivatives,
+            self.step_options,
+        )
         gait_coordinates = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
-        branch_data = (
+        branch_point = (
             gait_coordinates(cycle),
             gait_coordinates(d_cycle),
             cycle.collocation_state.phase_active,
             cycle.monodromy_value,
         )
-        return Gait(cycle, step, d_cycle, d_step, BranchPoint(*branch_data))
+        return Gait(cycle, step, d_cycle, d_step, BranchPoint(*branch_point))
 
     def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
         if set(names) <= set(self.cycle_measures):
@@ -179,7 +193,8 @@ class CollocationFinder(AbstractGaitFinder):
         self, params: WheelParams, cycle: Any, names: Sequence[str]
     ) -> SlopeResponse:
         """Return the response from the collocation if it determines the measures, else from the
-        step."""
+        event-driven step.
+        """
         if not set(names) <= set(COLLOCATION_RESPONSE_MEASURES):
             return super().slope_response(params, cycle, names)
         response: SlopeResponse = cycle.slope_response
@@ -187,22 +202,24 @@ class CollocationFinder(AbstractGaitFinder):
 
     def precompile(self, params: WheelParams) -> None:
         values = stack_parameters(params)
-        x = jnp.asarray(self.model.default_start(params), values.dtype)
-        dx = jnp.zeros((len(PARAMETER_NAMES), x.shape[0]), x.dtype)
-        with ThreadPoolExecutor(2) as pool:
-            cycle = pool.submit(
+        section_state = jnp.asarray(self.model.default_start(params), values.dtype)
+        section_state_derivatives = jnp.zeros(
+            (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
+        )
+        with ThreadPoolExecutor(2) as compile_threads:
+            cycle = compile_threads.submit(
                 with_default_settings(cycle_with_jacobian),
                 self.system,
                 values,
                 self.initial_guess(values),
             )
-            step = pool.submit(
+            step = compile_threads.submit(
                 with_default_settings(step_with_jacobian),
                 self.model,
                 self.n_legs,
                 values,
-                x,
-                dx,
+                section_state,
+                section_state_derivatives,
                 self.step_options,
             )
             cycle.result(), step.result()
@@ -212,8 +229,9 @@ class CollocationFinder(AbstractGaitFinder):
 def cycle_with_jacobian(
     system: CollocationSystem, values: Array, guess: CollocationState
 ) -> tuple[LimitCycle, LimitCycle]:
-    """Return the cycle near `guess`, and its derivatives with respect to all parameters as a
-    leading axis."""
+    """Return the cycle near `guess`, and its derivatives with respect to all parameters, which
+    lead its axes.
+    """
 
     find_cycle = lambda values: find_limit_cycle(
         wheel_from_parameters(values, system.n_legs), system, guess
@@ -224,17 +242,27 @@ def cycle_with_jacobian(
 
 @eqx.filter_jit
 def step_with_jacobian(
-    model: ViscoelasticWheel, n_legs: int, values: Array, x: Array, dx: Array, options: StepOptions
+    model: ViscoelasticWheel,
+    n_legs: int,
+    values: Array,
+    section_state: Array,
+    section_state_derivatives: Array,
+    options: StepOptions,
 ) -> tuple[StepResult, StepResult]:
-    """Return one step and its derivatives with respect to all parameters if its start moves by `dx`
-    with them."""
+    """Return one step, and its derivatives with respect to all parameters if its start moves with
+    them.
+
+    `section_state_derivatives` are those of the section state from which the step starts.
+    """
 
     n_values = values.shape[0]
     take_step = lambda inputs: model.take_step(
         wheel_from_parameters(inputs[:n_values], n_legs), inputs[n_values:], options
     )
-    step, jacobian = value_and_jacobian(take_step, jnp.concatenate([values, x]))
-    input_tangents = jnp.concatenate([jnp.eye(n_values, dtype=x.dtype), dx], axis=1)
+    step, jacobian = value_and_jacobian(take_step, jnp.concatenate([values, section_state]))
+    input_tangents = jnp.concatenate(
+        [jnp.eye(n_values, dtype=section_state.dtype), section_state_derivatives], axis=1
+    )
     return step, move_derivative_axis_first(
         jax.tree.map(lambda derivative: derivative @ input_tangents.T, jacobian)
     )

@@ -24,23 +24,26 @@ from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
 SAME_STATE_TOLERANCE = 1e-7
-"""Relative distance below which two section states of a cycle are the same one; chosen because it
-is ten times what the two computations of a gait may differ by (`finder.AGREEMENT`)."""
+"""Relative distance below which two section states of a cycle are equal. It is chosen because it
+is ten times the allowed difference of two computations of a gait
+(`finder.STATE_AGREEMENT_TOLERANCE`).
+"""
 
 
 class AbstractCycle(AbstractPrintable):
-    """Gait that repeats after `period_n` steps. Batched under vmap: every field gains the batch
-    axis.
+    """Gait that repeats after `period_n` steps; under vmap every field gains the batch axis.
 
     If no gait is found, `outcome` gives the reason. All other numbers and their derivatives are
-    then zero. The axis over steps is absent for `period_n` = 1.
+    then zero. The axis over steps is absent if `period_n` is 1.
     """
 
-    section_state: eqx.AbstractVar[Array]  # before touchdown, fixed under `period_n` return maps
+    # state before touchdown, a fixed point of `period_n` return maps
+    section_state: eqx.AbstractVar[Array]
     post_impact: eqx.AbstractVar[Float[Array, "2"]]  # (theta, dtheta) after the first landing
-    durations: eqx.AbstractVar[Float[Array, "*n 3"]]  # s, double support first
-    step_length: eqx.AbstractVar[Float[Array, "*n"]]  # between the feet at the landing, m
-    monodromy_value: eqx.AbstractVar[Array]  # monodromy matrix, without derivative
+    # durations of the phases, s, double support first
+    durations: eqx.AbstractVar[Float[Array, "*n 3"]]
+    step_length: eqx.AbstractVar[Float[Array, "*n"]]  # distance between the feet at the landing, m
+    monodromy_value: eqx.AbstractVar[Array]  # monodromy matrix, without derivatives
     outcome: eqx.AbstractVar[Int[Array, ""]]  # Outcome.STEPPED or the failure
 
     @property
@@ -51,72 +54,85 @@ class AbstractCycle(AbstractPrintable):
     @property
     @abc.abstractmethod
     def monodromy(self) -> Array:
-        """Return the Jacobian of the return map, itself differentiable."""
+        """Return the Jacobian of the return map, which is itself differentiable."""
 
     @property
     @abc.abstractmethod
     def warm_start(self) -> Any:
-        """Return the start of a search for a neighbor's gait."""
+        """Return the start of a search for the gait of a neighboring wheel."""
 
     @property
     @abc.abstractmethod
     def step_ends(self) -> Array:
-        """Section state at the end of each step; the last axes are steps and numbers."""
+        """Section state at the end of each step; the last axes are steps and coordinates."""
 
     @property
     def minimal_period(self) -> Int[Array, "..."]:
-        """Return the fewest steps after which the gait repeats; 0 where there is none.
+        """Return the fewest steps after which the gait repeats; 0 if there is no gait.
 
-        It divides `period_n`: a gait of one step also repeats after two.
+        The number divides `period_n`: a gait of one step also repeats after two.
         """
-        ends, n = self.step_ends, self.period_n
-        scale = jnp.max(jnp.abs(ends), (-2, -1))
-        tolerance = jnp.maximum(SAME_STATE_TOLERANCE, 100.0 * jnp.finfo(ends.dtype).eps)
-        fewest = jnp.full(self.outcome.shape, n, jnp.int32)
-        for steps in (steps for steps in range(n - 1, 0, -1) if n % steps == 0):
-            distance = jnp.max(jnp.abs(jnp.roll(ends, steps, -2) - ends), (-2, -1))
-            fewest = jnp.where(distance <= tolerance * scale, steps, fewest)
-        return jnp.where(self.found, fewest, 0)
+        step_ends, n_steps = self.step_ends, self.period_n
+        scale = jnp.max(jnp.abs(step_ends), (-2, -1))
+        tolerance = jnp.maximum(SAME_STATE_TOLERANCE, 100.0 * jnp.finfo(step_ends.dtype).eps)
+        minimal_steps = jnp.full(self.outcome.shape, n_steps, jnp.int32)
+        for candidate_period in (
+            candidate_period
+            for candidate_period in range(n_steps - 1, 0, -1)
+            if n_steps % candidate_period == 0
+        ):
+            distance = jnp.max(
+                jnp.abs(jnp.roll(step_ends, candidate_period, -2) - step_ends), (-2, -1)
+            )
+            minimal_steps = jnp.where(
+                distance <= tolerance * scale, candidate_period, minimal_steps
+            )
+        return jnp.where(self.found, minimal_steps, 0)
 
     def replace_missing_by_nan(self, params: WheelParams) -> Any:
-        """Return the cycle with NaN in place of zeros where there is none, also in derivatives with
-        respect to params."""
+        """Return the cycle with NaN in place of zeros if no gait was found, also in derivatives
+        by `params`.
+        """
         nan_if_missing = jnp.where(self.found, 0.0, jnp.nan)
-        weight = 1.0 + nan_if_missing * sum(
+        nan_weight = 1.0 + nan_if_missing * sum(
             jax.tree.leaves(params)
-        )  # so that derivatives pass the masks
+        )  # The parameters are included so that derivatives pass the masks.
 
-        def scale(x: Array) -> Array:
-            return x * weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
+        def apply_nan_weight(x: Array) -> Array:
+            return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
 
-        names = [name for name in MASKED_FIELDS if name in vars(self)]
-        values = {name: jax.tree.map(scale, getattr(self, name)) for name in names}
+        field_names = [name for name in MASKED_FIELDS if name in vars(self)]
+        values = {name: jax.tree.map(apply_nan_weight, getattr(self, name)) for name in field_names}
         return dataclasses.replace(self, **values)
 
     def _mask_missing(self, value: Array) -> Array:
-        """Return `value`, or zero where there is no cycle. The result is NaN after
-        `replace_missing_by_nan`, also in derivatives."""
+        """Return `value`, or zero if no gait was found.
+
+        After `replace_missing_by_nan` the result is NaN, also in derivatives.
+        """
         return jnp.where(
             self.found, value, 0.0 * self.monodromy_value[..., 0, 0]
-        )  # whose derivative is zero
+        )  # The derivative of this zero is zero.
 
     def combine_steps(self, values: Array, combine: Callable[[Array, int], Array]) -> Array:
-        """Combine one value per step, on the last axis, into one value for the whole cycle."""
+        """Return one value for the whole cycle, by `combine` of the values of its steps on the
+        last axis.
+        """
         return combine(values, -1) if self.period_n > 1 else values
 
     @property
     def found(self) -> Bool[Array, "..."]:
-        """Return whether there is a cycle."""
+        """Return whether a gait was found."""
         return self.outcome == Outcome.STEPPED
 
     @property
     def ending(self) -> Any:
-        """Return how the search ended, as a sentence; a batch has an array of sentences."""
+        """Return how the search ended, as a sentence; for a batch, an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     @property
     def why(self) -> Any:
-        """Return the reason why there is no cycle: the same as `ending`."""
+        """Return the reason why no gait was found: the same as `ending`."""
         return self.ending
 
     @property
@@ -126,35 +142,39 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def dls_fraction(self) -> Array:
-        """Return the share of the period in double support."""
+        """Return the fraction of the period in double support."""
         dls, period = self.combine_steps(self.durations[..., 0], jnp.sum), self.period
         return dls / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def speed(self) -> Array:
-        """Return distance over period, m/s."""
+        """Return the mean speed, the distance of a cycle over its period, m/s."""
         distance, period = self.combine_steps(self.step_length, jnp.sum), self.period
         return distance / jnp.where(period > 0.0, period, 1.0)
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
-        """Return the Floquet multipliers, largest first. They are differentiable for sections of at
-        most three coordinates."""
+        """Return the Floquet multipliers, largest modulus first.
+
+        They are differentiable for sections of at most three coordinates.
+        """
         return floquet.floquet_multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
-        """Return the largest modulus of a multiplier. The gait is stable below 1."""
+        """Return the largest modulus of a Floquet multiplier; the gait is stable below 1."""
         return floquet.compute_spectral_radius(self.monodromy)
 
     @property
     def spectral_margin(self) -> Array:
-        """Return 1 - spectral radius, positive for stable gaits, for every model."""
+        """Return 1 minus the spectral radius, which is positive for stable gaits, for every
+        model.
+        """
         return self._mask_missing(1.0 - self.spectral_radius)
 
     @property
     def stability_margin(self) -> Array:
-        """Return the smooth minimum of the Jury margins, positive for stable gaits: see
+        """Return the smooth minimum of the Jury margins, positive for stable gaits; see
         `floquet.stability_margin`.
 
         It is defined for sections of at most three coordinates, which excludes unilateral contact.
@@ -163,15 +183,16 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def condition_number(self) -> Array:
-        """Return the condition number of I - monodromy: the amplification of a disturbance by the
-        cycle."""
+        """Return the condition number of I - monodromy, by which the cycle amplifies a
+        disturbance.
+        """
         matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
         return self._mask_missing(jnp.linalg.cond(matrix))
 
     @with_default_settings
     def measure(self, name: str) -> Array:
-        """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `measures.MEASURES`. Batch
-        axes come first.
+        """Return one of `CYCLE_MEASURE_FUNCTIONS`, by its name in `measures.MEASURES`; batch axes
+        come first.
 
         Durations are sums over the cycle's steps, and indicators are minima.
         """
@@ -180,11 +201,13 @@ class AbstractCycle(AbstractPrintable):
         ](self)
 
     def measures(self, names: Iterable[str]) -> dict[str, Array]:
-        """Return several measures by name. Measures that are not requested are not traced."""
+        """Return several measures by name; other measures are not traced."""
         return {name: self.measure(name) for name in names}
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the printed rows of the cycle. A batch shows how many cycles are found."""
+        """Return the printed rows of the cycle; for a batch, the number of cycles that were
+        found.
+        """
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
             return [("wheels", format_outcome_counts(outcome, Outcome))]
@@ -192,8 +215,8 @@ class AbstractCycle(AbstractPrintable):
             return [("outcome", f"{Outcome(int(outcome)).name}: {self.why}")]
         spectral_radius, multipliers_text = format_multipliers(np.asarray(self.monodromy_value))
         period_text = f"{self.period_n} steps" if self.period_n > 1 else "one step"
-        if (fewest := int(self.minimal_period)) < self.period_n:
-            period_text += f"; its minimal period is {fewest}"
+        if (minimal_period := int(self.minimal_period)) < self.period_n:
+            period_text += f"; its minimal period is {minimal_period}"
         stability_text = "stable" if spectral_radius < 1.0 else "unstable"
         return [
             ("gait", f"{stability_text}, repeats after {period_text}"),
@@ -207,19 +230,24 @@ class AbstractCycle(AbstractPrintable):
 
     @abc.abstractmethod
     def model_rows(self) -> list[TextRow]:
-        """Return the rows that are specific to the model."""
+        """Return the printed rows that are specific to the model."""
 
 
 def format_multipliers(matrix: np.ndarray) -> tuple[float, str]:
-    """Return the spectral radius, and the multipliers that five digits show, largest first."""
+    """Return the spectral radius, and a text of the multipliers that five digits show, largest
+    first.
+    """
     multipliers = sorted(np.linalg.eigvals(matrix), key=abs, reverse=True)
-    shown_multipliers = [z for z in multipliers if abs(z) >= 5e-6]
+    shown_multipliers = [multiplier for multiplier in multipliers if abs(multiplier) >= 5e-6]
     remainder = (
         f"{len(multipliers) - len(shown_multipliers)} below 5e-6"
         if len(shown_multipliers) < len(multipliers)
         else ""
     )
-    texts = [f"{z:.5f}" if z.imag else f"{z.real:.5f}" for z in shown_multipliers]
+    texts = [
+        f"{multiplier:.5f}" if multiplier.imag else f"{multiplier.real:.5f}"
+        for multiplier in shown_multipliers
+    ]
     return float(np.abs(multipliers[0])), ", ".join([*texts, *([remainder] if remainder else [])])
 
 
@@ -232,21 +260,21 @@ MASKED_FIELDS = (
     "steps",
     "monodromy_value",
 )
-"""Fields that are zero where there is no gait."""
+"""Fields of a cycle that are zero if no gait was found."""
 
 
 def _read_property(name: str) -> Callable[[AbstractCycle], Array]:
-    """Return the function that reads a property of a cycle."""
+    """Return the function that reads the property `name` of a cycle."""
     return lambda cycle: getattr(cycle, name)
 
 
 def _read_duration(phase_index: int) -> Callable[[AbstractCycle], Array]:
-    """Return the function that reads the duration of a phase."""
+    """Return the function that reads the duration of a phase, s, from a cycle."""
     return lambda cycle: cycle.combine_steps(cycle.durations[..., phase_index], jnp.sum)
 
 
 def _read_indicator(name: str) -> Callable[[Any], Array]:
-    """Return the function that reads an indicator of double support."""
+    """Return the function that reads an indicator of double support from a cycle."""
     return lambda cycle: cycle.combine_steps(getattr(cycle.indicators, name), jnp.min)
 
 
@@ -278,6 +306,7 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_period": _read_gait_sensitivity("period"),
     "gait_sensitivity_speed": _read_gait_sensitivity("speed"),
 }
-"""Functions of a cycle by name of the measure; the only such table. Derivatives of the stability
-measures are second derivatives of the motion. They need one more compiled program and take twice
-the time to run."""
+"""Functions of a cycle by the name of the measure. Derivatives of the stability measures are
+second derivatives of the motion. They need one more compiled program and take twice the time to
+run.
+"""

@@ -45,8 +45,11 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, c
 def _collocation_tangents(
     system: CollocationSystem, parameters: Parameters, collocation_state: CollocationState
 ) -> CollocationState:
-    """Return d(state) / d(parameters) over lanes, with a leading axis; zero where nothing was
-    found."""
+    """Return the derivatives of the state with respect to the parameters, on a leading axis, for
+    each lane.
+
+    They are zero if no cycle was found.
+    """
     linearized_pass = system.linearize_at(
         parameters, collocation_state, tuple(range(parameters.shape[0]))
     )
@@ -66,12 +69,13 @@ def _monodromy_tangents(
     parameters: Parameters,
     solution_and_tangents: tuple[CollocationState, CollocationState],
 ) -> Array:
-    """Return d(monodromy) / d(parameters) along the branch, with a leading axis.
+    """Return the derivatives of the monodromy matrix along the branch, on a leading axis over
+    parameters.
 
-    `solution_and_tangents` are z and dz/dp. The directions are computed one after another, which
-    keeps the compiled code as short as for one. Three of the nine follow from units. For the unit
-    of mass, both masses grow in this direction. The forces of the ground and of the legs do not
-    contain it.
+    `solution_and_tangents` are z and dz/dp. The directions are computed one after another, so that
+    the compiled code is as short as for one. Three of the nine derivatives follow from a change of
+    units. For the unit of mass, the direction increases both masses by the same factor; it leaves
+    the forces of the ground and of the legs unchanged.
     """
     collocation_state, tangents = solution_and_tangents
     hub_index, leg_index = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
@@ -94,11 +98,13 @@ def _monodromy_tangents(
 
     def monodromy_tangent(direction: tuple) -> tuple[Array, Array]:
         first_index, second_index, first_weight, second_weight = direction
-        select_row = lambda x, first_index: lax.dynamic_index_in_dim(x, first_index, keepdims=False)
+        select_entry = lambda x, first_index: lax.dynamic_index_in_dim(
+            x, first_index, keepdims=False
+        )
         direction = jax.tree.map(
             lambda x: (
-                first_weight * select_row(x, first_index)
-                + second_weight * select_row(x, second_index)
+                first_weight * select_entry(x, first_index)
+                + second_weight * select_entry(x, second_index)
             ),
             (parameter_tangents, tangents),
         )
@@ -116,13 +122,13 @@ def _monodromy_tangents(
         )
         / total_mass
     )
-    squared_length = hub_share * hub_share + leg_share * leg_share
+    squared_direction_norm = hub_share * hub_share + leg_share * leg_share
     tangent_by_parameter[hub_index] = (
         hub_share * mass_scale_tangent - leg_share * monodromy_tangents[-1]
-    ) / squared_length
+    ) / squared_direction_norm
     tangent_by_parameter[leg_index] = (
         leg_share * mass_scale_tangent + hub_share * monodromy_tangents[-1]
-    ) / squared_length
+    ) / squared_direction_norm
     time_scale_tangent = (
         jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]
     )  # of angle and rate
@@ -146,7 +152,9 @@ def _mask_not_found(collocation_state: CollocationState, tree: Any) -> Any:
 def compile_batched(
     function: BatchFunction, make_output_template: Callable, cache_key: tuple, batch_size: int
 ) -> BatchFunction:
-    """Return a batched function in its fastest form: machine code on a CPU, else XLA in blocks."""
+    """Return a batched function compiled in its fastest form: machine code on a CPU, else XLA in
+    blocks.
+    """
     if simd.is_available():
         return cached_lane_function(function, make_output_template, cache_key)
     register_export_names()
@@ -156,8 +164,11 @@ def compile_batched(
 def _make_compiler(
     name: str, make_templates: tuple[Callable, ...], system: CollocationSystem
 ) -> ExecutionWrapper:
-    """Return a compiler for the first derivatives (`compile_batched`, one output template each).
-    XLA compiles higher ones."""
+    """Return a function that compiles a batch function, given the order of the derivative it
+    computes.
+
+    Orders with an output template use `compile_batched`, higher orders XLA.
+    """
     batch_size = system.options.batch_size
 
     def compile_function(function: BatchFunction, order: int) -> BatchFunction:
@@ -185,57 +196,64 @@ def _make_tangent_function(system: CollocationSystem) -> Callable:
     return tangents
 
 
-def _search_in_own_units(
+def _search_in_scaled_units(
     system: CollocationSystem,
     search: BatchFunction,
     parameters: Parameters,
     *guess: CollocationState,
 ) -> SearchResult:
-    """Return the result of `search_in_stages`, searched in own units of length and time, in SI.
+    """Return the result of `search_in_stages` in SI, searched in the wheel's own units of length
+    and time.
 
-    The section is (theta, dtheta) after a landing; the ends are (theta, L1) and their rates. Mass
-    is not converted, because no unknown contains it.
+    The section is (theta, dtheta) after a landing; the step ends are (theta, L1) and their rates.
+    Mass is not converted, because no unknown contains it.
     """
     units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(mass=1.0)
-    one, time = jnp.ones_like(units.time), units.time
-    position_units = jnp.stack([one, units.length, units.length])
-    section_units = jnp.stack([one, 1.0 / time])
-    end_units = jnp.concatenate([position_units[:2], position_units[:2] / time])
+    angle_unit, time_unit = jnp.ones_like(units.time), units.time
+    position_units = jnp.stack([angle_unit, units.length, units.length])
+    section_units = jnp.stack([angle_unit, 1.0 / time_unit])
+    end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
 
-    def convert(
-        state: CollocationState, scale: Callable[[Array, Array], Array]
+    def convert_units(
+        state: CollocationState, apply_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
-        """Return the state with each number scaled by its unit."""
+        """Return the state with each number converted by `apply_unit(number, unit)`."""
         solution = state.solution
         accelerations = tuple(
-            scale(x, position_units[: x.shape[-2]] / (time * time)) for x in solution.accelerations
+            apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
+            for x in solution.accelerations
         )
         solution = CollocationSolution(
-            scale(solution.section_state, section_units),
-            scale(solution.durations, time),
+            apply_unit(solution.section_state, section_units),
+            apply_unit(solution.durations, time_unit),
             accelerations,
         )
-        return state._replace(solution=solution, ends=scale(state.ends, end_units))
+        return state._replace(solution=solution, ends=apply_unit(state.ends, end_units))
 
-    own_guess = tuple(convert(state, operator.truediv) for state in guess)
-    parameter_units = [units.si_value(domain.unit) for domain in PARAMETER_DOMAINS.values()]
-    own_parameters = [x / unit for x, unit in zip(parameters, parameter_units, strict=True)]
-    result = search_in_stages(system, search, jnp.stack(own_parameters), *own_guess)
+    scaled_guess = tuple(convert_units(state, operator.truediv) for state in guess)
+    parameter_units = [
+        units.si_value(parameter_domain.unit) for parameter_domain in PARAMETER_DOMAINS.values()
+    ]
+    scaled_parameters = [x / unit for x, unit in zip(parameters, parameter_units, strict=True)]
+    result = search_in_stages(system, search, jnp.stack(scaled_parameters), *scaled_guess)
     monodromy = section_units[:, None] * result.monodromy / section_units
-    return result._replace(state=convert(result.state, operator.mul), monodromy=monodromy)
+    return result._replace(state=convert_units(result.state, operator.mul), monodromy=monodromy)
 
 
 def solve_cycle_with_derivatives(
     system: CollocationSystem, parameters: Array, guess: CollocationState | None
 ) -> tuple[CollocationState, tuple]:
-    """Search for the cycle of one wheel, differentiable in its parameters. The guess has no
-    derivative."""
+    """Return the cycle of one wheel, differentiable in its parameters, and the diagnostics of the
+    search.
+
+    The guess has no derivative.
+    """
     search_problem = functools.partial(search_lanes, system)
     make_template = lambda parameters, start, *_: start
     batched_search = compile_batched(
         search_problem, make_template, ("search", system), system.options.batch_size
     )
-    search_one = unbatch(functools.partial(_search_in_own_units, system, batched_search))
+    search_one = unbatch(functools.partial(_search_in_scaled_units, system, batched_search))
     tangents_of = _make_tangent_function(system)
 
     @jax.custom_jvp
@@ -261,7 +279,7 @@ def attach_monodromy(
     parameters: Array,
     collocation_state: CollocationState,
 ) -> Array:
-    """Return `monodromy_value` with the derivative of the monodromy matrix along the branch."""
+    """Return `monodromy_value` with the derivatives of the monodromy matrix along the branch."""
     make_template = lambda parameters, solution_and_tangents: parameters
     compile_function = _make_compiler("monodromy", (make_template, make_template), system)
     monodromy_of = functools.partial(_masked_monodromy, system)

@@ -1,4 +1,6 @@
-"""Interface of the gait finders: each finds, checks and differentiates the gaits of one model."""
+"""Interface of gait finders, each of which finds, checks and differentiates the gaits of one
+model.
+"""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -21,26 +23,28 @@ from vrw_jax.wheel import Outcome, WheelParams
 STATE_AGREEMENT_TOLERANCE = 1e-8
 """Largest distance, rad, rad/s and m/s, between a cycle's section state and the state after the
 event-driven step. The two computations are independent. At the default options their errors are a
-tenth of it while steps last some 1.5 s."""
+tenth of this limit, for steps of up to some 1.5 s.
+"""
 
 Values = Float[Array, " n_values"]
-"""Values of `AbstractWheel.parameter_names`."""
+"""Values of the parameters `AbstractWheel.parameter_names`, in that order."""
 
 
 class BranchPoint(NamedTuple):
     """Gait as a point of a branch: the data that `is_same_branch` compares."""
 
     coordinates: Any  # section state and durations
-    d_coordinates: Any  # derivatives, with a leading axis over the model's parameters
-    active_phases: Any  # which phases take place: constant along a branch
+    # derivatives of the coordinates, with a leading axis over the model's parameters
+    d_coordinates: Any
+    active_phases: Any  # which phases take place, constant along a branch
     return_jacobian: Any  # Jacobian of the return map
 
 
 class Gait(eqx.Module):
     """Gait that repeats after one step, with that step and the derivatives of both.
 
-    Derivatives are taken along the branch of gaits and have a leading axis over the parameters'
-    names. A batch of gaits has its axis before all others.
+    Derivatives are taken along the branch of gaits and have a leading axis over the parameters. In
+    a batch of gaits, the batch axis comes first.
     """
 
     cycle: AbstractCycle
@@ -51,39 +55,48 @@ class Gait(eqx.Module):
 
     @property
     def outcome(self) -> np.ndarray:
-        """Return the cycle's outcome, unless the step from it fails or ends at another state."""
+        """Return the cycle's outcome, unless the step from its state fails or ends at another
+        state.
+        """
         cycle, step = self.cycle, self.step
         return confirm_outcome(cycle.outcome, cycle.section_state, step.outcome, step.section_state)
 
 
-def is_same_branch(first: BranchPoint, second: BranchPoint, parameter_change: np.ndarray) -> bool:
+def is_same_branch(
+    first_point: BranchPoint, second_point: BranchPoint, parameter_change: np.ndarray
+) -> bool:
     """Return whether a branch connects two gaits whose parameters differ by `parameter_change`.
 
     The mean of the tangents at both ends must predict most of the distance between the gaits. The
     same phases must take place, and no multiplier may have crossed 1.
     """
-    first, second = take_rows((first, second), ...)
-    predicted = parameter_change @ (0.5 * (first.d_coordinates + second.d_coordinates))
-    deviation = np.linalg.norm(second.coordinates - first.coordinates - predicted)
-    if deviation > 0.5 * np.linalg.norm(predicted) + 1e-6:
+    first_point, second_point = take_rows((first_point, second_point), ...)
+    predicted_change = parameter_change @ (
+        0.5 * (first_point.d_coordinates + second_point.d_coordinates)
+    )
+    deviation = np.linalg.norm(
+        second_point.coordinates - first_point.coordinates - predicted_change
+    )
+    if deviation > 0.5 * np.linalg.norm(predicted_change) + 1e-6:
         return False
     fold_test_function = lambda point: np.linalg.det(
         np.eye(len(point.return_jacobian)) - point.return_jacobian
     )
     return bool(
-        np.array_equal(first.active_phases, second.active_phases)
-        and fold_test_function(first) * fold_test_function(second) > 0.0
+        np.array_equal(first_point.active_phases, second_point.active_phases)
+        and fold_test_function(first_point) * fold_test_function(second_point) > 0.0
     )
 
 
 def confirm_outcome(outcome: Any, state: Any, step_outcome: Any, end_state: Any) -> np.ndarray:
-    """Return outcomes of cycles with section states `state`, checked by a step that ends at
-    `end_state`."""
-    is_close = (
+    """Return the outcomes of cycles at section states `state`, confirmed by steps from them that
+    end at `end_state`.
+    """
+    ends_at_same_state = (
         np.max(np.abs(np.asarray(end_state) - np.asarray(state)), axis=-1)
         <= STATE_AGREEMENT_TOLERANCE
     )
-    confirmed_outcome = np.where(is_close, Outcome.STEPPED, Outcome.MESH_TOO_COARSE)
+    confirmed_outcome = np.where(ends_at_same_state, Outcome.STEPPED, Outcome.MESH_TOO_COARSE)
     confirmed_outcome = np.where(
         np.asarray(step_outcome) == Outcome.STEPPED, confirmed_outcome, np.asarray(step_outcome)
     )
@@ -91,21 +104,28 @@ def confirm_outcome(outcome: Any, state: Any, step_outcome: Any, end_state: Any)
 
 
 class AbstractGaitFinder(eqx.Module):
-    """Finder of the gaits of one model. Higher packages use this interface only; `make_finder`
-    selects the class."""
+    """Finder of the gaits of one model. Higher packages use only this interface; `make_finder`
+    selects the class.
+    """
 
     model: eqx.AbstractVar[AbstractWheel]
     n_legs: eqx.AbstractVar[int]
     step_options: eqx.AbstractVar[StepOptions]
     options_type: eqx.AbstractClassVar[type]  # type of the options that `limit_cycle` accepts
-    cycle_measures: eqx.AbstractClassVar[tuple[str, ...]]  # measures that need the cycle alone
+    # names of the measures that need only the cycle
+    cycle_measures: eqx.AbstractClassVar[tuple[str, ...]]
     differentiable_measures: eqx.AbstractClassVar[tuple[str, ...]]
-    """Scalar measures that have derivatives along the branch."""
-    default_measures: eqx.AbstractClassVar[tuple[str, ...]]  # the measures returned by default
-    readable_measures: eqx.AbstractClassVar[tuple[str, ...]]  # and those of several legs
-    supports_cold_start: eqx.AbstractClassVar[bool]  # whether a search works without a start nearby
+    """Names of the scalar measures that have derivatives along the branch."""
+    # names of the measures returned by default
+    default_measures: eqx.AbstractClassVar[tuple[str, ...]]
+    # names of all measures, including those with one value per leg
+    readable_measures: eqx.AbstractClassVar[tuple[str, ...]]
+    # whether a search works without a start near the gait
+    supports_cold_start: eqx.AbstractClassVar[bool]
     is_multistable: ClassVar[bool] = False
-    """Whether several gaits of a wheel may attract, which walks from several starts distinguish."""
+    """Whether several gaits of a wheel may attract; walks from several starts then distinguish
+    them.
+    """
 
     @classmethod
     @abc.abstractmethod
@@ -117,8 +137,7 @@ class AbstractGaitFinder(eqx.Module):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> "AbstractGaitFinder":
-        """Return the finder with the options of its step, and of its search if that has separate
-        options."""
+        """Return the finder with the options of its step, and those of its search if it has any."""
 
     @property
     def search_options(self) -> Any:
@@ -127,11 +146,12 @@ class AbstractGaitFinder(eqx.Module):
 
     @abc.abstractmethod
     def find_cycle(self, params: WheelParams, guess: Any = None) -> AbstractCycle:
-        """Return the cycle of a wheel near `guess`: a neighbor's `warm_start`, a section state or
-        None."""
+        """Return the cycle of one wheel near `guess`: a neighbor's `warm_start`, a section state
+        or None.
+        """
 
     def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        """Return the cycles of a batch of wheels; every array gains a leading axis."""
+        """Return the cycles of a batch of wheels; every array has a leading axis over wheels."""
         return jax.vmap(self.find_cycle)(params, guess)
 
     @abc.abstractmethod
@@ -143,20 +163,23 @@ class AbstractGaitFinder(eqx.Module):
 
     @abc.abstractmethod
     def find_gait(self, values: Values, guess: Any) -> Gait:
-        """Return the gait near `guess` with its derivatives. The large programs are compiled
-        once."""
+        """Return the gait near `guess` with its derivatives; the large programs are compiled
+        once.
+        """
 
     def find_gaits(self, values: Float[Array, "lanes n_values"], guess: Any) -> Gait:
-        """Return `find_gait` of a batch of wheels; every array gains a leading axis."""
+        """Return `find_gait` of a batch of wheels; every array has a leading axis over wheels."""
         return eqx.filter_vmap(self.find_gait)(values, guess)
 
     @abc.abstractmethod
     def precompile(self, params: WheelParams) -> None:
-        """Compile the programs that `find_gait` needs, in parallel where possible."""
+        """Compile the programs that `find_gait` needs, in parallel if possible."""
 
-    def take_step(self, params: WheelParams, x: Array) -> AbstractStep:
-        """Return one step of the model, computed by an already compiled program."""
-        step: AbstractStep = self.model.take_step(params, x, self.step_options)
+    def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
+        """Return one step of the model from a section state, computed by a program that is
+        already compiled.
+        """
+        step: AbstractStep = self.model.take_step(params, section_state, self.step_options)
         return step
 
     def find_cycle_from_values(self, values: Values, guess: Any = None) -> AbstractCycle:
@@ -175,16 +198,18 @@ class AbstractGaitFinder(eqx.Module):
     def slope_response(
         self, params: WheelParams, cycle: Any, names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the response of the cycle's step, one for each period, to the slopes of its two
-        lines, with these measures of a step."""
+        """Return the linear response of the cycle's step, and of these measures, to the slopes
+        of its two lines.
+        """
         return _step_slope_response(
             self.model, params, cycle.section_state, tuple(names), self.step_options
         )
 
     @classmethod
     def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """Return a measure of a gait by name. Margins of the locked legs have one value for each
-        leg."""
+        """Return a measure of a gait by name; margins of the locked legs have one value for each
+        leg.
+        """
         return cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
 
 
@@ -192,7 +217,7 @@ _step_slope_response = eqx.filter_jit(step_slope_response)
 
 
 class GaitMeasures(NamedTuple):
-    """Measures of a gait with their derivatives."""
+    """Measures of a gait with their derivatives with respect to the model's parameter values."""
 
     values: Float[Array, " n_names"]
     jacobian: Float[Array, "n_names n_values"]
@@ -203,7 +228,7 @@ class GaitMeasures(NamedTuple):
 def measure_from_cycle(
     finder: AbstractGaitFinder, values: Values, guess: Any, names: tuple[str, ...]
 ) -> GaitMeasures:
-    """Return measures that need the cycle alone, with their derivatives."""
+    """Return measures that need only the cycle, with their derivatives."""
 
     def measures_and_outcome(values: Values) -> tuple[Array, Array]:
         cycle = finder.find_cycle_from_values(values, guess)
@@ -214,7 +239,7 @@ def measure_from_cycle(
 
 
 def move_derivative_axis_first(derivatives: Any) -> Any:
-    """Move the axis of the derivatives, which is over the model's parameters, to the front."""
+    """Return a tree whose last axis, over the model's parameters, is moved to the front."""
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), derivatives)
 
 
@@ -222,7 +247,7 @@ def value_and_tangents(function: Callable, primals: tuple, tangents: tuple) -> t
     """Return a function of a gait's cycle and step, and its derivatives along the branch."""
     primal_floats, other_leaves = eqx.partition(primals, eqx.is_inexact_array)
     tangent_floats = eqx.filter(tangents, eqx.is_inexact_array)
-    value = lambda floats: function(*eqx.combine(floats, other_leaves))
+    value = lambda all_floats: function(*eqx.combine(all_floats, other_leaves))
     derivatives = jax.vmap(lambda tangent: jax.jvp(value, (primal_floats,), (tangent,))[1])(
         tangent_floats
     )
@@ -231,7 +256,9 @@ def value_and_tangents(function: Callable, primals: tuple, tangents: tuple) -> t
 
 @eqx.filter_jit
 def evaluate_on_gait(function: Callable, gait: Gait) -> tuple[Any, Any]:
-    """Return `value_and_tangents` of `function(cycle, step)` on one gait, compiled."""
+    """Return the value of `function(cycle, step)` on one gait and its derivatives along the
+    branch, compiled.
+    """
     return value_and_tangents(function, (gait.cycle, gait.step), (gait.d_cycle, gait.d_step))
 
 
@@ -246,7 +273,7 @@ def evaluate_on_gaits(function: Callable, gait: Gait) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class MeasureReader:
-    """Several named measures of a gait, as a function of cycle and step."""
+    """Function of cycle and step that returns several measures by name."""
 
     read: Callable[[str, AbstractCycle, AbstractStep], Array]
     names: tuple[str, ...]
@@ -256,7 +283,9 @@ class MeasureReader:
 
 
 def measure_from_gait(gait: Gait, read: Callable, names: tuple[str, ...]) -> GaitMeasures:
-    """Return measures of a gait that was found with all of its derivatives."""
-    readings, jacobian = evaluate_on_gait(MeasureReader(read, names), gait)
-    stack = lambda values: jnp.stack([values[name] for name in names], -1)
-    return GaitMeasures(stack(readings), stack(jacobian).T, gait.cycle.outcome)
+    """Return measures of a gait from its stored derivatives."""
+    measure_values, jacobian = evaluate_on_gait(MeasureReader(read, names), gait)
+    stack_measures = lambda values: jnp.stack([values[name] for name in names], -1)
+    return GaitMeasures(
+        stack_measures(measure_values), stack_measures(jacobian).T, gait.cycle.outcome
+    )

@@ -1,4 +1,4 @@
-"""Selection of the finder for a model, and checks of the arguments for a search."""
+"""Selection of the finder for a model, and checks of the arguments of a search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,7 +30,7 @@ from vrw_jax.validation import check_type, is_traced
 from vrw_jax.wheel import WheelParams
 
 Guess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
-"""A neighbor's cycle, or a section state near the wanted gait."""
+"""Guess of a user: a neighbor's cycle, or a section state near the gait."""
 
 FINDER_CLASSES: dict[GaitMethod, type[AbstractGaitFinder]] = {
     GaitMethod.COLLOCATION: CollocationFinder,
@@ -49,7 +49,7 @@ def make_finder(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> AbstractGaitFinder:
-    """Return the finder that finds, checks and differentiates gaits of this model."""
+    """Return the finder that finds, checks and differentiates the gaits of this model."""
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
@@ -64,7 +64,7 @@ def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | N
 
     The paper's gait is tried first. If it is not found or violates a margin on this ground, the
     upper model is returned. Any other model is returned unchanged. The ladder is returned unchanged
-    if the parameters have no values.
+    if the parameters have no concrete values.
     """
     return resolve_model_with_reason(params, model)[0]
 
@@ -82,8 +82,8 @@ def resolve_model_with_reason(
     if not bool(cycle.found):
         return ladder.fallback_model, f"The paper's wheel has no gait: {cycle.why}"
     section_state = ladder.embed_section(params, cycle.section_state)
-    choice = ladder.choose_model(params, section_state, StepOptions())[0]
-    return choice.model, choice.why
+    ladder_choice = ladder.choose_model(params, section_state, StepOptions())[0]
+    return ladder_choice.model, ladder_choice.why
 
 
 def check_guess(guess: Any) -> Any:

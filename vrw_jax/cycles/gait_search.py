@@ -1,9 +1,9 @@
-"""Limit cycles wherever a gait can be reached: by a search, on finer meshes, or from walks.
+"""Limit cycles by a search and, if it fails, by searches on finer meshes or from walks.
 
 The search (`cycles`) starts from predicted gaits of the paper's parameter ranges, on a mesh that
 suits them. If it fails, batches of walks (`batches`) begin at starts that scale with the wheel. A
 walk that continues is the start of another search. If the mesh is too coarse, it is refined. These
-fallbacks depend on concrete values; under a `jit` or `vmap` of the caller only the search runs.
+fallbacks depend on concrete values, so under a `jit` or `vmap` of the caller only the search runs.
 """
 
 import functools
@@ -57,7 +57,9 @@ RETRY_OUTCOMES = (
 
 @dataclass(frozen=True)
 class FallbackOptions:
-    """Fallbacks of the search for gaits of the paper's model: walks and finer meshes."""
+    """Options of the fallbacks of the search for gaits of the paper's model: walks and finer
+    meshes.
+    """
 
     refine_above: float = 1e-7
     """Estimate of the mesh error above which a finer mesh is used.
@@ -65,11 +67,11 @@ class FallbackOptions:
     It is chosen because the errors themselves are a hundredth of the estimate.
     """
     max_refinements: int = 3
-    """Largest number of times that a mesh is made twice as fine."""
+    """Largest number of times that the number of mesh intervals is doubled."""
     n_walk_steps: int = 80
     """Number of steps of a walk toward a gait."""
     max_walk_defect: float = ATTRACTING_GAIT_OPTIONS.start_defect
-    """Largest period defect of a walk that is used as a start, rad, rad/s, m/s."""
+    """Largest period defect of a walk from which a search starts, rad, rad/s, m/s."""
 
 
 FALLBACK_OPTIONS = FallbackOptions()
@@ -226,11 +228,11 @@ def limit_cycles(
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     if shape == (0,):
-        invalid = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
-        one_missing = limit_cycles(
-            invalid, period_n=period_n, model=model, options=options, which=which
+        is_invalid = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
+        has_single_missing = limit_cycles(
+            is_invalid, period_n=period_n, model=model, options=options, which=which
         )
-        return _take_rows_on_device(one_missing, slice(0, 0))
+        return _take_rows_on_device(has_single_missing, slice(0, 0))
     params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
     single_params = jax.tree.map(lambda x: x[0], params)
     finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
@@ -251,21 +253,23 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 
 def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
-    """Return the chosen attracting gait of each wheel."""
-    n_wheels, rank = params.damping.shape[0], parse_gait_choice(which)
+    """Return the attracting gait that `which` selects for each wheel."""
+    n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(which)
     wheel_index, gaits = find_attracting_gaits(
         finder, jax.vmap(finder.model.parameter_values)(params)
     )
     n_gaits_per_wheel = np.bincount(wheel_index, minlength=n_wheels)
-    too_few = n_gaits_per_wheel[(rank >= n_gaits_per_wheel) | (rank < -n_gaits_per_wheel)]
-    if len(too_few):
-        n_gaits = int(too_few[0])
+    has_too_few_gaits = n_gaits_per_wheel[
+        (gait_rank >= n_gaits_per_wheel) | (gait_rank < -n_gaits_per_wheel)
+    ]
+    if len(has_too_few_gaits):
+        n_gaits = int(has_too_few_gaits[0])
         raise ValueError(
             f"which is {which}, but {n_gaits} gait{'s' * (n_gaits > 1)} of this wheel attract"
             f"{'s' * (n_gaits == 1)}: vrw.limit_cycles(params, model=...) returns them."
         )
     return _take_rows_on_device(
-        gaits, find_slowest_indices(wheel_index, n_wheels) + rank % n_gaits_per_wheel
+        gaits, find_slowest_indices(wheel_index, n_wheels) + gait_rank % n_gaits_per_wheel
     )
 
 
@@ -287,7 +291,7 @@ def _search_with_fallbacks(
         cycle = cycle if is_batch else _take_rows_on_device(cycle, 0)
         return cycle if is_concrete else _search(finder, params, cycle.section_state)
     cycle = _search(finder, params, guess)
-    params_and_cycle = lax.stop_gradient((params, cycle))  # differentiated arrays have values, too
+    params_and_cycle = lax.stop_gradient((params, cycle))  # Differentiated arrays have values, too.
     if not finder.supports_cold_start or is_traced(params_and_cycle):
         return cycle
     if not is_batch:
@@ -322,15 +326,17 @@ def _search_with_fallbacks(
 def _keep_first_reason(cycle: LimitCycle, retry: LimitCycle) -> LimitCycle:
     """Return the cycles of the retry; a wheel without a gait keeps the reason of the first search.
 
-    It is the reason of every function, with fallbacks or without, and in any batch.
+    All functions therefore report the same reason, with or without fallbacks, and in any batch.
     """
     is_missing = ~cycle.found & ~retry.found
-    keep = lambda first, last: jnp.where(is_missing, first, last)
-    failed_check = keep(cycle.collocation_state.failed_check, retry.collocation_state.failed_check)
+    keep_first_if_missing = lambda first, last: jnp.where(is_missing, first, last)
+    failed_check = keep_first_if_missing(
+        cycle.collocation_state.failed_check, retry.collocation_state.failed_check
+    )
     return eqx.tree_at(
         lambda x: (x.outcome, x.collocation_state.failed_check),
         retry,
-        (keep(cycle.outcome, retry.outcome), failed_check),
+        (keep_first_if_missing(cycle.outcome, retry.outcome), failed_check),
     )
 
 
@@ -340,19 +346,21 @@ def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
 
 
 def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
-    """Return rows of a tree by numpy, because JAX would compile a program for each shape."""
+    """Return rows of a tree on the device, selected by NumPy because JAX would compile a program
+    for each shape.
+    """
     return jax.device_put(take_rows(tree, row_indices))
 
 
 def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
-    """Return a tree of arrays with these rows replaced."""
+    """Return a tree of arrays with these rows replaced by `values`."""
 
-    def replace(leaf: Any, new_rows: Any) -> np.ndarray:
+    def replace_leaf_rows(leaf: Any, new_rows: Any) -> np.ndarray:
         leaf = np.array(leaf)
         leaf[row_indices] = new_rows
         return leaf
 
-    return jax.tree.map(replace, tree, values)
+    return jax.tree.map(replace_leaf_rows, tree, values)
 
 
 def _walk_and_measure_defect(
@@ -364,11 +372,11 @@ def _walk_and_measure_defect(
     """
     walk_result = step_batch(params, start_states, n_steps, model=finder.model)
     states = np.array(walk_result.section_state)
-    continues = np.asarray(walk_result.outcome) == Outcome.STEPPED
+    is_walking = np.asarray(walk_result.outcome) == Outcome.STEPPED
     period_defect = np.full(len(states), np.inf)
-    if continues.any():
-        period_defect[continues] = _measure_period_defect(
-            finder, _take_rows_on_device(params, continues), states[continues]
+    if is_walking.any():
+        period_defect[is_walking] = _measure_period_defect(
+            finder, _take_rows_on_device(params, is_walking), states[is_walking]
         )
     return states, period_defect
 
@@ -387,46 +395,48 @@ def _measure_period_defect(
 
 
 class _WalkResults(NamedTuple):
-    """State of a batch of wheels after walks toward their gaits."""
+    """Result of walks toward the gaits of a batch of wheels."""
 
     is_usable: np.ndarray  # whether a walk continues, and repeats to `max_walk_defect`
-    section_states: np.ndarray  # (wheels, 3): section state of the walk that repeats best
+    # (wheels, 3): section state of the walk with the smallest period defect
+    section_states: np.ndarray
 
 
 def _walk_from_all_starts(
     finder: CollocationFinder,
     params: WheelParams,
-    is_wanted: np.ndarray,
+    needs_walk: np.ndarray,
     guess_states: np.ndarray | None,
     options: FallbackOptions,
 ) -> _WalkResults:
-    """Return the walks that repeat best, from all starts of the wheels that need one.
+    """Return the walks with the smallest period defects, from all starts of the wheels that need a
+    walk.
 
     A guess that nearly repeats replaces the walks of its wheel. Wheels too stiff for explicit
-    solvers do not walk, because the walks of one such wheel would take minutes by an implicit
+    solvers do not walk, because the walks of one such wheel would take minutes with an implicit
     solver.
     """
     solver_index = select_solver(np.asarray(stack_parameters(params)), StepOptions())
-    is_wanted = is_wanted & (solver_index != SolverIndex.IMPLICIT)
-    n_wheels = len(is_wanted)
+    needs_walk = needs_walk & (solver_index != SolverIndex.IMPLICIT)
+    n_wheels = len(needs_walk)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
-    if guess_states is not None and is_wanted.any():
-        smallest_defect[is_wanted] = _measure_period_defect(
-            finder, _take_rows_on_device(params, is_wanted), guess_states[is_wanted]
+    if guess_states is not None and needs_walk.any():
+        smallest_defect[needs_walk] = _measure_period_defect(
+            finder, _take_rows_on_device(params, needs_walk), guess_states[needs_walk]
         )
         section_states = guess_states.copy()
-    indices = np.flatnonzero(is_wanted & (smallest_defect >= options.max_walk_defect))
+    wheel_indices = np.flatnonzero(needs_walk & (smallest_defect >= options.max_walk_defect))
     for compute_starts in (compute_walk_starts, compute_fallback_starts):
-        own_params = _take_rows_on_device(params, indices)
-        for start in compute_starts(own_params) if len(indices) else ():
+        selected_params = _take_rows_on_device(params, wheel_indices)
+        for start in compute_starts(selected_params) if len(wheel_indices) else ():
             states, period_defect = _walk_and_measure_defect(
-                finder, own_params, start, options.n_walk_steps
+                finder, selected_params, start, options.n_walk_steps
             )
-            is_better = period_defect < smallest_defect[indices]
-            better_indices = indices[is_better]
+            is_better = period_defect < smallest_defect[wheel_indices]
+            better_indices = wheel_indices[is_better]
             smallest_defect[better_indices] = period_defect[is_better]
             section_states[better_indices] = states[is_better]
-        indices = np.flatnonzero(is_wanted & (smallest_defect >= options.max_walk_defect))
+        wheel_indices = np.flatnonzero(needs_walk & (smallest_defect >= options.max_walk_defect))
     return _WalkResults(smallest_defect < options.max_walk_defect, section_states)
 
 
@@ -437,24 +447,25 @@ def _initial_guesses(
     has_state: np.ndarray,
     walk_results: _WalkResults,
 ) -> CollocationState:
-    """Return the starts of searches: the known states, else states from walks, else the surface of
-    gaits."""
+    """Return the starts of searches: the known states, else states from walks, else predictions
+    of the surface.
+    """
     guesses = map_in_batches(
         lambda batch_params: finder.initial_guesses(stack_parameters(batch_params).T),
         batch_sizes.GAIT_BATCH_SIZES,
         params,
     )
-    from_walk = np.flatnonzero(walk_results.is_usable & ~has_state)
-    if len(from_walk):
+    walk_indices = np.flatnonzero(walk_results.is_usable & ~has_state)
+    if len(walk_indices):
         guess_from_state = jax.vmap(finder.guess_from_state)
         guesses = _replace_rows(
             guesses,
-            from_walk,
+            walk_indices,
             map_in_batches(
                 guess_from_state,
                 batch_sizes.GAIT_BATCH_SIZES,
-                _take_rows_on_device(params, from_walk),
-                walk_results.section_states[from_walk],
+                _take_rows_on_device(params, walk_indices),
+                walk_results.section_states[walk_indices],
             ),
         )
     return _replace_rows(guesses, has_state, _take_rows_on_device(collocation_state, has_state))
@@ -468,25 +479,26 @@ def _fallback_starts(
     refines_mesh: bool,
     options: FallbackOptions = FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder, and starts from which it finds more of a batch's gaits.
+    """Return a finder and starts from which it finds more gaits of a batch, or None if there are
+    none.
 
-    Returns None if there are none. `guess_states` are the section states of guesses, (wheels, 3).
-    `refines_mesh` allows a finer mesh.
+    `guess_states` are the section states of guesses, (wheels, 3). `refines_mesh` allows a finer
+    mesh.
     """
     outcome = np.asarray(cycle.outcome)
-    is_rough = refines_mesh & (np.asarray(cycle.mesh_error) > options.refine_above)
+    has_large_mesh_error = refines_mesh & (np.asarray(cycle.mesh_error) > options.refine_above)
     is_missing = np.isin(outcome, RETRY_OUTCOMES)
-    is_open = is_missing | is_rough
-    if not is_open.any():
+    is_unresolved = is_missing | has_large_mesh_error
+    if not is_unresolved.any():
         return None
     walk_results = _walk_from_all_starts(finder, params, is_missing, guess_states, options)
-    # Best start of each wheel so far, found by a search, on the mesh of `finder`.
-    collocation_state, has_state = cycle.collocation_state, is_rough.copy()
+    # The best start of each wheel so far was found by a search, on the mesh of `finder`.
+    collocation_state, has_state = cycle.collocation_state, has_large_mesh_error.copy()
     is_coarse = outcome == Outcome.MESH_TOO_COARSE
     best_result = None
     for refinement_index in range(1 + options.max_refinements * refines_mesh):
         if refinement_index:
-            coarser_finder, finder = finder, finder.finer()
+            coarser_finder, finder = finder, finder.with_finer_mesh()
             transfer = jax.vmap(functools.partial(finder.transfer_to_mesh, coarser_finder.system))
             collocation_state = map_in_batches(
                 transfer, batch_sizes.GAIT_BATCH_SIZES, collocation_state
@@ -498,16 +510,16 @@ def _fallback_starts(
             | (is_coarse & (refinement_index > 0))
             | (refinement_index == 1)
         )
-        indices = np.flatnonzero(is_open & is_promising)
-        if not len(indices):
+        wheel_indices = np.flatnonzero(is_unresolved & is_promising)
+        if not len(wheel_indices):
             continue
-        subset_params = _take_rows_on_device(params, indices)
-        subset_walks = _WalkResults(*(part[indices] for part in walk_results))
+        subset_params = _take_rows_on_device(params, wheel_indices)
+        subset_walks = _WalkResults(*(walk_array[wheel_indices] for walk_array in walk_results))
         guesses = _initial_guesses(
             finder,
             subset_params,
-            _take_rows_on_device(collocation_state, indices),
-            has_state[indices],
+            _take_rows_on_device(collocation_state, wheel_indices),
+            has_state[wheel_indices],
             subset_walks,
         )
         retry = map_in_batches(
@@ -516,22 +528,23 @@ def _fallback_starts(
         is_found, mesh_error = np.asarray(retry.found), np.asarray(retry.mesh_error)
         collocation_state = _replace_rows(
             collocation_state,
-            indices[is_found],
+            wheel_indices[is_found],
             _take_rows_on_device(retry.collocation_state, is_found),
         )
         if is_found.any():
             best_result = finder, collocation_state
-        has_state[indices[is_found]] = True
-        is_coarse[indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
-        is_open[indices[is_found & ((mesh_error <= options.refine_above) | (not refines_mesh))]] = (
-            False
-        )
+        has_state[wheel_indices[is_found]] = True
+        is_coarse[wheel_indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
+        is_unresolved[
+            wheel_indices[is_found & ((mesh_error <= options.refine_above) | (not refines_mesh))]
+        ] = False
     return best_result
 
 
 def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
-    """Return the search's result, with cycles from walks where the search found none, on the same
-    mesh."""
+    """Return the search's result, with cycles from walks for wheels without a cycle, on the same
+    mesh.
+    """
     fallback = _fallback_starts(finder, params, search_result, None, refines_mesh=False)
     if fallback is None:
         return search_result
@@ -541,7 +554,8 @@ def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle
 
 def _guess_section_state(guess: Any) -> Any:
     """Return the section state of a guess, which is a cycle, a `CollocationState` or a section
-    state."""
+    state.
+    """
     if isinstance(guess, CollocationState):
         return guess.ends[-1][jnp.array([0, 2, 3])]
     return getattr(guess, "section_state", guess)
@@ -550,16 +564,17 @@ def _guess_section_state(guess: Any) -> Any:
 def _retry_from_other_steps(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same orbits, found with another of their steps as the first one.
+    """Return a finder and the same orbits, found with another of their steps as the first one; None
+    if none is found.
 
     A guess contains the accelerations of all steps, whose errors accumulate. A step without double
-    support is the most sensitive. As the first or last step it may make the guess fail.
+    support is the most sensitive one. As the first or last step it may make the guess fail.
     """
-    missing = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
-    if not len(missing):
+    missing_indices = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
+    if not len(missing_indices):
         return None
-    subset_params = _take_rows_on_device(params, missing)
-    section_states = np.array(section_states[missing])
+    subset_params = _take_rows_on_device(params, missing_indices)
+    section_states = np.array(section_states[missing_indices])
     best_result = None
     collocation_state = cycle.collocation_state
     for _ in range(1, finder.period_n):
@@ -570,12 +585,12 @@ def _retry_from_other_steps(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, section_states
         )
         found_indices = np.flatnonzero(
-            np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing] < 0.5)
+            np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing_indices] < 0.5)
         )
         if len(found_indices):
             collocation_state = _replace_rows(
                 collocation_state,
-                missing[found_indices],
+                missing_indices[found_indices],
                 _take_rows_on_device(retry.collocation_state, found_indices),
             )
             best_result = finder, collocation_state
@@ -589,7 +604,9 @@ def _align_first_step(
     first_states: np.ndarray,
     fallback: tuple[CollocationFinder, CollocationState] | None,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return the same orbits with the step nearest to `first_states` as the first one."""
+    """Return a finder and the same orbits with the step nearest to `first_states` as the first
+    one.
+    """
     finder, collocation_state = fallback or (finder, cycle.collocation_state)
     ends = np.asarray(collocation_state.ends)[:, :, [0, 2, 3]]
     distances = np.abs(np.roll(ends, 1, axis=1) - first_states[:, None]).max(-1)

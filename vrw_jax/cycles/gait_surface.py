@@ -1,11 +1,11 @@
-"""Prediction of gaits by a cubic surface fitted to the gaits of many wheels; the start of every
+"""Prediction of gaits by a cubic polynomial fitted to the gaits of many wheels, the start of every
 search.
 
 Lengths are in L0, times in sqrt(L0 / g) and masses in the total mass, so that wheels of any size
-are covered. The surface was fitted by experiments/gaits/fit_surface.py to the gaits that a
-continuation from Table 1 reaches. The fit uses Table 1's mass ratio, center of mass and eight legs.
-There it is accurate to about 1 %. Elsewhere it is clipped to its range and is a start for a
-homotopy.
+are covered. The polynomial surface was fitted by experiments/gaits/fit_surface.py to the gaits that
+a continuation from Table 1 reaches. The fit uses Table 1's mass ratio, center of mass and eight
+legs, for which it is accurate to about 1 %. For other wheels it is clipped to its range and is the
+start of a homotopy.
 """
 
 import functools
@@ -22,14 +22,15 @@ from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import PAPER_PHASES, WheelParams
 
 SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
-"""Meshes of the surface's accelerations, for DLS, SLS-I and SLS-II."""
+"""Meshes of the surface's accelerations for DLS, SLS-I and SLS-II."""
 SURFACE_DEGREE = 3
-"""Degree of the surface's polynomials, which the stored coefficients have."""
+"""Degree of the surface's polynomials, that of the stored coefficients."""
 
 
 class GaitSurface(NamedTuple):
-    """Coefficients (monomial, unknown) over centered coordinates, and the range of the
-    coordinates."""
+    """Polynomial coefficients (monomial, unknown) in centered coordinates, and the range of the
+    coordinates.
+    """
 
     centre: np.ndarray
     spread: np.ndarray
@@ -47,12 +48,14 @@ def load_surface() -> GaitSurface:
 
 
 def time_unit(params: WheelParams) -> Elementwise:
-    """Return the wheel's unit of time, sqrt(L0 / g), s."""
+    """Return the wheel's own unit of time, sqrt(L0 / g), s."""
     return jnp.sqrt(params.locked_length / params.gravity)
 
 
 def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Return the root of damping, stiffness, natural length and slope, unitless."""
+    """Return the coordinates of the surface: root of damping, stiffness, natural length and
+    slope, dimensionless.
+    """
     mass = params.hub_mass + params.n_legs * params.leg_mass
     length, gravity = params.locked_length, params.gravity
     return (
@@ -74,7 +77,9 @@ def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
 
 
 def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
-    """Return section, durations and accelerations on `meshes` of the surface's gait, lanes last."""
+    """Return the predicted section state, durations and accelerations at the nodes of `meshes`,
+    lanes last.
+    """
     surface = load_surface()
     # Python floats preserve the dtype of the parameters.
     ranges = (x.tolist() for x in surface[:4])
@@ -84,23 +89,25 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
             surface_coordinates(params), *ranges, strict=True
         )
     )
-    features = jnp.stack(evaluate_monomials(centered))
-    values = jnp.tensordot(jnp.asarray(surface.coefficients.T, features.dtype), features, 1)
+    monomials = jnp.stack(evaluate_monomials(centered))
+    values = jnp.tensordot(jnp.asarray(surface.coefficients.T, monomials.dtype), monomials, 1)
     time_scale = time_unit(params)
     section = jnp.stack([values[0], values[1] / time_scale])
     durations = values[None, 2:5] * time_scale
     accelerations, start_index = [], 5
     for phase, surface_mesh, mesh in zip(PAPER_PHASES, SURFACE_MESHES, meshes, strict=True):
-        dim = phase.n_dof
-        size = surface_mesh.n_intervals * N_GAUSS_NODES * dim
-        flat = values[start_index : start_index + size].reshape(-1, dim, *features.shape[1:])
-        start_index += size
-        matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), features.dtype)
-        # Units of the accelerations of (theta, L1, L2).
+        n_coordinates = phase.n_dof
+        n_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
+        surface_accelerations = values[start_index : start_index + n_values].reshape(
+            -1, n_coordinates, *monomials.shape[1:]
+        )
+        start_index += n_values
+        matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), monomials.dtype)
+        # These are the units of the accelerations of (theta, L1, L2).
         angle_scale = 1.0 / time_scale**2
         length_scale = params.locked_length / time_scale**2
-        scale = jnp.stack([angle_scale, length_scale, length_scale][:dim])
-        phase_accelerations = jnp.tensordot(matrix, flat, 1) * scale
+        scale = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
+        phase_accelerations = jnp.tensordot(matrix, surface_accelerations, 1) * scale
         accelerations.append(
             phase_accelerations.reshape(
                 1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]

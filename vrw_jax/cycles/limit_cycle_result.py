@@ -1,8 +1,8 @@
 """Limit cycles of the paper's model as differentiable functions of its parameters.
 
-The search (see `collocation_search`) carries no derivative. Derivatives come from the implicit
-function theorem: they are the tangents of the linearized pass at the cycle. They are valid on
-unstable cycles, in forward and reverse mode, and to any order.
+The search (see `collocation_search`) carries no derivatives. They come from the implicit function
+theorem as the tangents of the linearized pass at the cycle. They are valid on unstable cycles, in
+forward and reverse mode, and to any order.
 """
 
 import functools
@@ -23,7 +23,7 @@ from vrw_jax.collocation import (
 )
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles.collocation_search import (
-    MESH_CHECK,
+    MESH_CHECK_CODE,
     CollocationState,
     CollocationSystem,
     init_search_flags,
@@ -93,7 +93,7 @@ class LimitCycle(AbstractCycle):
     system: CollocationSystem = eqx.field(static=True)
     model: ViscoelasticWheel = eqx.field(
         default_factory=ViscoelasticWheel
-    )  # whose ground `margins` uses
+    )  # `margins` uses its ground.
 
     @property
     def period_n(self) -> int:
@@ -108,17 +108,17 @@ class LimitCycle(AbstractCycle):
         return self.collocation_state
 
     def _map_over_batch(self, function: Callable) -> Callable:
-        """Map a function of one cycle over the axes of this batch."""
+        """Return `function` of one cycle, mapped over the axes of this batch."""
         for _ in range(self.outcome.ndim):
             function = jax.vmap(function)
         return with_default_settings(function)
 
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
-        """Return the Jacobian of the return map on the section after the impact, over (theta+,
-        dtheta+).
+        """Return the Jacobian of the return map on the section after the impact, with coordinates
+        (theta+, dtheta+).
 
-        A third multiplier, on the section before the impact, is zero.
+        On the section before the impact there is a third multiplier, which is zero.
         """
         attach_function = attach_monodromy if is_inside_jit() else _compiled_attach_monodromy
         attach = self._map_over_batch(functools.partial(attach_function, self.system))
@@ -126,8 +126,9 @@ class LimitCycle(AbstractCycle):
 
     @property
     def jury_margins(self) -> Array:
-        """Return the margins to fold, period doubling and Neimark-Sacker: see
-        floquet.jury_margins."""
+        """Return the margins to fold, period doubling and Neimark-Sacker bifurcation; see
+        `floquet.jury_margins`.
+        """
         return floquet.jury_margins(self.monodromy)
 
     @property
@@ -137,8 +138,8 @@ class LimitCycle(AbstractCycle):
 
     @property
     def mesh_error(self) -> Array:
-        """Return an estimate of the mesh's error, mostly too large: see
-        collocation.estimate_mesh_error.
+        """Return an estimate of the mesh's error, in most cases too large; see
+        `collocation.estimate_mesh_error`.
 
         Above 1e-5 a gait does not count as found. More mesh intervals in `CycleOptions` reduce it.
         """
@@ -147,8 +148,9 @@ class LimitCycle(AbstractCycle):
 
     @property
     def takeoff_acceleration(self) -> Array:
-        """Return the rear foot's acceleration at take-off, m/s^2, least over the steps: see
-        `margin_defaults`."""
+        """Return the rear foot's acceleration at take-off, m/s^2, the least over the steps; see
+        `margin_defaults`.
+        """
         acceleration_of_cycle = functools.partial(_takeoff_acceleration, self.system)
         return self._mask_missing(
             self._map_over_batch(acceleration_of_cycle)(self.parameters, self.collocation_state)
@@ -156,8 +158,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def slope_response(self) -> SlopeResponse:
-        """Return the response of the step to the slopes of its lines, with
-        `slope_response.COLLOCATION_RESPONSE_MEASURES`."""
+        """Return the linear response of the step to the slopes of its two lines.
+
+        Its measures are `slope_response.COLLOCATION_RESPONSE_MEASURES`.
+        """
         if self.period_n > 1:
             raise ValueError(
                 f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
@@ -167,8 +171,9 @@ class LimitCycle(AbstractCycle):
         return self._map_over_batch(respond)(self.parameters, self.collocation_state)
 
     def gait_sensitivity(self, name: str) -> Array:
-        """Return the gait sensitivity norm of a measure, in its unit per rad of slope: see
-        `gait_sensitivity`."""
+        """Return the gait sensitivity norm of a measure, in its unit per rad of slope; see
+        `gait_sensitivity`.
+        """
         index = COLLOCATION_RESPONSE_MEASURES.index(name)
 
         def norm_of(response: SlopeResponse) -> Array:
@@ -178,7 +183,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def margins(self) -> Margins:
-        """Return the margins over the (first) step, computed by one event-driven step."""
+        """Return the margins over the first step, computed by one event-driven step."""
 
         def margins_of_step(parameters: Array, section_state: Array) -> Margins:
             wheel = wheel_from_parameters(parameters, self.system.n_legs)
@@ -227,7 +232,7 @@ def _takeoff_acceleration(
 ) -> Array:
     """Return the least take-off acceleration over the steps of a cycle, m/s^2."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
-    _, steps = system.evaluate_passages(parameters, collocation_state.solution)
+    _, steps = system.evaluate_phase_points(parameters, collocation_state.solution)
     return jnp.min(jnp.stack([gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
 
 
@@ -245,7 +250,7 @@ def find_limit_cycle(
 def _find_cycle(
     params: WheelParams, system: CollocationSystem, guess: CollocationState | None
 ) -> LimitCycle:
-    """Return `find_limit_cycle`, to be compiled."""
+    """Return the cycle as `find_limit_cycle` does, without compilation."""
     is_usable = params.is_in_domain()
     table_1 = WheelParams(n_legs=system.n_legs)
     safe_params = jax.tree.map(
@@ -256,44 +261,50 @@ def _find_cycle(
         solve_cycle_with_derivatives(system, parameters, guess)
     )
     is_found = is_usable & (collocation_state.found > 0.5)
-    # Mask inputs and outputs: measures and derivatives are zero where there is no cycle.
+    # Inputs and outputs are masked, so that measures and derivatives are zero if there is no cycle.
     mask = lambda x: jnp.where(is_found, x, 0.0)
-    stand_in = lambda x, d: jnp.where(is_found, x, d)
+    replace_if_missing = lambda x, d: jnp.where(is_found, x, d)
     parameters = jax.tree.map(
-        stand_in, parameters, stack_parameters(table_1).astype(parameters.dtype)
+        replace_if_missing, parameters, stack_parameters(table_1).astype(parameters.dtype)
     )
 
-    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
     period_n = system.period_n
-    # theta, its rate and the rate of L1: L1 itself follows from theta at touchdown.
+    # The states are theta, its rate and the rate of L1, because L1 follows from theta at touchdown.
     states = jnp.concatenate([collocation_state.ends[:, :1], collocation_state.ends[:, 2:]], 1)
     # The landing at the start of a step follows the state at the end of the previous step.
-    landings = jax.vmap(lambda x: transitions.land(s, *x))(jnp.roll(states, 1, 0))
-    fore, rear = jax.vmap(lambda landing: transitions.landing_forces(s, landing))(landings)
+    landings = jax.vmap(lambda x: transitions.land(symbols, *x))(jnp.roll(states, 1, 0))
+    fore_force, rear_force = jax.vmap(lambda landing: transitions.landing_forces(symbols, landing))(
+        landings
+    )
 
-    def over_steps(values: Array) -> Array:
+    def mask_steps(values: Array) -> Array:
         return mask(values[0] if period_n == 1 else values)
 
     durations = collocation_state.solution.durations
-    code = jnp.where(
+    outcome_code = jnp.where(
         collocation_state.failed_check > 0.0, Outcome.EVENT_ORDER_MISMATCH, Outcome.NO_CYCLE_FOUND
     )
-    code = jnp.where(collocation_state.failed_check == MESH_CHECK, Outcome.MESH_TOO_COARSE, code)
-    code = jnp.where(
-        collocation_state.failed_check > MESH_CHECK, Outcome.BRANCH_ENDS_BEFORE_TARGET, code
+    outcome_code = jnp.where(
+        collocation_state.failed_check == MESH_CHECK_CODE, Outcome.MESH_TOO_COARSE, outcome_code
     )
-    code = jnp.where(is_found, Outcome.STEPPED, code)
+    outcome_code = jnp.where(
+        collocation_state.failed_check > MESH_CHECK_CODE,
+        Outcome.BRANCH_ENDS_BEFORE_TARGET,
+        outcome_code,
+    )
+    outcome_code = jnp.where(is_found, Outcome.STEPPED, outcome_code)
     return LimitCycle(
         section_state=mask(states[-1]),
         post_impact=mask(collocation_state.solution.section_state),
-        durations=over_steps(durations),
-        step_length=over_steps(landings.distance),
+        durations=mask_steps(durations),
+        step_length=mask_steps(landings.distance),
         indicators=DoubleSupportIndicators(
-            lambda_I4=over_steps(landings.rear_impulse.normal),
-            lambda_2=over_steps(fore.normal),
-            lambda_4=over_steps(rear.normal),
+            lambda_I4=mask_steps(landings.rear_impulse.normal),
+            lambda_2=mask_steps(fore_force.normal),
+            lambda_4=mask_steps(rear_force.normal),
         ),
-        outcome=jnp.where(is_usable, code, Outcome.BAD_INPUT).astype(jnp.int32),
+        outcome=jnp.where(is_usable, outcome_code, Outcome.BAD_INPUT).astype(jnp.int32),
         residual=jnp.where(jnp.isfinite(residual), residual, 1.0),
         n_newton_iterations=n_newton_iterations,
         parameters=parameters,
@@ -307,10 +318,10 @@ _compiled_find_cycle = eqx.filter_jit(_find_cycle)
 
 
 class WalkSamples(NamedTuple):
-    """Event-driven walk, sampled as a start on any mesh."""
+    """Event-driven walk, sampled in time as a start on any mesh."""
 
     post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
-    distances: Float[Array, " n"]  # between the feet at each landing, m
+    distances: Float[Array, " n"]  # distances between the feet at each landing, m
     durations: Float[Array, "n 3"]
     states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
 
@@ -325,8 +336,8 @@ def sample_walk(
 ) -> WalkSamples:
     """Return `n_steps` event-driven steps from a section state, sampled in time.
 
-    - `n_samples`: number of points of each phase, chosen because with too few (33 at c = 221) the
-      fast start of a step without double support is lost and Newton's method fails.
+    - `n_samples`: number of points of each phase, chosen because too few lose the fast start of a
+      step without double support, and Newton's method fails (33 at c = 221).
     """
     options, s = StepOptions(), params.symbols()
     landing = transitions.land(s, *section_state)
@@ -345,11 +356,11 @@ def sample_walk(
 def guess_from_walk(
     system: CollocationSystem, params: WheelParams, walk: WalkSamples
 ) -> CollocationState:
-    """Return the cycle's unknowns from a walk of `period_n` steps."""
-    accelerations = functools.partial(_sample_accelerations, system, params.symbols())
+    """Return the unknowns of a cycle from a walk of `period_n` steps."""
+    sample_accelerations = functools.partial(_sample_accelerations, system, params.symbols())
     is_active = (walk.durations > 0.0).astype(walk.durations.dtype)
-    by_phase = jax.vmap(accelerations)(walk.distances, walk.states)
-    solution = CollocationSolution(walk.post_impact, walk.durations, by_phase)
+    phase_accelerations = jax.vmap(sample_accelerations)(walk.distances, walk.states)
+    solution = CollocationSolution(walk.post_impact, walk.durations, phase_accelerations)
     search_flags = init_search_flags(system, walk.post_impact)
     return lax.stop_gradient(CollocationState(solution, is_active, *search_flags))
 
@@ -358,32 +369,43 @@ def guess_from_walk(
 def transfer_to_mesh(
     known_system: CollocationSystem, wanted_system: CollocationSystem, solution: CollocationSolution
 ) -> CollocationSolution:
-    """Return a solution transferred to another mesh. The accelerations in each mesh interval are a
-    polynomial."""
+    """Return a solution transferred to another mesh; the accelerations in each mesh interval are
+    a polynomial.
+    """
     accelerations = []
-    for known_mesh, wanted_mesh, rows in zip(
+    for known_mesh, wanted_mesh, phase_accelerations in zip(
         known_system.meshes, wanted_system.meshes, solution.accelerations, strict=True
     ):
         matrix = jnp.asarray(
             mesh_transfer_matrix(known_mesh, wanted_mesh), solution.section_state.dtype
         )
-        n, _, _, dim = rows.shape
-        resampled = jnp.einsum("ij,njd->nid", matrix, rows.reshape(n, -1, dim))
-        accelerations.append(resampled.reshape(n, wanted_mesh.n_intervals, N_GAUSS_NODES, dim))
+        n_steps, _, _, n_coordinates = phase_accelerations.shape
+        transferred = jnp.einsum(
+            "ij,njd->nid", matrix, phase_accelerations.reshape(n_steps, -1, n_coordinates)
+        )
+        accelerations.append(
+            transferred.reshape(n_steps, wanted_mesh.n_intervals, N_GAUSS_NODES, n_coordinates)
+        )
     return CollocationSolution(solution.section_state, solution.durations, tuple(accelerations))
 
 
 def _sample_accelerations(
     system: CollocationSystem, s: Symbols, distance: Scalar, states: Float[Array, "3 n_samples 6"]
 ) -> tuple[Array, ...]:
-    """Return accelerations at the nodes of each phase, (step, node, coordinate), of a sampled
-    step."""
+    """Return accelerations at the nodes of each phase of a sampled step, (interval, node,
+    coordinate).
+    """
     accelerations, phases = [], make_phases(s, distance, stop_at_lift_off=False)
     sample_times = jnp.linspace(0.0, 1.0, states.shape[1])
     for phase, mesh, samples in zip(phases, system.meshes, states, strict=True):
-        rows = [
-            jnp.interp(jnp.asarray(mesh.node_fractions), sample_times, row) for row in samples.T
+        node_states = [
+            jnp.interp(jnp.asarray(mesh.node_fractions), sample_times, samples_of_coordinate)
+            for samples_of_coordinate in samples.T
         ]
-        nodes = jnp.stack(phase.acceleration(Motion.from_angle(*rows))[: phase.n_dof], axis=-1)
-        accelerations.append(nodes.reshape(mesh.n_intervals, N_GAUSS_NODES, phase.n_dof))
+        node_accelerations = jnp.stack(
+            phase.acceleration(Motion.from_angle(*node_states))[: phase.n_dof], axis=-1
+        )
+        accelerations.append(
+            node_accelerations.reshape(mesh.n_intervals, N_GAUSS_NODES, phase.n_dof)
+        )
     return tuple(accelerations)

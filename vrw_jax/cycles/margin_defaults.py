@@ -1,8 +1,10 @@
-"""Margins of the paper's model that searches along gaits keep, and their default least values."""
+"""Margins of the paper's model that searches along gaits keep positive, and their default least
+values.
+"""
 
 from collections.abc import Mapping
 
-from vrw_jax.collocation import PhasePassage
+from vrw_jax.collocation import PhasePoints
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import Elementwise
 from vrw_jax.runtime import with_default_settings
@@ -10,9 +12,10 @@ from vrw_jax.validation import check_type
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
 
-def gait_takeoff_acceleration(s: Symbols, sls1: PhasePassage) -> Elementwise:
-    """Return the rear foot's acceleration at the start of a gait's passage through SLS-I, m/s^2;
-    see `dynamics`."""
+def gait_takeoff_acceleration(s: Symbols, sls1: PhasePoints) -> Elementwise:
+    """Return the rear foot's acceleration at the start of SLS-I of a gait, m/s^2; see
+    `dynamics`.
+    """
     return dynamics.takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
 
 
@@ -29,10 +32,10 @@ MARGIN_NAMES: tuple[str, ...] = (
     "lambda_2_plus",
     "lambda_4_plus",
 )
-"""Margins on forces, clearances and indicators that gaits of this model can keep."""
+"""Names of margins on forces, clearances and indicators that gaits of this model can keep."""
 
 DEFAULT_MARGIN_SHARE = 1e-3
-"""Default least value of a margin, as a share of the wheel's weight, leg length or gravity."""
+"""Default least value of a margin, as a fraction of the wheel's weight, leg length or gravity."""
 
 
 @with_default_settings

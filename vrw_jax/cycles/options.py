@@ -1,4 +1,4 @@
-"""All numerical choices of the search for limit cycles in one options object."""
+"""Numerical options of the search for limit cycles, in one object."""
 
 import dataclasses
 
@@ -72,25 +72,28 @@ class CycleOptions:
         object.__setattr__(self, "mesh_intervals", mesh_intervals)
 
     def check_tolerances(self, dtype: np.dtype) -> None:
-        """Refuse a tolerance below what the number format can resolve.
+        """Raise a ValueError for a tolerance that the number format cannot resolve.
 
-        A wheel of 64 bits counts as what JAX makes of it: 32 bits if `jax_enable_x64` is off.
+        The parameters of a wheel in 64 bits count as 32 bits if `jax_enable_x64` is off, as in JAX.
         """
-        computed = jax.dtypes.canonicalize_dtype(dtype)
-        if self.tolerance < jnp.finfo(computed).eps:
-            holder = "the wheel holds" if computed == dtype else "jax_enable_x64 is off: JAX takes"
+        computed_dtype = jax.dtypes.canonicalize_dtype(dtype)
+        if self.tolerance < jnp.finfo(computed_dtype).eps:
+            source = (
+                "the wheel holds" if computed_dtype == dtype else "jax_enable_x64 is off: JAX takes"
+            )
             raise ValueError(
-                f"{holder} {np.dtype(computed).name} numbers, in which no limit cycle is found "
+                f"{source} {computed_dtype.name} numbers, in which no limit cycle is found "
                 f"to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 
     def refine_mesh(self) -> "CycleOptions":
-        """Return the options with a mesh about twice as fine."""
+        """Return the options with about twice as many mesh intervals."""
         dls, sls1, sls2 = self.mesh_intervals
         return dataclasses.replace(self, mesh_intervals=(2 * dls, 2 * sls1, max(2 * sls2, sls1)))
 
     @classmethod
     def tight(cls) -> "CycleOptions":
         """Return options that are accurate to about 1e-12 in values and 1e-10 in first
-        derivatives."""
+        derivatives.
+        """
         return cls(mesh_intervals=(16, 20, 4), tolerance=1e-13)

@@ -1,4 +1,4 @@
-"""Gaits of any model, found by Newton's method on its return map from a start nearby.
+"""Gaits of any model, found by Newton's method on its return map from a start near the gait.
 
 The paper's model has a faster method (see `collocation_finder`). This module uses only the
 interface of the models.
@@ -37,8 +37,9 @@ from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
-"""Lower limit of the tolerance of Newton's last correction. The step's own tolerance is a limit
-too."""
+"""Lower limit of the tolerance of Newton's last correction. The step's own tolerance is another
+limit.
+"""
 
 
 def newton_tolerance(options: StepOptions) -> Scalar:
@@ -85,7 +86,7 @@ class ReturnMapCycle(AbstractCycle):
         return self.steps.durations.shape[self.outcome.ndim]
 
     def _squeeze_steps(self, tree: Any) -> Any:
-        """Remove the axis over steps if there is only one step."""
+        """Return the tree without the axis over steps if there is only one step."""
         axis, is_single_step = self.outcome.ndim, self.period_n == 1
         return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if is_single_step else leaf, tree)
 
@@ -124,7 +125,7 @@ def find_return_map_cycle(
     period_n: int,
     uses_jvp_rule: bool,
 ) -> ReturnMapCycle:
-    """Find a cycle by Newton's method on the model's return map.
+    """Return the cycle of a wheel, found by Newton's method on the model's return map.
 
     `uses_jvp_rule` selects `solve_fixed_point_implicit`, because second derivatives of a step are
     expensive with unilateral contact. The search then uses the same step as the result, so that
@@ -173,8 +174,9 @@ def make_cycle(params: WheelParams, fixed_point: FixedPointResult, steps: Any) -
 
 
 def summarize_steps(steps: Any) -> tuple[Array, Array, Array]:
-    """Return post-impact state, durations and step lengths of a cycle from its steps, which have a
-    leading axis."""
+    """Return post-impact state, durations, s, and step lengths, m, of a cycle from its steps, on
+    a leading axis.
+    """
     durations, lengths = steps.durations, steps.step_length
     if len(durations) == 1:
         durations, lengths = durations[0], lengths[0]
@@ -266,14 +268,16 @@ def prepare_search(
 def make_gait(
     model: AbstractWheel, n_legs: int, cycle: Any, step: Any, d_cycle: Any, d_step: Any
 ) -> Gait:
-    """Return a gait with the data that identify its branch. With unilateral contact the order of
-    events may change along a branch."""
+    """Return a gait with the data that identify its branch.
+
+    With unilateral contact the order of events may change along a branch.
+    """
     n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, step: jnp.concatenate(
         [cycle.section_state[:n_coordinates], step.durations]
     )
-    branch_data = value_and_tangents(gait_coordinates, (cycle, step), (d_cycle, d_step))
+    branch_point = value_and_tangents(gait_coordinates, (cycle, step), (d_cycle, d_step))
     return_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
     return Gait(
-        cycle, step, d_cycle, d_step, BranchPoint(*branch_data, jnp.ones(1), return_jacobian)
+        cycle, step, d_cycle, d_step, BranchPoint(*branch_point, jnp.ones(1), return_jacobian)
     )

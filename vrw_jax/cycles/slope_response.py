@@ -1,7 +1,7 @@
-"""Linear response of a gait's step to the slopes of uneven ground, and the norm that follows.
+"""Linear response of a gait's step to the slopes of uneven ground, and the gait sensitivity norm.
 
-Hobbelen and Wisse, "A disturbance rejection measure for limit cycle walkers: the gait sensitivity
-norm" (2007), with its sum over all later steps in closed form.
+The norm is that of Hobbelen and Wisse, "A disturbance rejection measure for limit cycle walkers:
+the gait sensitivity norm" (2007), with its sum over all later steps in closed form.
 """
 
 import functools
@@ -24,15 +24,17 @@ from vrw_jax.numerics import ForwardFunction, StepOptions, enable_all_ad_modes
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 N_REFINEMENTS = 3
-"""Number of Newton iterations with one Jacobian, chosen because each makes derivatives of one more
-order exact, and a gradient of the norm needs the second order."""
+"""Number of Newton iterations with one Jacobian. It is chosen because each makes derivatives of
+one more order exact, and a gradient of the norm needs the second order.
+"""
 
 
 class SlopeResponse(NamedTuple):
-    """Derivatives of a step: of its end state, and of measures, by start and by its two lines.
+    """Derivatives of a step's end state and measures with respect to its start and the slopes of
+    its two lines.
 
-    With x[k] the start of step k and e[k] the deviation of the slope of line k,
-    x[k+1] = A x[k] + B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
+    With x[k] the start of step k and e[k] the deviation of the slope of line k, x[k+1] = A x[k] +
+    B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
     """
 
     A: Float[Array, "n n"]
@@ -44,7 +46,9 @@ class SlopeResponse(NamedTuple):
 
     @classmethod
     def from_jacobian(cls, jacobian: Array, n: int) -> "SlopeResponse":
-        """Split the Jacobian of (end state, measures) by (start, slope, slope of the next line)."""
+        """Return the response from the Jacobian of (end state, measures) with respect to (start,
+        slope, next slope).
+        """
         end, measures = jacobian[:n], jacobian[n:]
         return cls(
             end[:, :n],
@@ -55,17 +59,18 @@ class SlopeResponse(NamedTuple):
             measures[:, n + 1],
         )
 
-    def select(self, rows: Sequence[int]) -> "SlopeResponse":
+    def select(self, measure_indices: Sequence[int]) -> "SlopeResponse":
         """Return the response with some of its measures."""
-        indices = jnp.asarray(rows)
+        indices = jnp.asarray(measure_indices)
         return self._replace(C=self.C[indices], D1=self.D1[indices], D0=self.D0[indices])
 
 
 class GaitSensitivityNorm(NamedTuple):
     """Norm of each measure, and the parts whose squares add up to its square, in its unit per rad.
 
-    The parts are the response to one line: of the step that ends on it, of the step that begins on
-    it, both with their sign, and of all later steps together.
+    The parts are the response to the deviation of one line. They are that of the step that ends on
+    it and that of the step that begins on it, both with their sign, and that of all later steps
+    together.
     """
 
     norm: Float[Array, " n_measures"]
@@ -79,7 +84,7 @@ def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
 
     The response to one line is D0, then C B0 + D1, then C A^j b with b = A B0 + B1. The sum of the
     squares of the last ones is C P C^T, where P = A P A^T + b b^T is a discrete Lyapunov equation.
-    It is infinite for a gait that is not stable.
+    The norm is infinite for a gait that is not stable.
     """
     A, B1, B0, C, D1, D0 = response
     n = len(A)
@@ -95,31 +100,37 @@ def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
     return GaitSensitivityNorm(if_stable(norm), D0, beginning_step, if_stable(_root(later_squared)))
 
 
-def _root(square: Array) -> Array:
-    """Return the square root with a zero derivative at zero, where round-off may be negative."""
-    is_positive = square > 0.0
-    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1.0)), 0.0)
+def _root(squared_value: Array) -> Array:
+    """Return the square root, with a zero derivative at zero and for negative round-off."""
+    is_positive = squared_value > 0.0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, squared_value, 1.0)), 0.0)
 
 
 def step_slope_response(
-    model: AbstractWheel, params: WheelParams, x: Array, names: Sequence[str], options: StepOptions
+    model: AbstractWheel,
+    params: WheelParams,
+    section_state: Array,
+    names: Sequence[str],
+    options: StepOptions,
 ) -> SlopeResponse:
-    """Return the response of a model's own step from the section state `x` of its gait.
+    """Return the response of a model's own step from the section state of its gait.
 
-    Entries of `x` that are codes do not vary.
+    Entries of the section state that are codes do not vary.
     """
     n = model.n_continuous(params)
-    codes = x[n:]
+    codes = section_state[n:]
 
     def evaluate(inputs: Array) -> Array:
         ground: Any = model.split_ground(eqx.tree_at(lambda p: p.slope, params, inputs[n:]), 1)
-        step_model, step_params = model.with_ground(params, tuple(row[0] for row in ground))
+        step_model, step_params = model.with_ground(
+            params, tuple(line_values[0] for line_values in ground)
+        )
         step = step_model.take_step(step_params, jnp.concatenate([inputs[:n], codes]), options)
         measures = step.measures()
         values = [jnp.ravel(measures[name]) for name in names]
         return jnp.concatenate([step.section_state[:n], *values])
 
-    inputs = jnp.concatenate([x[:n], jnp.stack([params.slope, params.slope])])
+    inputs = jnp.concatenate([section_state[:n], jnp.stack([params.slope, params.slope])])
     return SlopeResponse.from_jacobian(jax.jacfwd(evaluate)(inputs), n)
 
 
@@ -145,27 +156,34 @@ def collocation_slope_response(
     The response is differentiable along the branch of gaits in every mode, up to second order.
     """
     solution, is_active = collocation_state.solution, collocation_state.phase_active[0]
-    known = lax.stop_gradient((solution.durations[0], *(a[0] for a in solution.accelerations)))
+    gait_unknowns = lax.stop_gradient(
+        (solution.durations[0], *(a[0] for a in solution.accelerations))
+    )
     respond = _make_collocation_response(system)
-    return respond(parameters, solution.section_state, lax.stop_gradient(is_active), *known)[0]
+    return respond(
+        parameters, solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
+    )[0]
 
 
 @functools.cache
 def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
-    """Return the response as a function of parameters, section state and a step's solution.
+    """Return the function that computes the response from parameters, section state and a step's
+    solution.
 
-    Durations and accelerations of other starts and slopes follow by Newton's method with the
+    Durations and accelerations for other starts and slopes follow by Newton's method with the
     Jacobian of the gait's own step.
     """
     slope_index = PARAMETER_NAMES.index("slope")
 
-    def respond(parameters: Array, section: Array, is_active: Array, *known: Array) -> tuple:
-        unknowns_of_gait, unravel = ravel_pytree(known)
+    def respond(
+        parameters: Array, section: Array, is_active: Array, *gait_unknowns: Array
+    ) -> tuple:
+        unknowns_of_gait, unravel = ravel_pytree(gait_unknowns)
 
         def reconstruct(unknowns: Array, inputs: Array, parameters: Array) -> tuple:
             durations, *accelerations = unravel(unknowns)
             line_parameters = parameters.at[slope_index].set(inputs[2])
-            constants = (*system.constants_of(*line_parameters), inputs[3] - inputs[2])
+            constants = (*system.compute_constants(*line_parameters), inputs[3] - inputs[2])
             section, passages = reconstruct_step(
                 system.sequence,
                 system.meshes,
@@ -179,23 +197,23 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
         def residual(unknowns: Array, inputs: Array, parameters: Array) -> Array:
             durations, *accelerations = unravel(unknowns)
             constants, _, passages = reconstruct(unknowns, inputs, parameters)
-            rows: list[Array] = []
+            residuals: list[Array] = []
             for i, (phase, passage) in enumerate(
                 zip(system.sequence.phases, passages, strict=True)
             ):
                 node_accelerations = accelerations[i].reshape(-1, phase.n_coordinates).T
-                rows += phase.residual(constants, passage.nodes, tuple(node_accelerations))
+                residuals += phase.residual(constants, passage.nodes, tuple(node_accelerations))
                 event = phase.event(constants, passage.end)
-                rows.append(jnp.where(is_active[i] > 0.5, event, durations[i])[None])
-            return jnp.concatenate(rows)
+                residuals.append(jnp.where(is_active[i] > 0.5, event, durations[i])[None])
+            return jnp.concatenate(residuals)
 
         inputs = jnp.concatenate([section, jnp.full(2, parameters[slope_index])])
         jacobian = jax.jacfwd(residual)(unknowns_of_gait, *lax.stop_gradient((inputs, parameters)))
-        factors = lu_factor(jacobian)
+        lu_factors = lu_factor(jacobian)
 
         def evaluate(inputs: Array) -> Array:
             def refine(unknowns: Array, _: None) -> tuple[Array, None]:
-                return unknowns - lu_solve(factors, residual(unknowns, inputs, parameters)), None
+                return unknowns - lu_solve(lu_factors, residual(unknowns, inputs, parameters)), None
 
             unknowns, _ = lax.scan(refine, unknowns_of_gait, length=N_REFINEMENTS)
             _, end, passages = reconstruct(unknowns, inputs, parameters)

@@ -1,7 +1,8 @@
-"""Gaits with unilateral contact, found by Newton's method on batched steps and their derivatives.
+"""Gaits with unilateral contact, found by Newton's method on batches of steps and their
+derivatives.
 
-All tangents of a step are computed beside its motion in the same machine code. Many wheels are
-therefore searched side by side, and no large program is compiled for the derivatives.
+All tangents of a step are computed together with its motion in the same machine code. Many wheels
+are therefore searched together, and no large program is compiled for the derivatives.
 """
 
 import functools
@@ -48,26 +49,27 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class ContactNewtonOptions:
-    """Newton's method on the return map with unilateral contact."""
+    """Options of Newton's method on the return map with unilateral contact."""
 
     max_iterations: int = 15
     """Largest number of Newton iterations."""
     max_halvings: int = 6
-    """Largest number of halvings of a correction after which no step ends."""
+    """Largest number of halvings of a correction if no step completes after it."""
     far_step_tolerance: float = 1e-6
     """Tolerance of the steps far from a gait."""
     near_correction: float = 1e-4
-    """Correction below which a state is near a gait, rad, rad/s, m/s."""
+    """Size of a correction below which a state is near a gait, rad, rad/s, m/s."""
     clear_convergence_factor: float = 0.01
-    """Share of the tolerance below which a correction is accepted without a second one."""
+    """Fraction of the tolerance below which a correction is accepted without a second one."""
 
 
 CONTACT_NEWTON_OPTIONS = ContactNewtonOptions()
 
 
 class UnilateralFinder(AbstractReturnMapFinder):
-    """Finder with unilateral contact, with first derivatives, including those with respect to
-    friction."""
+    """Finder of gaits with unilateral contact and their first derivatives, also with respect to
+    friction.
+    """
 
     model: UnilateralWheel
     batch_sizes: tuple[int, ...] = eqx.field(
@@ -89,13 +91,14 @@ class UnilateralFinder(AbstractReturnMapFinder):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> AbstractReturnMapFinder:
-        if model.restitution is not None:  # the batched engine has no restitution
+        if model.restitution is not None:  # The batched engine has no restitution.
             return ReturnMapFinder(model, n_legs, step_options, period_n)
         return cls(model, n_legs, step_options, period_n)
 
     def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
-        """Return the cycle from the batched engine if all inputs are concrete, else from the step's
-        own derivatives."""
+        """Return the cycle by the batched engine if all inputs are concrete, else by the step's
+        own derivatives.
+        """
         params, x, model, options = prepare_search(self, params, guess)
         if is_traced(params, x, model):
             return find_return_map_cycle(
@@ -117,11 +120,13 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return self.find_cycles_near(values, states)
 
     def find_cycles_near(self, values: Any, states: Any) -> ReturnMapCycle:
-        """Return the gaits near section states, one per wheel, without derivatives."""
-        return self._solve_and_read(_make_cycle, values, states, with_parameter_derivatives=False)
+        """Return the gaits near section states, one for each wheel, without derivatives."""
+        return self._solve_and_evaluate(
+            _make_cycle, values, states, with_parameter_derivatives=False
+        )
 
     def precompile_newton(self, values: np.ndarray, states: np.ndarray) -> None:
-        """Compile the programs of Newton's method while another thread walks towards its start."""
+        """Compile the programs of Newton's method while another thread walks toward its start."""
         period_map = PeriodMap(self.model, self.n_legs, self.period_n, values)
         period_map.evaluate_period(self.step_options, states, False)
 
@@ -129,7 +134,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return _remove_batch_axis(self.initial_guesses(_add_batch_axis(values)))
 
     def initial_guesses(self, values: Array) -> Array:
-        """Return a slow attracting gait's section state for each wheel, NaN if there is none."""
+        """Return the section state of a slow attracting gait for each wheel, NaN if there is
+        none.
+        """
         gaits = find_slow_gaits(self, values)
         is_found = np.asarray(gaits.outcome) == Outcome.STEPPED
         return jax.device_put(np.where(is_found[:, None], gaits.section_state, np.nan))
@@ -138,27 +145,35 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return _remove_batch_axis(self.find_gaits(_add_batch_axis(values), _add_batch_axis(guess)))
 
     def find_gaits(self, values: Array, guess: Any) -> Gait:
-        return self._solve_and_read(
+        return self._solve_and_evaluate(
             _make_gait,
             values,
             getattr(guess, "section_state", guess),
             with_parameter_derivatives=True,
         )
 
-    def _solve_and_read(
-        self, read_wheel: Callable, values: Any, states: Any, with_parameter_derivatives: bool
+    def _solve_and_evaluate(
+        self, evaluate_wheel: Callable, values: Any, states: Any, with_parameter_derivatives: bool
     ) -> Any:
-        """Return `read_wheel` of the fixed point of each wheel."""
+        """Return `evaluate_wheel` of the fixed point of each wheel."""
         arguments = np.asarray(values), np.asarray(states), with_parameter_derivatives
         fixed_points = _find_fixed_points(
             self.model, self.n_legs, self.step_options, self.period_n, *arguments
         )
-        read_batch = functools.partial(_map_over_wheels, read_wheel, self.model, self.n_legs)
-        return map_in_batches(read_batch, self.batch_sizes, arguments[0], fixed_points)
+        evaluate_batch = functools.partial(
+            _map_over_wheels, evaluate_wheel, self.model, self.n_legs
+        )
+        return map_in_batches(evaluate_batch, self.batch_sizes, arguments[0], fixed_points)
 
-    def take_step(self, params: WheelParams, x: Array) -> AbstractStep:
+    def take_step(self, params: WheelParams, section_state: Array) -> AbstractStep:
         value_columns, model = np.asarray(self.model.parameter_values(params))[:, None], self.model
-        arguments = value_columns, np.asarray(x)[None], model, self.step_options, self.n_legs
+        arguments = (
+            value_columns,
+            np.asarray(section_state)[None],
+            model,
+            self.step_options,
+            self.n_legs,
+        )
         return _remove_batch_axis(step_batch_with_jacobian(*arguments, ())[0])
 
     def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
@@ -173,29 +188,30 @@ class UnilateralFinder(AbstractReturnMapFinder):
 
 
 def _add_batch_axis(x: Array) -> Array:
-    """Add a batch axis of length one, by numpy because JAX compiles a program for each shape."""
+    """Return the array with a batch axis of length one, added by NumPy because JAX compiles a
+    program for each shape.
+    """
     return jax.device_put(np.asarray(x)[None])
 
 
 def _remove_batch_axis(tree: Any) -> Any:
-    """Return the first row of every leaf: the inverse of `_add_batch_axis`."""
+    """Return the first entry of every leaf, the inverse of `_add_batch_axis`."""
     return jax.device_put(take_rows(tree, 0))
 
 
 class _FixedPoints(NamedTuple):
-    """Result of Newton's method; with a leading axis for many wheels."""
+    """Result of Newton's method; for many wheels with a leading axis."""
 
     x: Any  # section state
-    steps: Any  # from that state, (period_n, ...)
-    step_jacobians: Any  # derivatives with respect to values and section state
+    steps: Any  # steps from that state, (period_n, ...)
+    step_jacobians: Any  # derivatives of the steps with respect to values and section state
     residual: Any
     converged: Any
     n_iterations: Any
 
 
 class PeriodMap(NamedTuple):
-    """Map over one period of each wheel for Newton's method, evaluated by the batched engine
-    outside jit."""
+    """Map over one period of each wheel, evaluated by the batched engine outside of `jax.jit`."""
 
     model: Any
     n_legs: int
@@ -212,37 +228,56 @@ class PeriodMap(NamedTuple):
         return self._replace(values=self.values[indices])
 
     def evaluate_period(
-        self, options: StepOptions, x: np.ndarray, value_mask: Any = True, start_mask: bool = True
+        self,
+        options: StepOptions,
+        section_states: np.ndarray,
+        value_mask: Any = True,
+        start_mask: bool = True,
     ) -> "PeriodEvaluation":
-        """Evaluate the period from `x`, with derivatives with respect to the masked values and the
-        section state."""
-        results, (n, m) = [], (self.values.shape[1], x.shape[1])
-        jacobian = np.concatenate([np.zeros((m, n)), np.eye(m)], 1)[None]
-        is_valid = np.ones(len(x), bool)
+        """Return the period from these section states, with derivatives with respect to masked
+        values and the states.
+        """
+        results, (n_values, n_section) = [], (self.values.shape[1], section_states.shape[1])
+        jacobian = np.concatenate([np.zeros((n_section, n_values)), np.eye(n_section)], 1)[None]
+        is_valid = np.ones(len(section_states), bool)
         input_mask = np.concatenate(
-            [np.broadcast_to(value_mask, n), np.broadcast_to(start_mask, m)]
+            [np.broadcast_to(value_mask, n_values), np.broadcast_to(start_mask, n_section)]
         )
         input_indices = np.flatnonzero(input_mask).tolist()
         for _ in range(self.period_n):
-            arguments = self.values.T, x, self.model, options, self.n_legs, input_indices
+            arguments = (
+                self.values.T,
+                section_states,
+                self.model,
+                options,
+                self.n_legs,
+                input_indices,
+            )
             results.append(step_batch_with_jacobian(*arguments))
             step, step_jacobians = results[-1]
             is_valid &= np.asarray(step.outcome) == Outcome.STEPPED
-            x = np.asarray(step.section_state)
+            section_states = np.asarray(step.section_state)
             step_jacobian = np.asarray(step_jacobians.section_state)
-            jacobian = step_jacobian[:, :, n:] @ jacobian
-            jacobian[:, :, :n] += step_jacobian[:, :, :n]
+            jacobian = step_jacobian[:, :, n_values:] @ jacobian
+            jacobian[:, :, :n_values] += step_jacobian[:, :, :n_values]
         steps, stacked_jacobians = (
             jax.tree.map(lambda *leaves: np.stack(leaves, 1), *pair)
             for pair in zip(*results, strict=True)
         )
         return PeriodEvaluation(
-            steps, stacked_jacobians, x, jacobian[:, :, :n], jacobian[:, :, n:], is_valid
+            steps,
+            stacked_jacobians,
+            section_states,
+            jacobian[:, :, :n_values],
+            jacobian[:, :, n_values:],
+            is_valid,
         )
 
 
 class PeriodEvaluation(NamedTuple):
-    """Steps of one period, their Jacobians, the end state, its Jacobians, and which periods end."""
+    """Steps of one period, their Jacobians, the end state, its Jacobians, and which periods are
+    complete.
+    """
 
     steps: Any
     step_jacobians: Any
@@ -251,19 +286,22 @@ class PeriodEvaluation(NamedTuple):
     return_jacobian: np.ndarray
     is_valid: np.ndarray
 
-    def newton_correction(self, x: np.ndarray, return_jacobian: np.ndarray) -> np.ndarray:
-        """Return Newton's correction of x; zeros where no period ends."""
-        correction, is_valid = np.zeros_like(x), self.is_valid
-        matrix = np.eye(x.shape[1]) - return_jacobian[is_valid]
+    def newton_correction(
+        self, section_states: np.ndarray, return_jacobian: np.ndarray
+    ) -> np.ndarray:
+        """Return Newton's correction of the section states; zeros if a period is not complete."""
+        correction, is_valid = np.zeros_like(section_states), self.is_valid
+        matrix = np.eye(section_states.shape[1]) - return_jacobian[is_valid]
         correction[is_valid] = solve_linear_systems(
-            matrix, (self.end_state - x)[is_valid][..., None]
+            matrix, (self.end_state - section_states)[is_valid][..., None]
         )[..., 0]
         return correction
 
 
 def solve_linear_systems(matrix: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
-    """Return `numpy.linalg.solve` of many systems. A singular one gives NaN instead of an error for
-    all."""
+    """Return the solutions of many linear systems; a singular system gives NaN instead of an
+    error for all.
+    """
     try:
         return np.linalg.solve(matrix, right_sides)
     except np.linalg.LinAlgError:
@@ -284,11 +322,12 @@ def _find_fixed_points(
     with_parameter_derivatives: bool,
     newton_options: ContactNewtonOptions = CONTACT_NEWTON_OPTIONS,
 ) -> _FixedPoints:
-    """Return fixed points near `start`. Codes at the end of a section state are those of the image.
+    """Return the fixed points near `start`; codes at the end of a section state are those of its
+    image.
 
     The iteration uses loose steps until corrections are small. Then a step at the tolerance of
     `options` is taken with the same Jacobian. One more step, with all derivatives, yields the gait.
-    If loose steps move away from a state that an exact one hardly changes, all steps are exact.
+    If loose steps move away from a state that an exact step hardly changes, all steps are exact.
     """
     period_map = PeriodMap(model, n_legs, period_n, values)
     loose_tolerances = [
@@ -299,7 +338,7 @@ def _find_fixed_points(
         lambda o: (o.rtol, o.atol), options, jax.device_put(loose_tolerances)
     )
     tolerance, all_wheels = float(newton_tolerance(options)), np.ones(len(values), bool)
-    rough_solution, return_jacobian = _run_newton(
+    loose_solution, return_jacobian = _run_newton(
         period_map,
         loose_options,
         start,
@@ -308,29 +347,32 @@ def _find_fixed_points(
         all_wheels,
         newton_options,
     )
-    is_near = rough_solution.converged
-    x = np.where(is_near[:, None], rough_solution.x, start)
+    is_near = loose_solution.converged
+    section_states = np.where(is_near[:, None], loose_solution.x, start)
     units = period_map.section_units
-    exact_period = period_map.evaluate_period(options, x, False, False)
-    correction = exact_period.newton_correction(x, return_jacobian)
-    x[is_near] += correction[is_near] * (
+    exact_period = period_map.evaluate_period(options, section_states, False, False)
+    correction = exact_period.newton_correction(section_states, return_jacobian)
+    section_states[is_near] += correction[is_near] * (
         np.abs(correction / units)[is_near].max(-1, keepdims=True) < newton_options.near_correction
     )
     is_near = is_near | (
         exact_period.is_valid
-        & (np.abs((exact_period.end_state - x) / units).max(-1) < newton_options.near_correction)
+        & (
+            np.abs((exact_period.end_state - section_states) / units).max(-1)
+            < newton_options.near_correction
+        )
     )
     solution, _ = _run_newton(
         period_map,
         options,
-        x,
+        section_states,
         with_parameter_derivatives,
         tolerance,
         is_near,
         newton_options,
         stops_at_small_correction=False,
     )
-    return solution._replace(n_iterations=rough_solution.n_iterations + 1 + solution.n_iterations)
+    return solution._replace(n_iterations=loose_solution.n_iterations + 1 + solution.n_iterations)
 
 
 def _run_newton(
@@ -339,83 +381,100 @@ def _run_newton(
     start: np.ndarray,
     with_parameter_derivatives: bool,
     tolerance: float,
-    is_wanted: np.ndarray,
+    is_requested: np.ndarray,
     newton_options: ContactNewtonOptions,
     stops_at_small_correction: bool = True,
 ) -> tuple[_FixedPoints, np.ndarray]:
-    """Run Newton's method on the `is_wanted` wheels until corrections are small; return the last
-    Jacobians too.
+    """Run Newton's method on the requested wheels until corrections are small; return the solution
+    and Jacobians.
 
-    A correction after which no period ends is halved. A small correction ends the iteration if
+    A correction after which no period completes is halved. A small correction ends the iteration if
     `stops_at_small_correction` is set. Otherwise another evaluation follows, which gives the gait
-    at the corrected state. It also requires a period that repeats, because the map may jump between
-    the two states where feet dip.
+    at the corrected state. Then a small correction must occur twice in succession, because the map
+    may jump between two states if a foot grazes the ground.
     """
     n_wheels, n_legs = len(start), period_map.n_legs
-    x, last_x, units = start.copy(), start.copy(), period_map.section_units
+    section_states, last_section_states, units = (
+        start.copy(),
+        start.copy(),
+        period_map.section_units,
+    )
     residual, n_iterations = np.full(n_wheels, np.inf), np.zeros(n_wheels, np.int32)
-    is_small, is_found, n_halvings = (np.zeros(n_wheels, dtype) for dtype in (bool, bool, int))
+    has_small_correction, is_found, n_halvings = (
+        np.zeros(n_wheels, dtype) for dtype in (bool, bool, int)
+    )
     return_jacobian = np.zeros((n_wheels, start.shape[1], start.shape[1]))
-    active, stored = np.arange(n_wheels), None
+    active_indices, stored_results = np.arange(n_wheels), None
     for _ in range(newton_options.max_iterations + newton_options.max_halvings):
-        period = period_map.select(active).evaluate_period(
-            options, x[active], with_parameter_derivatives
+        period = period_map.select(active_indices).evaluate_period(
+            options, section_states[active_indices], with_parameter_derivatives
         )
-        if stored is None:
-            stored = jax.tree.map(np.array, (period.steps, period.step_jacobians))
+        if stored_results is None:
+            stored_results = jax.tree.map(np.array, (period.steps, period.step_jacobians))
         for stored_leaf, new_leaf in zip(
-            jax.tree.leaves(stored), jax.tree.leaves(period[:2]), strict=True
+            jax.tree.leaves(stored_results), jax.tree.leaves(period[:2]), strict=True
         ):
-            stored_leaf[active] = new_leaf
-        correction = period.newton_correction(x[active], period.return_jacobian)
-        correction_size = np.abs(correction / units[active]).max(-1)
+            stored_leaf[active_indices] = new_leaf
+        correction = period.newton_correction(
+            section_states[active_indices], period.return_jacobian
+        )
+        correction_size = np.abs(correction / units[active_indices]).max(-1)
         is_valid = period.is_valid & np.isfinite(correction).all(-1)
-        residual[active] = np.abs((period.end_state - x[active]) / units[active]).max(-1)
-        return_jacobian[active] = period.return_jacobian
-        n_iterations[active] += 1
-        is_small_now = is_valid & (correction_size <= tolerance)
+        residual[active_indices] = np.abs(
+            (period.end_state - section_states[active_indices]) / units[active_indices]
+        ).max(-1)
+        return_jacobian[active_indices] = period.return_jacobian
+        n_iterations[active_indices] += 1
+        has_small_correction_now = is_valid & (correction_size <= tolerance)
         is_done = (
-            is_small_now
+            has_small_correction_now
             & (
-                is_small[active]
+                has_small_correction[active_indices]
                 | (correction_size <= newton_options.clear_convergence_factor * tolerance)
             )
             & (not stops_at_small_correction)
         )
-        is_small[active] = is_small_now
-        moving_indices = active[is_valid & ~is_done]
-        last_x[moving_indices], n_halvings[moving_indices] = x[moving_indices], 0
-        x[moving_indices] += correction[is_valid & ~is_done]
-        bad_indices = active[~is_valid]
-        x[bad_indices] = 0.5 * (x[bad_indices] + last_x[bad_indices])
-        n_halvings[bad_indices] += 1
-        x[bad_indices, -n_legs:] = last_x[bad_indices, -n_legs:]
-        is_found[active] = is_wanted[active] & (
-            is_small[active] if stops_at_small_correction else is_done
+        has_small_correction[active_indices] = has_small_correction_now
+        moving_indices = active_indices[is_valid & ~is_done]
+        last_section_states[moving_indices], n_halvings[moving_indices] = (
+            section_states[moving_indices],
+            0,
         )
-        is_lost = (
+        section_states[moving_indices] += correction[is_valid & ~is_done]
+        failed_indices = active_indices[~is_valid]
+        section_states[failed_indices] = 0.5 * (
+            section_states[failed_indices] + last_section_states[failed_indices]
+        )
+        n_halvings[failed_indices] += 1
+        section_states[failed_indices, -n_legs:] = last_section_states[failed_indices, -n_legs:]
+        is_found[active_indices] = is_requested[active_indices] & (
+            has_small_correction[active_indices] if stops_at_small_correction else is_done
+        )
+        has_failed = (
             (n_halvings > newton_options.max_halvings)
             | (n_iterations > newton_options.max_iterations)
-            | ~is_wanted
+            | ~is_requested
         )
-        active = active[~is_found[active] & ~is_lost[active]]
-        if not len(active):
+        active_indices = active_indices[~is_found[active_indices] & ~has_failed[active_indices]]
+        if not len(active_indices):
             break
-    assert stored is not None
-    return _FixedPoints(x, stored[0], stored[1], residual, is_found, n_iterations), return_jacobian
+    assert stored_results is not None
+    return _FixedPoints(
+        section_states, stored_results[0], stored_results[1], residual, is_found, n_iterations
+    ), return_jacobian
 
 
 @eqx.filter_jit
 def _map_over_wheels(
-    read_wheel: Callable,
+    evaluate_wheel: Callable,
     model: AbstractWheel,
     n_legs: int,
     values: Array,
     fixed_points: _FixedPoints,
 ) -> Any:
-    """Return `read_wheel` of each wheel, compiled for the batch."""
+    """Return `evaluate_wheel` of each wheel, compiled for the batch."""
     return eqx.filter_vmap(
-        lambda values, fixed_points: read_wheel(model, n_legs, values, fixed_points)
+        lambda values, fixed_points: evaluate_wheel(model, n_legs, values, fixed_points)
     )(values, fixed_points)
 
 
@@ -442,7 +501,7 @@ def _make_cycle(
 def _make_gait(
     model: AbstractWheel, n_legs: int, values: Array, fixed_points: _FixedPoints
 ) -> Gait:
-    """Return the gait of a fixed point, with derivatives by the implicit function."""
+    """Return the gait of a fixed point, with derivatives by the implicit function theorem."""
     n_values = values.shape[0]
     identity = jnp.eye(fixed_points.x.shape[0], dtype=fixed_points.x.dtype)
     value_jacobian = jnp.zeros((len(identity), n_values), identity.dtype)
@@ -466,7 +525,8 @@ def _make_gait(
     d_step = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1), *d_steps)
 
     cycle = _make_cycle(model, n_legs, values, fixed_points)
-    # The derivative of the Jacobian is unknown: measures of it are not in `differentiable`.
+    # The derivative of the Jacobian is unknown, so measures of the Jacobian are not in
+    # `differentiable_measures`.
     float_fields = eqx.filter(cycle, eqx.is_inexact_array)
     zero_tangents = jax.tree.map(lambda x: jnp.zeros((n_values, *x.shape), x.dtype), float_fields)
     d_cycle = eqx.tree_at(
