@@ -12,7 +12,7 @@ import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.figures.style import format_value_label
-from vrw_jax.simulation.basins import compute_end_shares
+from vrw_jax.simulation.basins import compute_end_fractions
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 RATES = np.linspace(0.4, 3.2, 57)  # rad/s
@@ -36,7 +36,7 @@ def main() -> None:
             format_value_label("theta_touchdown", theta),
         )
         titles.append(", ".join(shown_values))
-        print(damping, compute_end_shares(result), "periods", result.orbit_period.values)
+        print(damping, compute_end_fractions(result), "periods", result.orbit_period.values)
     plots.save(plots.basin_figure(results, titles), folder, "basin")
 
 

@@ -7,7 +7,7 @@ from support.files import assert_netcdf_round_trip
 import vrw_jax as vrw
 from vrw_jax.figures.branch_figures import basin_figure
 from vrw_jax.simulation.attractors import WalkEnds, find_distinct_orbits
-from vrw_jax.simulation.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_shares
+from vrw_jax.simulation.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_fractions
 
 OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 
@@ -35,9 +35,9 @@ def test_the_attractor_is_the_limit_cycle(basins):
 
 
 def test_the_basin_at_200_is_far_smaller_than_at_100(basins):
-    assert compute_end_shares(basins[100.0])["attractor 0"] > 0.9
+    assert compute_end_fractions(basins[100.0])["attractor 0"] > 0.9
     assert (
-        compute_end_shares(basins[200.0])["attractor 0"] < 0.6
+        compute_end_fractions(basins[200.0])["attractor 0"] < 0.6
     )  # half of the 24 starts, one at its edge
 
 

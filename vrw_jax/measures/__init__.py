@@ -1,4 +1,4 @@
-"""The table of measures and margins: names, symbols, units and meanings."""
+"""Table of measures and margins: names, symbols, units and meanings."""
 
 from vrw_jax.measures.provenance import provenance
 from vrw_jax.measures.table import (

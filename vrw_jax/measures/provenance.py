@@ -13,17 +13,22 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 def provenance(
     params: WheelParams, model: object, options: StepOptions
 ) -> dict[str, str | float | int]:
-    """Return the origin of a result: versions, device, number format, tolerances, parameters."""
-    names = ("vrw-jax", "jax", "diffrax", "numpy")
-    values: dict[str, str | float | int] = {
-        f"parameter_{name}": float(getattr(params, name))
-        for name in PARAMETER_NAMES
-        if getattr(params, name).ndim == 0
+    """Return the origin of a result as dataset attributes.
+
+    The attributes are versions, device, number format, tolerances and parameters.
+    """
+    library_names = ("vrw-jax", "jax", "diffrax", "numpy")
+    parameter_attrs: dict[str, str | float | int] = {
+        f"parameter_{library_name}": float(getattr(params, library_name))
+        for library_name in PARAMETER_NAMES
+        if getattr(params, library_name).ndim == 0
     }
-    return values | {
+    return parameter_attrs | {
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
-        "versions": ", ".join(f"{name} {_installed_version(name)}" for name in names)
+        "versions": ", ".join(
+            f"{library_name} {_installed_version(library_name)}" for library_name in library_names
+        )
         + f", python {platform.python_version()}",
         "device": jax.devices()[0].device_kind,
         "dtype": str(params.damping.dtype),
@@ -34,9 +39,9 @@ def provenance(
 
 
 @functools.cache  # Reading the metadata takes longer than the steps of a walk.
-def _installed_version(name: str) -> str:
-    """Return the version of an installed library."""
+def _installed_version(library_name: str) -> str:
+    """Return the version of an installed library, or "not installed"."""
     try:
-        return importlib.metadata.version(name)
+        return importlib.metadata.version(library_name)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"

@@ -1,7 +1,7 @@
 """Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
 
 Every labeled result takes its units and long names from here, so that scans, trajectories and
-figures use the same names. Frame: x downhill along the slope, z normal to it.
+figures use the same names. In the frame, x points downhill along the slope and z is normal to it.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 @dataclass(frozen=True)
 class Measure:
-    """A named quantity.
+    """Quantity with name, unit, symbol and meaning.
 
-    - `unit`: "1" for a pure number;
+    - `unit`: unit of SI, "1" for a pure number;
     - `equation`: number of the paper's equation, "" if there is none;
-    - `dimension`: "leg" if there is one value per leg: for margins of each locked leg 3..n, for
-      `CONTACT_MEASURES` of each leg; otherwise "";
-    - `violation`: clause on what happens if the value is negative, "" if nothing does;
-    - `is_shared`: whether the steps of every model have it;
-    - `is_code`: whether it is a whole number without derivatives;
+    - `dimension`: "leg" if there is one value per leg, otherwise "". Margins have values of the
+      locked legs 3..n, `CONTACT_MEASURES` of every leg;
+    - `violation`: clause on the consequence of a negative value, "" without one;
+    - `is_shared`: whether the steps of every model have the measure;
+    - `is_code`: whether the measure is a whole number without derivatives;
     - `is_ratio`: whether several steps are summarized by the mean, not by the sum.
     """
 
@@ -70,12 +70,15 @@ class Measure:
         return attrs | ({"equation": self.equation} if self.equation else {})
 
     def format_with_unit(self, value: object) -> str:
-        """Return a number with its unit, for a reader."""
+        """Return a number with its unit as text, with six significant digits."""
         return f"{float(np.asarray(value)):.6g} {self.display_unit}".strip()
 
 
 def _make_table(*measures: Measure) -> dict[str, Measure]:
-    """Return the measures by name."""
+    """Return the measures by name.
+
+    Raises `ValueError` if two measures have the same name.
+    """
     table = {measure.name: measure for measure in measures}
     if len(table) != len(measures):
         raise ValueError("Two measures share one name: give each its own.")
@@ -326,7 +329,7 @@ CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphi
 
 
 def flag_attrs(names: Iterable[str]) -> dict[str, object]:
-    """Return the CF attributes of an integer variable whose values 0, 1, ... have names."""
+    """Return the CF attributes of an integer variable whose values 0, 1, ... have these names."""
     names = [name.replace(" ", "_") for name in names]
     return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
 
@@ -340,32 +343,42 @@ def get_measure(name: str) -> Measure:
 
 
 def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[str, xr.Variable]:
-    """Return labeled measures over one dimension, and over `leg` for those of the locked legs."""
-    dims_of = lambda name: (
+    """Return the labeled variables of columns over one dimension, and over `leg` for measures per
+    leg.
+    """
+    select_dimensions = lambda name: (
         (dimension, MEASURES[name].dimension) if MEASURES[name].dimension else dimension
     )
-    return {name: xr.Variable(dims_of(name), x, measure_attrs(name)) for name, x in columns.items()}
+    return {
+        name: xr.Variable(select_dimensions(name), x, measure_attrs(name))
+        for name, x in columns.items()
+    }
 
 
 def locked_leg_coordinate(n_legs: int) -> xr.Variable:
-    """Return the coordinate `leg` of margins of legs 3..n."""
+    """Return the coordinate `leg` of margins of the locked legs 3..n."""
     attrs = {"long_name": "locked leg", "units": "1"}
     return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
 
 
 def describe_violation(name: str) -> str:
-    """Return the event at which a margin or indicator is zero; `name` may end with a leg, "[5]"."""
-    base, _, leg = name.partition("[")
-    if base in STEP_MEASURES and not MEASURES[base].violation:
-        return f"{MEASURES[base].long_name} is zero"
-    if base not in MEASURES or not MEASURES[base].violation:
+    """Return the text of the event at which a margin or indicator is zero.
+
+    The name may end with a leg, as "[5]".
+    """
+    base_name, _, leg_text = name.partition("[")
+    if base_name in STEP_MEASURES and not MEASURES[base_name].violation:
+        return f"{MEASURES[base_name].long_name} is zero"
+    if base_name not in MEASURES or not MEASURES[base_name].violation:
         return name.replace("_", " ")
-    symbol = f"{MEASURES[base].symbol} = 0: " if base in STEP_MEASURES else ""
-    return symbol + MEASURES[base].violation + (f", leg {leg[:-1]}" if leg else "")
+    symbol_text = f"{MEASURES[base_name].symbol} = 0: " if base_name in STEP_MEASURES else ""
+    return (
+        symbol_text + MEASURES[base_name].violation + (f", leg {leg_text[:-1]}" if leg_text else "")
+    )
 
 
 def measure_attrs(name: str) -> dict[str, object]:
-    """Return the attributes of the variable `name`, with flag names of codes."""
+    """Return the attributes of the variable `name`, with flag names for codes."""
     attrs: dict[str, object] = dict(MEASURES[name].attrs)
     if name == "phase":
         attrs |= flag_attrs(PHASE_NAMES)

@@ -1,9 +1,9 @@
 """Gaits that a wheel reaches by walking, also along a parameter from one gait to the next.
 
-No equation is solved for a fixed point. Every gait here is the limit of a walk, so it is stable and
-checks the Newton search independently. The model continues formally if the ground would have to
-pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the c at which λ2⁺
-vanishes; other gaits are unaffected.
+No equation is solved for a fixed point. Every gait here is the limit of a walk, so the gait is
+stable and tests the Newton search independently. The model continues formally if the ground would
+have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the c at which
+λ2⁺ vanishes. Other gaits are unaffected.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclasses.dataclass(frozen=True)
 class SettlingOptions:
-    """When a walk counts as settled in a gait.
+    """Conditions under which a walk counts as settled in a gait.
 
     - `n_steps`: number of steps of a walk, chosen because the slowest gait, c = 70, converges to
       round-off in as many;
@@ -59,14 +59,14 @@ def make_paper_model() -> ViscoelasticWheel:
 
 def replace_parameter(params: WheelParams, name: str, value: float) -> WheelParams:
     """Return the wheel with another value of one parameter."""
-    change: dict[str, Any] = {name: value}
-    return dataclasses.replace(params, **change)
+    replaced_fields: dict[str, Any] = {name: value}
+    return dataclasses.replace(params, **replaced_fields)
 
 
 def walk_into_gait(
     params: WheelParams, x: SectionState, options: SettlingOptions = SETTLING_OPTIONS
 ) -> xr.Dataset:
-    """Return the section states of a walk and their change per step.
+    """Return a dataset of the section states of a walk and their change per step.
 
     `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). `settled`
     is whether the walk reached a period-1 gait: each of the last changes is small enough.
@@ -74,18 +74,22 @@ def walk_into_gait(
     gait_walk = walk(params, x, options.n_steps, model=make_paper_model())
     n_stepped = int(gait_walk.n_stepped)
     states = np.concatenate([gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]])
-    change = np.full(n_stepped + 1, np.nan)
-    change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
+    state_change = np.full(n_stepped + 1, np.nan)
+    state_change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
     outcome = Outcome(int(gait_walk.outcome))
     n_settled_steps = options.n_settled_steps
     last_change = (
-        float(change[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
+        float(state_change[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
     )
     is_settled = outcome == Outcome.STEPPED and last_change < options.max_change
     return xr.Dataset(
         {
             "section_state": (("step", "component"), states),
-            "change": ("step", change, {"units": "1", "long_name": "change since the step before"}),
+            "change": (
+                "step",
+                state_change,
+                {"units": "1", "long_name": "change since the step before"},
+            ),
         },
         {"component": ["theta", "dtheta", "dL1"]},
         {
@@ -104,7 +108,7 @@ def walk_along_parameter(
     """Yield the walk at each of `values` of the parameter `name`, as `walk_into_gait` returns it.
 
     The start is extrapolated from the last two settled gaits. Walks that fail or do not settle are
-    not used for it.
+    not used for this.
     """
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
@@ -124,29 +128,34 @@ def measure_gaits_along(
     x: SectionState,
     on_progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Return the gaits of `walk_along_parameter` with all measures, over the parameter `name`.
+    """Return a dataset of the gaits of `walk_along_parameter` with all measures, over the parameter
+    `name`.
 
     The measures are those of one more step. `settled` is whether the walk reached a period-1 gait,
-    and `change` is the largest change of its last steps. `on_progress` is called with the completed
-    share.
+    and `change` is the largest change of its last steps.
+
+    - `on_progress`: function of the completed fraction.
     """
-    rows: list[dict[str, np.ndarray]] = []
+    measures_by_value: list[dict[str, np.ndarray]] = []
     for value, gait_walk in zip(values, walk_along_parameter(params, name, values, x), strict=True):
         state = gait_walk.section_state.values[-1]
-        result = step(
+        step_result = step(
             replace_parameter(params, name, value), jnp.asarray(state), model=make_paper_model()
         )
-        row = {key: np.asarray(values) for key, values in result.measures().items()}
+        gait_measures = {key: np.asarray(values) for key, values in step_result.measures().items()}
         if gait_walk.outcome != Outcome.STEPPED.name:
-            row["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
-        row["section_state"] = state
-        row["change"] = np.asarray(gait_walk.attrs["last_change"])
-        row["settled"] = np.asarray(bool(gait_walk.settled))
-        rows.append(row)
+            gait_measures["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
+        gait_measures["section_state"] = state
+        gait_measures["change"] = np.asarray(gait_walk.attrs["last_change"])
+        gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
+        measures_by_value.append(gait_measures)
         if on_progress is not None:
-            on_progress(len(rows) / len(values))
+            on_progress(len(measures_by_value) / len(values))
     return _make_dataset(
-        params, name, values, {key: np.stack([r[key] for r in rows]) for key in rows[0]}
+        params,
+        name,
+        values,
+        {key: np.stack([r[key] for r in measures_by_value]) for key in measures_by_value[0]},
     )
 
 
@@ -158,17 +167,17 @@ def _extrapolate_start(
         return x
     if len(states) == 1:
         return jnp.asarray(states[0])
-    ratio = (value - values[-1]) / (values[-1] - values[-2])
-    return jnp.asarray(states[-1] + ratio * (states[-1] - states[-2]))
+    extrapolation_factor = (value - values[-1]) / (values[-1] - values[-2])
+    return jnp.asarray(states[-1] + extrapolation_factor * (states[-1] - states[-2]))
 
 
 def _make_dataset(
     params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
 ) -> xr.Dataset:
     """Return the labeled dataset of columns over the parameter `name`."""
-    data = make_variables({key: columns[key] for key in STEP_MEASURES | MARGIN_MEASURES}, name)
+    variables = make_variables({key: columns[key] for key in STEP_MEASURES | MARGIN_MEASURES}, name)
     change_attrs = {"units": "1", "long_name": "largest change of the last five steps"}
-    data |= {
+    variables |= {
         "section_state": xr.Variable(
             (name, "component"), columns["section_state"], {"long_name": "section state"}
         ),
@@ -185,4 +194,4 @@ def _make_dataset(
     provenance_attrs = provenance(params, make_paper_model(), StepOptions())
     provenance_attrs.pop(f"parameter_{name}")
     attrs = {"title": f"Gaits walked to along {name}"} | provenance_attrs
-    return xr.Dataset(data, coordinates, attrs).sortby(name)
+    return xr.Dataset(variables, coordinates, attrs).sortby(name)

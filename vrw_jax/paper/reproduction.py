@@ -1,4 +1,4 @@
-"""Reproduction of the paper: its figures, and the table of its facts, published and computed.
+"""Reproduction of the paper: its figures, and the table of its published and computed facts.
 
 All gaits are limits of walks from one start; no equation is solved for a fixed point.
 """
@@ -25,14 +25,14 @@ from vrw_jax.simulation import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
 ReproductionProgress = Callable[[float, str], None]
-"""Function that is called with the completed share, 0 to 1, and the present task."""
+"""Function that is called with the completed fraction, 0 to 1, and the name of the present task."""
 
 FIGURE_DAMPINGS = (50.0, 100.0, 200.0)
-"""Damping values of figures 8 and 9, in N s/m."""
+"""Values of damping in figures 8 and 9, N s/m."""
 
 
-def ignore_progress(share: float, task: str) -> None:
-    """Ignore the progress."""
+def ignore_progress(completed_fraction: float, task: str) -> None:
+    """Do nothing with the reported progress."""
 
 
 def walk_into_table_1_gait() -> xr.Dataset:
@@ -41,7 +41,7 @@ def walk_into_table_1_gait() -> xr.Dataset:
 
 
 def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
-    """Return the trajectory of the gait of Table 1 at slope 0.30, for figures 6 and 7."""
+    """Return the trajectory of the gait of Table 1 at slope 0.30 rad, for figures 6 and 7."""
     state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
     return simulate(WheelParams(), state, n_steps, model=make_paper_model())
 
@@ -51,19 +51,22 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
 
     The damping is changed from that of Table 1 by at most 10 N s/m per walk.
     """
-    start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    table_1, gaits = WheelParams(), []
+    start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    table_1_wheel, gaits = WheelParams(), []
     for damping in dampings:
-        start_damping = float(table_1.damping)
-        n = 1 + math.ceil(abs(damping - start_damping) / 10.0)
-        damping_path = np.linspace(start_damping, damping, n).tolist()
-        *_, gait_walk = walk_along_parameter(table_1, "damping", damping_path, start)
+        start_damping = float(table_1_wheel.damping)
+        n_dampings = 1 + math.ceil(abs(damping - start_damping) / 10.0)
+        damping_path = np.linspace(start_damping, damping, n_dampings).tolist()
+        *_, gait_walk = walk_along_parameter(table_1_wheel, "damping", damping_path, start_state)
         if not gait_walk.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
         state = jnp.asarray(gait_walk.section_state.values[-1])
         gaits.append(
             simulate(
-                replace_parameter(table_1, "damping", damping), state, 1, model=make_paper_model()
+                replace_parameter(table_1_wheel, "damping", damping),
+                state,
+                1,
+                model=make_paper_model(),
             )
         )
     return gaits
@@ -72,45 +75,49 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
 def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
     """Return the gaits at each integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
-    start = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    lower_gaits = measure_gaits_along(params, "damping", range(200, 0, -1), start, on_progress)
-    upper_gaits = measure_gaits_along(params, "damping", range(201, 225), start)
+    start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    lower_gaits = measure_gaits_along(
+        params, "damping", range(200, 0, -1), start_state, on_progress
+    )
+    upper_gaits = measure_gaits_along(params, "damping", range(201, 225), start_state)
     return xr.concat(
         [lower_gaits, upper_gaits], "damping", data_vars="minimal", combine_attrs="override"
     )
 
 
 def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evidence:
-    """Compute all walks that the facts and figures use, and return them."""
-    table_1 = WheelParams()
+    """Return all walks that the facts and figures use."""
+    table_1_wheel = WheelParams()
     on_progress(0.0, "walk from the start for Table 1")
     settling_walk = walk_into_table_1_gait()
-    fast_start_walk = walk_into_gait(table_1, jnp.asarray((0.1, 2.0, -0.1)))
+    fast_start_walk = walk_into_gait(table_1_wheel, jnp.asarray((0.1, 2.0, -0.1)))
 
-    task = "gaits along c from 1 to 224"
-    on_progress(0.1, task)
-    damping_branch = measure_gaits_along_damping(lambda share: on_progress(0.1 + 0.5 * share, task))
+    task_name = "gaits along c from 1 to 224"
+    on_progress(0.1, task_name)
+    damping_branch = measure_gaits_along_damping(
+        lambda completed_fraction: on_progress(0.1 + 0.5 * completed_fraction, task_name)
+    )
 
     on_progress(0.65, "gaits at slope 0.10")
-    start = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
+    start_state = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
     slopes = [0.01 * i for i in range(30, 9, -1)]
     medium_damping_wheel, gentle_slope_wheel = (
-        replace_parameter(table_1, "damping", 100.0),
-        replace_parameter(table_1, "slope", 0.10),
+        replace_parameter(table_1_wheel, "damping", 100.0),
+        replace_parameter(table_1_wheel, "slope", 0.10),
     )
-    slope_branch = measure_gaits_along(medium_damping_wheel, "slope", slopes, start)
-    start = jnp.asarray(slope_branch.section_state.sel(slope=0.10, method="nearest").values)
+    slope_branch = measure_gaits_along(medium_damping_wheel, "slope", slopes, start_state)
+    start_state = jnp.asarray(slope_branch.section_state.sel(slope=0.10, method="nearest").values)
     gentle_slope_branch = measure_gaits_along(
-        gentle_slope_wheel, "damping", range(100, 221, 10), start
+        gentle_slope_wheel, "damping", range(100, 221, 10), start_state
     )
     low_dampings = [*range(100, 0, -10), 5, 4]
     gentle_slope_low_damping_branch = measure_gaits_along(
-        gentle_slope_wheel, "damping", low_dampings, start
+        gentle_slope_wheel, "damping", low_dampings, start_state
     )
 
     on_progress(0.7, "trajectories")
     return Evidence(
-        params=table_1,
+        params=table_1_wheel,
         settling_walk=settling_walk,
         table_1_trajectory=simulate_table_1_gait(),
         gaits_by_damping=simulate_gaits_at_dampings(FIGURE_DAMPINGS),
@@ -124,10 +131,12 @@ def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evi
 
 def draw_figures(evidence: Evidence, folder: Path) -> list[Path]:
     """Write figures 6 to 10 as SVG and PNG, and the walk as a GIF, and return the paths."""
-    two_steps = evidence.table_1_trajectory.isel(time=evidence.table_1_trajectory.step.values < 2)
+    two_step_trajectory = evidence.table_1_trajectory.isel(
+        time=evidence.table_1_trajectory.step.values < 2
+    )
     figures = {
         "fig06_gait": plots.gait_panels(evidence.table_1_trajectory),
-        "fig07_sticks": plots.sticks(two_steps),
+        "fig07_sticks": plots.sticks(two_step_trajectory),
         "fig08_scuffing": plots.foot_height(evidence.gaits_by_damping),
         "fig09_rear_force": plots.rear_force(evidence.gaits_by_damping),
         "fig10_indicators": plots.indicators(evidence.damping_branch),
@@ -142,7 +151,9 @@ def reproduce(
 ) -> list[Fact]:
     """Write all figures and the table of facts into `folder`, and return the facts.
 
-    `facts.md` and `facts.csv` hold the table, and `indicators.csv` the numbers of Figure 10.
+    The table is in `facts.md` and `facts.csv`. The numbers of Figure 10 are in `indicators.csv`.
+
+    - `on_progress`: function of the completed fraction and the present task.
     """
     folder = Path(folder)
     evidence = collect_evidence(on_progress)

@@ -1,4 +1,4 @@
-"""Choice of the simplest model that is accurate for a step."""
+"""Selection of the simplest model that is accurate for a step."""
 
 from vrw_jax.selection.ladder import (
     SELECTION_ATTRS,

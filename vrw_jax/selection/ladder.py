@@ -1,9 +1,9 @@
-"""The ladder: a wheel that takes each step by the simplest model whose assumptions hold.
+"""Wheel that takes each step by the simplest model whose assumptions hold ("ladder" of models).
 
-The viscoelastic model takes the step and measures its margins. If one is violated, the unilateral
-model takes the step again. Under `vmap` the choice is made per batch element, and an element for
-which the viscoelastic model holds costs no work in the unilateral model. The rigid model is never
-chosen, because its assumption of rigid legs fails for every finite stiffness.
+The viscoelastic model takes the step and measures its margins. If a margin is violated, the
+unilateral model takes the step again. Under `vmap` the selection is made per batch element. An
+element for which the viscoelastic model holds costs no work in the unilateral model. The rigid
+model is never selected, because its assumption of rigid legs fails for every finite stiffness.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ from vrw_jax.wheel import (
 
 
 class ModelCode(enum.IntEnum):
-    """Code of the model that takes a step. Stores hold these numbers."""
+    """Code of the model that takes a step. Stores contain these numbers."""
 
     RIGID = 0
     VISCOELASTIC = 1
@@ -116,18 +116,19 @@ class ModelChoice(AbstractPrintable):
 
     model_code: Int[Array, ""]
     reason_code: Int[Array, ""]
-    margins: Float[Array, " n_premises"]
+    margins: Float[Array, " n_margins"]
     friction: Scalar
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the printable rows: model, explanation and margins."""
-        reason = np.asarray(self.reason_code)
-        if reason.ndim:
-            n_paper_model = int(np.sum(reason == 0))
+        """Return label and text of model, explanation and margins."""
+        reason_codes = np.asarray(self.reason_code)
+        if reason_codes.ndim:
+            n_paper_wheels = int(np.sum(reason_codes == 0))
             return [
                 (
                     "wheels",
-                    f"{reason.size} in shape {reason.shape}, {n_paper_model} served by the paper's",
+                    f"{reason_codes.size} in shape {reason_codes.shape}, {n_paper_wheels} served "
+                    "by the paper's",
                 )
             ]
         named_margins = zip(SELECTION_MARGINS, np.asarray(self.margins), strict=True)
@@ -138,31 +139,31 @@ class ModelChoice(AbstractPrintable):
         return [("model", type(self.model).__name__), ("reason", self.why), *margins]
 
     def model_selection(self) -> dict[str, Array]:
-        """Return model and reason codes, see `AbstractStep.model_selection`."""
+        """Return the codes of model and reason, see `AbstractStep.model_selection`."""
         return {"rung": self.model_code, "reason": self.reason_code}
 
     @property
     def model(self) -> AbstractWheel:
-        """Chosen model, for one wheel."""
+        """Selected model, for one wheel."""
         if int(self.model_code) == ModelCode.VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
     @property
     def why(self) -> Any:
-        """Reason of the choice as one sentence. A batch has an array of sentences."""
+        """Reason of the selection as one sentence; a batch has an array of sentences."""
         return describe_elements(describe_reason, self.reason_code)
 
 
-def describe_reason(reason: int) -> str:
+def describe_reason(reason_code: int) -> str:
     """Return a reason code of `ModelChoice` as a sentence."""
-    if reason == 0:
+    if reason_code == 0:
         return "The paper's wheel serves: all its margins hold over this step."
-    if reason < 0:
-        return f"The paper's wheel can't step: {Outcome(-reason).meaning}"
-    if reason == REASON_START_NOT_EMBEDDABLE:
+    if reason_code < 0:
+        return f"The paper's wheel can't step: {Outcome(-reason_code).meaning}"
+    if reason_code == REASON_START_NOT_EMBEDDABLE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    return f"The paper's margins break: {list(SELECTION_MARGINS.values())[reason - 1]}."
+    return f"The paper's margins break: {list(SELECTION_MARGINS.values())[reason_code - 1]}."
 
 
 def find_selection_reason(
@@ -171,16 +172,18 @@ def find_selection_reason(
     """Return `ModelChoice.reason_code` of viscoelastic steps, and their margins on the last axis.
 
     - `measures`: measures and outcome of these steps;
-    - `friction_difference`: friction of the ground minus the friction behind `measures`.
+    - `friction_difference`: friction of the ground minus the friction assumed by `measures`.
     """
     margins = [
         measures[name] + (friction_difference if "friction" in name else 0.0)
         for name in SELECTION_MARGINS
     ]
     is_violated = ~(jnp.stack(margins, -1) >= 0.0)
-    first_violated = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
-    outcome = jnp.asarray(measures["outcome"], first_violated.dtype)
-    return jnp.where(outcome == Outcome.STEPPED, first_violated, -outcome), jnp.stack(margins, -1)
+    violated_margin_code = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
+    outcome = jnp.asarray(measures["outcome"], violated_margin_code.dtype)
+    return jnp.where(outcome == Outcome.STEPPED, violated_margin_code, -outcome), jnp.stack(
+        margins, -1
+    )
 
 
 class LadderStep(AbstractContactStep):
@@ -218,6 +221,7 @@ class LadderStep(AbstractContactStep):
     solver_steps: Int[Array, ""]
 
     def model_selection(self) -> dict[str, Array]:
+        """Return the codes of model and reason, see `AbstractStep.model_selection`."""
         return self.choice.model_selection()
 
 
@@ -261,7 +265,7 @@ class LadderWheel(AbstractWheel):
         return self.unilateral_model
 
     def split_ground(self, params: WheelParams, n_steps: int) -> None:
-        """Return None, because the ladder does not support slopes that change."""
+        """Return None, because the ladder does not support changing slopes."""
         return None
 
     def default_start(self, params: WheelParams) -> FullState:
@@ -282,19 +286,19 @@ class LadderWheel(AbstractWheel):
     def choose_model(
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
-        """Return the chosen model, and the step of the viscoelastic model."""
+        """Return the selected model, and the step of the viscoelastic model."""
         paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
         locked_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
-        paper_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_code)
-        is_embeddable = jnp.all(jnp.round(x[4 + 2 * params.n_legs :]) == paper_codes)
+        paper_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_code)
+        is_embeddable = jnp.all(jnp.round(x[4 + 2 * params.n_legs :]) == paper_contact_codes)
         paper_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
-        result = paper_model.take_step(
+        paper_result = paper_model.take_step(
             params, jnp.where(is_embeddable, paper_section_state, jnp.nan), options
         )
         reason_code, margins = find_selection_reason(
-            result.measures(), friction - paper_model.friction
+            paper_result.measures(), friction - paper_model.friction
         )
         reason_code = jnp.where(is_embeddable, reason_code, REASON_START_NOT_EMBEDDABLE).astype(
             jnp.int32
@@ -302,7 +306,7 @@ class LadderWheel(AbstractWheel):
         model_code = jnp.where(
             reason_code == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
         ).astype(jnp.int32)
-        return ModelChoice(model_code, reason_code, margins, friction), result
+        return ModelChoice(model_code, reason_code, margins, friction), paper_result
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
         choice, paper_result = self.choose_model(params, x, options)
@@ -317,7 +321,7 @@ class LadderWheel(AbstractWheel):
                 contact_result.section_state,
             ),
             durations=jnp.where(
-                uses_paper_model, _durations_by_feet(paper_result), contact_result.durations
+                uses_paper_model, _durations_by_loaded_feet(paper_result), contact_result.durations
             ),
             outcome=jnp.where(uses_paper_model, paper_result.outcome, contact_result.outcome),
             solver_steps=paper_result.solver_steps + contact_result.solver_steps,
@@ -341,7 +345,9 @@ class LadderWheel(AbstractWheel):
                 contact_result.section_state,
             ),
             post_impact=select_result(paper_result.post_impact, contact_result.post_impact),
-            durations=select_result(_durations_by_feet(paper_result), contact_result.durations),
+            durations=select_result(
+                _durations_by_loaded_feet(paper_result), contact_result.durations
+            ),
             step_length=select_result(paper_result.step_length, contact_result.step_length),
             energy_impacts=select_result(
                 paper_result.energy.landing + paper_result.energy.stopper,
@@ -359,9 +365,9 @@ class LadderWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        """Return the motion in the form of the unilateral model.
+        """Return the motion of a step in the form of the unilateral model.
 
-        If the viscoelastic model is chosen, no foot slips, and the motion is that of this model.
+        If the viscoelastic model is selected, no foot slips, and the motion is that of this model.
         """
         choice, _ = self.choose_model(params, x, options)
         friction = jnp.where(choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction)
@@ -375,14 +381,14 @@ def _embed_paper_result(
 ) -> FullState:
     """Return the full section state of a viscoelastic step.
 
-    Where the viscoelastic model is not used, it is the state of Table 1's start.
+    If the viscoelastic model is not used, the result is the state of Table 1's start.
     """
     fallback_x = jnp.asarray(PAPER_START, paper_result.section_state.dtype)
     params, x = replace_invalid(uses_paper_model, params, paper_result.section_state, fallback_x)
     return embed_section_state(params.symbols(), x)
 
 
-def _durations_by_feet(paper_result: StepResult) -> Float[Array, "3"]:
+def _durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
     """Return the durations with two loaded feet, with one and with none, s."""
     double_support, *single_support = paper_result.durations
     return jnp.stack(
@@ -391,7 +397,10 @@ def _durations_by_feet(paper_result: StepResult) -> Float[Array, "3"]:
 
 
 def refuse_ladder(model: object, role: str) -> None:
-    """Raise `TypeError` for a ladder where a model with smoothly varying gaits is required."""
+    """Raise `TypeError` for a ladder if a model with smoothly varying gaits is required.
+
+    - `role`: use of the model in the message, such as "tuned".
+    """
     if isinstance(model, LadderWheel | str):
         raise TypeError(
             f"the ladder can't be {role}, since its gaits jump where the model changes: give "

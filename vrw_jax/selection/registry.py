@@ -1,4 +1,4 @@
-"""The registry of models: a new model is added to this list and nowhere else."""
+"""Registry of models: a new model is added to this list and nowhere else."""
 
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
@@ -10,36 +10,42 @@ MODEL_CLASSES: list[type[AbstractWheel]] = [
     UnilateralWheel,
     LadderWheel,
 ]
-"""Classes of all models, in the order in which messages list them; the first is the default."""
+"""Classes of all models, in the order in which messages list them. The first class is the
+default."""
 
 
 def find_model_class(config_name: str) -> type[AbstractWheel]:
     """Return the class of the model with this name in a configuration.
 
-    Raises: KeyError: no model has this name.
+    Raises `KeyError` if no model has this name.
     """
-    return {entry.capabilities.config_name: entry for entry in MODEL_CLASSES}[config_name]
+    return {model_class.capabilities.config_name: model_class for model_class in MODEL_CLASSES}[
+        config_name
+    ]
 
 
 def list_config_names(command: str | None = None, parameter: str | None = None) -> tuple[str, ...]:
-    """Return the names that models have in a configuration.
+    """Return the names of models in a configuration.
 
-    Args:
-        command: list only the models that this command accepts.
-        parameter: list only the models whose motion depends on this parameter.
+    - `command`: command that must accept the model;
+    - `parameter`: parameter on which the model's motion must depend.
     """
     return tuple(
-        entry.capabilities.config_name
-        for entry in MODEL_CLASSES
-        if (command is None or command in entry.capabilities.commands)
-        and (parameter is None or parameter in entry.parameter_names)
+        model_class.capabilities.config_name
+        for model_class in MODEL_CLASSES
+        if (command is None or command in model_class.capabilities.commands)
+        and (parameter is None or parameter in model_class.parameter_names)
     )
 
 
 def describe_models(command: str | None = None, parameter: str | None = None) -> str:
-    """Return the same models as a caller writes them: "vrw.RigidWheel() or "auto"", say."""
-    expressions = [
+    """Return the models of `list_config_names` as a caller writes them, such as `vrw.RigidWheel()
+    or "auto"`.
+    """
+    model_expressions = [
         f'"{name}"' if name == "auto" else f"vrw.{find_model_class(name).__name__}()"
         for name in list_config_names(command, parameter)
     ]
-    return " or ".join([", ".join(expressions[:-1]), expressions[-1]][not expressions[1:] :])
+    return " or ".join(
+        [", ".join(model_expressions[:-1]), model_expressions[-1]][not model_expressions[1:] :]
+    )

@@ -1,4 +1,4 @@
-"""One step, a walk, a trajectory, attractors and basins."""
+"""Simulation of one step, a walk, a trajectory, attractors and basins."""
 
 from vrw_jax.simulation.basins import PRE_TOUCHDOWN_NAMES, basin
 from vrw_jax.simulation.stepping import (

@@ -1,4 +1,6 @@
-"""Basins of attraction: the gait that each start of a grid reaches, or how it fails."""
+"""Basins of attraction: the gait that each start of a grid reaches, or the outcome of its
+failure.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ POST_LANDING_NAMES = ("theta_post_impact", "dtheta_post_impact")
 """Names of the components of a state just after a landing on both feet, in rad, rad/s."""
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
-"""Values of each component of a start, by name; a single number is not an axis."""
+"""Values of each component of a start, by name. A single number is not an axis."""
 
 
 @with_default_settings
@@ -87,65 +89,79 @@ def basin(
     """
     check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
     check_single_wheel(params, "compute one basin after the other")
-    model = check_model(model).fallback_model  # valid for any start
+    model = check_model(model).fallback_model  # The fallback model is valid for any start.
     options = check_options(options)
     options.check_tolerances(np.dtype(params.damping.dtype))
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
-    values = _parse_grid(grid)
-    names = tuple(values)
-    axes = [name for name in names if np.ndim(grid[name]) > 0]
-    shape = tuple(len(values[name]) for name in axes)
-    mesh = np.meshgrid(*values.values(), indexing="ij")
-    points = np.stack([m.ravel() for m in mesh], -1)
-    starts = points if names == PRE_TOUCHDOWN_NAMES else _invert_landing(params, points)
+    axis_values = _parse_grid(grid)
+    component_names = tuple(axis_values)
+    axis_names = [
+        component_name for component_name in component_names if np.ndim(grid[component_name]) > 0
+    ]
+    grid_shape = tuple(len(axis_values[component_name]) for component_name in axis_names)
+    grid_coordinates = np.meshgrid(*axis_values.values(), indexing="ij")
+    grid_points = np.stack([m.ravel() for m in grid_coordinates], -1)
+    starts = (
+        grid_points
+        if component_names == PRE_TOUCHDOWN_NAMES
+        else _invert_landing(params, grid_points)
+    )
     is_reachable = np.isfinite(starts).all(-1)
     starts = np.where(is_reachable[:, None], starts, np.nan)
-    to_full_state = functools.partial(model.embed_section, params)
-    starts = np.asarray(jax.vmap(to_full_state)(jnp.asarray(starts)))
+    embed_start = functools.partial(model.embed_section, params)
+    starts = np.asarray(jax.vmap(embed_start)(jnp.asarray(starts)))
     walk_ends = walk_until_periodic(params, starts, model, options, max_steps, max_period)
     attractors = find_distinct_orbits(walk_ends)
 
-    data = {
+    walk_variables = {
         "attractor": xr.Variable(
-            axes,
-            attractors.orbit_index.reshape(shape),
+            axis_names,
+            attractors.orbit_index.reshape(grid_shape),
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
-        "outcome": xr.Variable(axes, walk_ends.outcome.reshape(shape), measure_attrs("outcome")),
+        "outcome": xr.Variable(
+            axis_names, walk_ends.outcome.reshape(grid_shape), measure_attrs("outcome")
+        ),
         "steps": xr.Variable(
-            axes,
-            walk_ends.n_steps.reshape(shape),
+            axis_names,
+            walk_ends.n_steps.reshape(grid_shape),
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
-    labels = {
-        name: xr.Variable(
-            (name,) if name in axes else (),
-            values[name] if name in axes else values[name][0],
-            dict(MEASURES[name].attrs),
+    start_coordinates = {
+        component_name: xr.Variable(
+            (component_name,) if component_name in axis_names else (),
+            axis_values[component_name]
+            if component_name in axis_names
+            else axis_values[component_name][0],
+            dict(MEASURES[component_name].attrs),
         )
-        for name in names
+        for component_name in component_names
     }
-    orbits = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
+    orbit_variables = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
     attrs = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
-        "starts": "before touchdown" if names == PRE_TOUCHDOWN_NAMES else "after landing",
+        "starts": "before touchdown" if component_names == PRE_TOUCHDOWN_NAMES else "after landing",
     }
-    return xr.Dataset(data | orbits, labels, attrs | provenance(params, model, options))
+    return xr.Dataset(
+        walk_variables | orbit_variables,
+        start_coordinates,
+        attrs | provenance(params, model, options),
+    )
 
 
 def _parse_grid(grid: StartGrid) -> dict[str, np.ndarray]:
-    """Return the values of each component as an array of one axis.
+    """Return the values of each component as an array with one axis.
 
-    Raises a ValueError unless the grid contains all components of one kind, each a number or an
+    Raises `ValueError` unless the grid contains all components of one kind, each a number or an
     axis of numbers.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
-        if set(grid) == set(names):
+    for component_names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
+        if set(grid) == set(component_names):
             break
     else:
         raise ValueError(
@@ -153,25 +169,29 @@ def _parse_grid(grid: StartGrid) -> dict[str, np.ndarray]:
             f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
             "each a number or an axis."
         )
-    values = {name: np.asarray(check_reals(name, grid[name]), float) for name in names}
-    for name, value in values.items():
+    values = {
+        component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
+        for component_name in component_names
+    }
+    for component_name, value in values.items():
         if value.ndim > 1 or not value.size:
             raise ValueError(
-                f"{name} has shape {value.shape}, but it must be a number, or a list of at least "
-                "one: give one axis of values."
+                f"{component_name} has shape {value.shape}, but it must be a number, or a list "
+                "of at least one: give one axis of values."
             )
-    return {name: np.atleast_1d(value) for name, value in values.items()}
+    return {component_name: np.atleast_1d(value) for component_name, value in values.items()}
 
 
-def _invert_landing(params: WheelParams, points: np.ndarray) -> np.ndarray:
-    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN.
+def _invert_landing(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
+    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+); NaN without
+    one.
 
-    With dL1- = 0 the angular rate after the landing is proportional to that before it.
+    With dL1- = 0, the angular rate after the landing is proportional to the rate before it.
     """
     s = params.symbols()
 
-    def invert_at_point(point: jax.Array) -> jax.Array:
-        theta, target_rate = point[0] + s.alpha, point[1]
+    def invert_at_point(post_landing_state: jax.Array) -> jax.Array:
+        theta, target_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
         landing = transitions.land(
             s, theta, jnp.ones_like(target_rate), jnp.zeros_like(target_rate)
         )
@@ -179,7 +199,7 @@ def _invert_landing(params: WheelParams, points: np.ndarray) -> np.ndarray:
         is_admissible = landing.keeps_rear_foot & (dtheta > 0.0)
         return jnp.where(is_admissible, jnp.stack([theta, dtheta, 0.0 * dtheta]), jnp.nan)
 
-    return np.asarray(jax.vmap(invert_at_point)(jnp.asarray(points)))
+    return np.asarray(jax.vmap(invert_at_point)(jnp.asarray(post_landing_states)))
 
 
 def _make_orbit_variables(
@@ -189,17 +209,19 @@ def _make_orbit_variables(
     model: AbstractWheel,
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
-    """Return states, periods, DLS fractions and least margins of the orbits."""
+    """Return the dataset variables of the orbits: states, periods, DLS fractions and minimum
+    margins.
+    """
     n = len(orbits)
     states = np.full((n, max_period, model.section_size(params)), np.nan)
-    margins = MARGIN_MEASURES if model.section_size(params) == 3 else ()
-    fractions, least_margins = np.zeros(n), {name: np.zeros(n) for name in margins}
+    margin_names = MARGIN_MEASURES if model.section_size(params) == 3 else ()
+    dls_fractions, min_margins = np.zeros(n), {name: np.zeros(n) for name in margin_names}
     for i, orbit in enumerate(orbits):
         states[i, : len(orbit)] = orbit
         measures = measure_orbits(params, orbit, model, options)
-        fractions[i] = measures["duration_dls"].sum() / measures["period"].sum()
-        for name in margins:
-            least_margins[name][i] = measures[name].min()
+        dls_fractions[i] = measures["duration_dls"].sum() / measures["period"].sum()
+        for name in margin_names:
+            min_margins[name][i] = measures[name].min()
     return {
         "orbit_state": xr.Variable(
             ("attractor_index", "orbit_step", "component"),
@@ -212,25 +234,29 @@ def _make_orbit_variables(
             {"units": "1", "long_name": "steps until the orbit repeats"},
         ),
         "orbit_dls_fraction": xr.Variable(
-            "attractor_index", fractions, dict(MEASURES["dls_fraction"].attrs)
+            "attractor_index", dls_fractions, dict(MEASURES["dls_fraction"].attrs)
         ),
         **{
             f"orbit_{name}": xr.Variable(
                 "attractor_index", values, dict(MARGIN_MEASURES[name].attrs)
             )
-            for name, values in least_margins.items()
+            for name, values in min_margins.items()
         },
     }
 
 
-def compute_end_shares(basins: xr.Dataset) -> dict[str, float]:
-    """Return the share of starts by end: "attractor 0", ..., or the name of the outcome."""
+def compute_end_fractions(basins: xr.Dataset) -> dict[str, float]:
+    """Return the fraction of starts for each end: "attractor 0", ..., "unsettled", or an outcome's
+    name.
+    """
     attractors = basins.attractor.values.ravel()
-    codes = basins.outcome.values.ravel()
-    names = [
+    outcome_codes = basins.outcome.values.ravel()
+    end_names = [
         f"attractor {a}"
         if a >= 0
         else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
-        for a, c in zip(attractors, codes, strict=True)
+        for a, c in zip(attractors, outcome_codes, strict=True)
     ]
-    return {name: names.count(name) / len(names) for name in sorted(set(names))}
+    return {
+        end_name: end_names.count(end_name) / len(end_names) for end_name in sorted(set(end_names))
+    }

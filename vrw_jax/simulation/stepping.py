@@ -1,7 +1,7 @@
 """Single steps, the return map, and walks of many steps.
 
 All functions are pure, take a single wheel, and work with `jit`, `vmap` and every mode of
-differentiation. A model compiles its own step once.
+differentiation. A model compiles its step once.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 SectionLike = Array | np.ndarray | Sequence[float]
 """Section state as a caller gives it; `validate_arguments` converts it to an array."""
 ModelLike = AbstractWheel | Literal["auto"]
-"""Model as a caller gives it; "auto" is `LadderWheel()`, the simplest valid model."""
+"""Model as a caller gives it; "auto" means `LadderWheel()`, the simplest valid model."""
 
 
 @with_default_settings
@@ -62,7 +62,8 @@ def paper_start() -> SectionState:
 def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
     """Return the model of an argument: by default the paper's, for "auto" a `LadderWheel`.
 
-    Raise if the argument is no model, or if its friction is an array although that is not allowed.
+    Raises `TypeError` if the argument is no model. Raises `ValueError` if its friction is an array
+    although `allows_arrays` is False.
     """
     if model is None:
         return _make_default_model()
@@ -86,24 +87,30 @@ _make_default_model = functools.cache(ViscoelasticWheel)
 
 
 def check_single_wheel(params: Any, remedy: str) -> None:
-    """Raise unless `params` is a single wheel; `remedy` completes the message."""
+    """Raise `TypeError` or `ValueError` unless `params` is a single wheel.
+
+    - `remedy`: end of the message.
+    """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_single(params, remedy)  # to bind the method takes as long as a step
+    WheelParams.require_single(params, remedy)  # An unbound call is much faster.
 
 
 def check_options(options: StepOptions | None) -> StepOptions:
-    """Return the options, by default `StepOptions()`; raise if they are of another type."""
+    """Return the options, by default `StepOptions()`.
+
+    Raises `TypeError` if the argument has another type.
+    """
     if options is not None:
         check_type(
             "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
         )
-        StepOptions.require_scalars(options)  # to bind the method takes 0.1 ms
+        StepOptions.require_scalars(options)  # An unbound call is faster: binding takes 0.1 ms.
     return _make_default_options(jnp.result_type(float)) if options is None else options
 
 
 @functools.cache
 def _make_default_options(dtype: np.dtype) -> StepOptions:
-    """Return the default options, made once per type and concrete even under a trace."""
+    """Return the default options for a floating type, made once and concrete even under a trace."""
     with jax.ensure_compile_time_eval():
         return StepOptions()
 
@@ -111,7 +118,10 @@ def _make_default_options(dtype: np.dtype) -> StepOptions:
 def check_section_state(
     x: Any, description: str = "the section state", converter: Callable = check_reals
 ) -> Any:
-    """Return the section state that `converter` makes of an argument; raise if it is invalid."""
+    """Return the section state as converted by `converter`.
+
+    Raises an error if the argument is invalid.
+    """
     return converter(
         description,
         x,
@@ -127,17 +137,23 @@ def validate_arguments(
     options: StepOptions | None,
     engine: EngineName = "auto",
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
-    """Return wheel, section state, model and options of one type; raise if one is invalid."""
+    """Return wheel, section state, model and options, all of one floating type.
+
+    Raises `TypeError` or `ValueError` if an argument is invalid.
+    """
     check_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
     model, options = check_model(model), StepOptions.with_engine(check_options(options), engine)
     state = check_section_state(x)
-    size = model.section_size(params)
-    if state.shape == (3,) and size != 3:
+    section_size = model.section_size(params)
+    if state.shape == (3,) and section_size != 3:
         state = model.embed_section(params, state)
-    if state.shape != (size,):
+    if state.shape != (section_size,):
+        longer_shape_text = (
+            "" if section_size == 3 else f", or this model’s own of shape ({section_size},)"
+        )
         raise ValueError(
             f"the section state has shape {state.shape}, but it is (theta-, dtheta-, dL1-), shape "
-            f"(3,){'' if size == 3 else f', or this model’s own of shape ({size},)'}: "
+            f"(3,){longer_shape_text}: "
             "for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
@@ -145,13 +161,13 @@ def validate_arguments(
     dtype = jnp.result_type(state, params.damping)
     StepOptions.check_tolerances(options, dtype)
 
-    def convert(tree: Any) -> Any:
-        """Return the tree with all leaves of the common type."""
+    def convert_dtype(tree: Any) -> Any:
+        """Return the tree with all leaves of the common floating type."""
         if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
             return tree
         return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
 
-    return convert(params), convert(state), model, convert(options)
+    return convert_dtype(params), convert_dtype(state), model, convert_dtype(options)
 
 
 @overload
@@ -288,7 +304,7 @@ class Walk(AbstractPrintable):
 
     @property
     def outcome(self) -> Array:
-        """Return the outcome of the walk: that of the first failed step, or STEPPED."""
+        """Outcome of the walk: that of the first failed step, or STEPPED."""
         last_index = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
@@ -296,11 +312,11 @@ class Walk(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Return how the walk ended, as a sentence; a batch has an array of sentences."""
+        """Description of how the walk ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return names and texts of outcome, steps, start, last state and time."""
+        """Return labels and texts of outcome, steps, start, last state and time."""
         outcome = np.asarray(self.outcome)
         if outcome.ndim:
             return [("walks", format_outcome_counts(outcome, Outcome))]
@@ -325,26 +341,26 @@ def _scan_steps(
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
 
-    def take_gait_step(carry: tuple, ground: StepGround | None) -> tuple:
-        """Return the next carry and one step, which is not taken after a failure."""
+    def advance_walk(carry: tuple, ground: StepGround | None) -> tuple:
+        """Return the next carry and the results of one step, which is not taken after a failure."""
         x, outcome = carry
-        is_walking = outcome == Outcome.STEPPED
+        is_unfinished = outcome == Outcome.STEPPED
         model_and_params = (model, params) if ground is None else model.with_ground(params, ground)
-        advance = model_and_params[0].advance(
-            model_and_params[1], jnp.where(is_walking, x, jnp.nan), options
+        step_result = model_and_params[0].advance(
+            model_and_params[1], jnp.where(is_unfinished, x, jnp.nan), options
         )
-        outcome = jnp.where(is_walking, advance.outcome, outcome)
-        advance = dataclasses.replace(
-            advance,
-            durations=jnp.where(is_walking, advance.durations, 0.0),
+        outcome = jnp.where(is_unfinished, step_result.outcome, outcome)
+        step_result = dataclasses.replace(
+            step_result,
+            durations=jnp.where(is_unfinished, step_result.durations, 0.0),
             outcome=outcome,
-            solver_steps=jnp.where(is_walking, advance.solver_steps, 0),
+            solver_steps=jnp.where(is_unfinished, step_result.solver_steps, 0),
         )
-        return (advance.section_state, outcome), advance
+        return (step_result.section_state, outcome), step_result
 
     carry = (x, jnp.int32(Outcome.STEPPED))
     steps: AdvanceResult
-    _, steps = lax.scan(take_gait_step, carry, ground_per_step, length=n_steps)
+    _, steps = lax.scan(advance_walk, carry, ground_per_step, length=n_steps)
     return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
 
 
@@ -394,7 +410,9 @@ def walk(
         params, x, checked_model, options, engine
     )
     if ground_per_step is not None:
-        ground_per_step = tuple(row.astype(state.dtype) for row in ground_per_step)
+        ground_per_step = tuple(
+            ground_values.astype(state.dtype) for ground_values in ground_per_step
+        )
     return _scan_steps(checked_model, params, state, options, n_steps, ground_per_step)
 
 
@@ -411,7 +429,9 @@ def read_ground(
     ground_per_step = checked_model.split_ground(params, n_steps)
     if ground_per_step is None:
         return checked_model, params, None
-    first_model, _ = checked_model.with_ground(params, tuple(row[0] for row in ground_per_step))
+    first_model, _ = checked_model.with_ground(
+        params, tuple(ground_values[0] for ground_values in ground_per_step)
+    )
     first_slope = jnp.reshape(params.slope, -1)[0]
     first_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_slope)
     return first_model, first_wheel, ground_per_step
@@ -419,7 +439,7 @@ def read_ground(
 
 def _first_ground(ground_per_step: StepGround, dtype: Any) -> StepGround:
     """Return the ground of the first step."""
-    return tuple(row[0].astype(dtype) for row in ground_per_step)
+    return tuple(ground_values[0].astype(dtype) for ground_values in ground_per_step)
 
 
 def walk_toward_gait(
@@ -427,7 +447,7 @@ def walk_toward_gait(
 ) -> Walk:
     """Return a walk toward an attracting gait from the default start of the model.
 
-    - `n_steps`: number of steps; the search that follows needs only a state near the gait.
+    - `n_steps`: number of steps. The search that follows needs only a state near the gait.
     """
     return walk(params, model.default_start(params), n_steps, model=model, options=options)
 

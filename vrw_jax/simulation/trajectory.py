@@ -1,4 +1,4 @@
-"""A walk as a labelled trajectory: motion, forces, energy and points, with units and provenance.
+"""Labelled trajectories of walks: motion, forces, energy and positions, with units and provenance.
 
 In the frame, x points downhill along the slope, z is normal to it, and the origin is the first
 foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a landing.
@@ -104,20 +104,32 @@ def simulate(
     start = checked_model.default_start(params) if x is None else x
     params, x, model, options = validate_arguments(params, start, checked_model, options, engine)
     make_spec = make_contact_spec if model.reports_contacts else make_phase_spec
-    s, wheels, lines = jax.tree.map(float, params).symbols(), [(model, params)], None
+    s, model_and_wheel_by_step, ground_lines = (
+        jax.tree.map(float, params).symbols(),
+        [(model, params)],
+        None,
+    )
     if ground_per_step is not None:
-        rows = zip(*(row.astype(x.dtype) for row in ground_per_step), strict=True)
-        wheels = [model.with_ground(params, row) for row in rows]
+        ground_rows = zip(
+            *(step_ground.astype(x.dtype) for step_ground in ground_per_step), strict=True
+        )
+        model_and_wheel_by_step = [
+            model.with_ground(params, step_ground) for step_ground in ground_rows
+        ]
         slopes = params_with_lines.slope
         slopes = slopes if slopes.ndim else jnp.full(n_steps, slopes)
         slopes = complete_slopes(slopes, n_steps)
-        lines = GroundLines(np.asarray(slopes, float), float(s.Mt * s.g))
-    spec = make_spec(wheels, options, n_samples)
-    sampled_walk = sample_walk(spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), lines)
-    columns = sampled_walk.columns
-    data = make_variables({name: columns[name] for name in spec.variable_names}, "time")
-    for name in filter(columns.__contains__, SELECTION_ATTRS):
-        data[name] = xr.Variable("time", columns[name], SELECTION_ATTRS[name])
+        ground_lines = GroundLines(np.asarray(slopes, float), float(s.Mt * s.g))
+    trajectory_spec = make_spec(model_and_wheel_by_step, options, n_samples)
+    sampled_walk = sample_walk(
+        trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
+    )
+    walk_columns = sampled_walk.columns
+    variables = make_variables(
+        {name: walk_columns[name] for name in trajectory_spec.variable_names}, "time"
+    )
+    for name in filter(walk_columns.__contains__, SELECTION_ATTRS):
+        variables[name] = xr.Variable("time", walk_columns[name], SELECTION_ATTRS[name])
     attrs = {
         "title": f"Walk of the {type(model).__name__}",
         "n_steps": sampled_walk.n_stepped,
@@ -125,33 +137,35 @@ def simulate(
         "outcome_meaning": sampled_walk.outcome.meaning,
         "start": np.asarray(x).tolist(),
     }
-    provenance_attrs = spec.attrs | provenance(params, model, options)
-    if lines is not None:
-        provenance_attrs |= {"frame": UNEVEN_GROUND_FRAME, "slopes": lines.slopes.tolist()}
+    provenance_attrs = trajectory_spec.attrs | provenance(params, model, options)
+    if ground_lines is not None:
+        provenance_attrs |= {"frame": UNEVEN_GROUND_FRAME, "slopes": ground_lines.slopes.tolist()}
         del provenance_attrs["parameter_slope"]
-    coordinates = {name: data.pop(name) for name in ("step", "phase") if name in data}
-    return xr.Dataset(data, spec.coordinates | coordinates, attrs | provenance_attrs)
+    coordinates = {name: variables.pop(name) for name in ("step", "phase") if name in variables}
+    return xr.Dataset(
+        variables, trajectory_spec.coordinates | coordinates, attrs | provenance_attrs
+    )
 
 
 class SampledStep(NamedTuple):
-    """One step, sampled in each interval between two events."""
+    """Samples of one step, in each interval between two events."""
 
     columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
-    durations: np.ndarray  # of each interval, s; 0 if it did not occur
+    durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
     outcome: Outcome
     next_section_state: Array  # section state at the end of the step
     period: float  # s
-    step_length: float  # from this landing to the next, along the line of double support, m
-    rise: float  # the same normal to that line, m; 0 on flat ground
+    step_length: float  # distance of the landings along the step's line, m
+    normal_rise: float  # the same normal to that line, m; 0 on flat ground
 
 
 class TrajectorySpec(NamedTuple):
-    """Specification of a trajectory: how a model samples a step, and the variables."""
+    """Specification of a trajectory: the sampling function of a model, and the variables."""
 
-    sample_step: Callable[[Array, int], SampledStep]  # from a section state and the step's number
-    variable_names: tuple[str, ...]  # measures over time
-    slope_position_names: tuple[str, ...]  # those that are positions along the slope
-    coordinates: dict[str, Any]  # coordinates that are not among the names
+    sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
+    variable_names: tuple[str, ...]  # names of the measures over time
+    slope_position_names: tuple[str, ...]  # names of the positions along the slope
+    coordinates: dict[str, Any]  # coordinates besides the variables
     attrs: dict[str, object]
 
 
@@ -175,33 +189,34 @@ UNEVEN_GROUND_FRAME = (
 
 
 class GroundLines(NamedTuple):
-    """The lines of uneven ground, with the weight of the wheel."""
+    """Lines of uneven ground, with the weight of the wheel."""
 
     slopes: np.ndarray  # rad
     weight: float  # N
 
-    def to_walk_frame(
+    def convert_to_walk_frame(
         self,
         columns: dict[str, np.ndarray],
         position_names: Sequence[str],
         k: int,
         foothold: np.ndarray,
     ) -> None:
-        """Convert positions and energies of step k, in place, from its own frame to that of line 0.
+        """Convert positions (m) and energies (J) of step k, in place, from its frame to that of
+        line 0.
 
         - `position_names`: columns that are positions along the slope;
         - `foothold`: position of the first foot of step k in the frame of line 0, m.
         """
         for name in position_names:
             normal_name = f"{name[:-1]}z"
-            x, z = self.rotate(k, columns[name], columns[normal_name])
+            x, z = self.rotate_to_line_0(k, columns[name], columns[normal_name])
             columns[name], columns[normal_name] = x + foothold[0], z + foothold[1]
         slope = self.slopes[0]
         height = foothold[1] * np.cos(slope) - foothold[0] * np.sin(slope)
         for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
             columns[name] = columns[name] + self.weight * height
 
-    def rotate(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
+    def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
         """Return the components in the frame of line 0 of a vector in the frame of line k."""
         angle = self.slopes[k] - self.slopes[0]
         sin, cos = np.sin(angle), np.cos(angle)
@@ -209,65 +224,72 @@ class GroundLines(NamedTuple):
 
 
 def sample_walk(
-    spec: TrajectorySpec,
+    trajectory_spec: TrajectorySpec,
     x: Array,
     n_steps: int,
     downslope_weight: float,
-    lines: GroundLines | None = None,
+    ground_lines: GroundLines | None = None,
 ) -> SampledWalk:
     """Return the samples of a walk from the section state x, which ends at the first failure.
 
-    Positions along the slope, m, are measured from the first landing. Energies of
+    Positions along the slope, m, are measured from the first landing. The energies in
     `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight`, N, times the traveled distance. On
-    uneven ground `GroundLines.to_walk_frame` replaces both.
+    uneven ground, `GroundLines.convert_to_walk_frame` replaces both conversions.
     """
-    parts: list[dict[str, np.ndarray]] = []
-    outcome, n_stepped, time, position = Outcome.STEPPED, 0, 0.0, 0.0
+    columns_by_step: list[dict[str, np.ndarray]] = []
+    outcome, n_stepped, start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
     foothold = np.zeros(2)
     while outcome == Outcome.STEPPED and n_stepped < n_steps:
-        sampled_step = spec.sample_step(x, n_stepped)
-        has_occurred, part = sampled_step.durations > 0.0, dict[str, np.ndarray]()
+        sampled_step = trajectory_spec.sample_step(x, n_stepped)
+        has_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
         # A full slice copies nothing.
-        selection = slice(None) if has_occurred.all() else has_occurred
+        occurred_selection = slice(None) if has_occurred.all() else has_occurred
         for name, values in sampled_step.columns.items():
-            part[name] = values[selection].reshape(-1, *values.shape[2:])
-        if lines is None:
-            for name in spec.slope_position_names:
-                part[name] = part[name] + position
-            for name in part.keys() & HEIGHT_DEPENDENT_ENERGIES:
-                part[name] = part[name] - downslope_weight * position
+            step_columns[name] = values[occurred_selection].reshape(-1, *values.shape[2:])
+        if ground_lines is None:
+            for name in trajectory_spec.slope_position_names:
+                step_columns[name] = step_columns[name] + traveled_distance
+            for name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+                step_columns[name] = step_columns[name] - downslope_weight * traveled_distance
         else:
-            lines.to_walk_frame(part, spec.slope_position_names, n_stepped, foothold)
-            displacement = lines.rotate(n_stepped, sampled_step.step_length, sampled_step.rise)
+            ground_lines.convert_to_walk_frame(
+                step_columns, trajectory_spec.slope_position_names, n_stepped, foothold
+            )
+            displacement = ground_lines.rotate_to_line_0(
+                n_stepped, sampled_step.step_length, sampled_step.normal_rise
+            )
             foothold = foothold + displacement
-        part["time"] = part["time"] + time
-        part["step"] = np.full(len(part["time"]), n_stepped)
-        parts.append(part)
+        step_columns["time"] = step_columns["time"] + start_time
+        step_columns["step"] = np.full(len(step_columns["time"]), n_stepped)
+        columns_by_step.append(step_columns)
         outcome = sampled_step.outcome
         if outcome == Outcome.STEPPED:
             n_stepped += 1
-            time += sampled_step.period
-            position += sampled_step.step_length
+            start_time += sampled_step.period
+            traveled_distance += sampled_step.step_length
             x = sampled_step.next_section_state
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns = {
+        name: np.concatenate([step_columns[name] for step_columns in columns_by_step])
+        for name in columns_by_step[0]
+    }
     return SampledWalk(columns, n_stepped, outcome)
 
 
 @functools.cache
-def _compile_trace(
+def _compile_step_sampling(
     model: AbstractWheel, structure: Any, n_samples: int
 ) -> Callable[..., Trajectory]:
     """Return the compiled function that samples a step from x and the leaves of its inputs."""
 
-    def trace(x: Array, *leaves: Array) -> Trajectory:
+    def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
         params, options = jax.tree.unflatten(structure, leaves)
         return model.sample_step(params, x, options, n_samples)
 
-    return jax.jit(trace)
+    return jax.jit(sample_paper_step)
 
 
 def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
+    """Return the columns of a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
 
     Positions are relative to the foot of Leg 1. The columns `landing_foot_x` and `landing_foot_z`
     are added: the position of the foot of the leg that lands next, m.
@@ -277,17 +299,17 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
     motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     rear_leg = rear_direction(s, motion.sin, motion.cos)
-    hub_x, hub_z, zero = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
+    hub_x, hub_z, zeros = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
     landing_leg = landing_direction(s, motion.sin, motion.cos)
     return {
         "time": np.array(trajectory.time),
-        "x": zero,
-        "z": zero,
+        "x": zeros,
+        "z": zeros,
         "theta": theta,
         "L1": L1,
         "L2": L2,
-        "dx": zero,
-        "dz": zero,
+        "dx": zeros,
+        "dz": zeros,
         "dtheta": dtheta,
         "dL1": dL1,
         "dL2": dL2,
@@ -297,8 +319,8 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
         "elastic_energy": elastic,
         "total_energy": kinetic + gravitational + elastic,
         "damping_power": damping_power(s, motion),
-        "foot_1_x": zero,
-        "foot_1_z": zero,
+        "foot_1_x": zeros,
+        "foot_1_z": zeros,
         "foot_2_x": hub_x - L2 * rear_leg.sin,
         "foot_2_z": hub_z - L2 * rear_leg.cos,
         "hub_x": hub_x,
@@ -312,26 +334,28 @@ StepWheels = list[tuple[Any, WheelParams]]
 """Model and wheel of each step, or one pair for all steps."""
 
 
-def make_phase_spec(wheels: StepWheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
-    """Return the specification of a model whose steps have the paper's phases."""
+def make_phase_spec(
+    model_and_wheel_by_step: StepWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpec:
+    """Return the specification of a trajectory for a model whose steps have the paper's phases."""
 
     def prepare_step(model: AbstractWheel, params: WheelParams) -> tuple:
         leaves, structure = jax.tree.flatten((params, options))
         s = jax.tree.map(float, split_slopes(params)[0]).symbols()
-        return s, _compile_trace(model, structure, n_samples), leaves
+        return s, _compile_step_sampling(model, structure, n_samples), leaves
 
-    prepared_steps = [prepare_step(*wheel) for wheel in wheels]
+    prepared_steps = [prepare_step(*model_and_wheel) for model_and_wheel in model_and_wheel_by_step]
 
-    def sample_step(x: Array, k: int) -> SampledStep:
-        s, trace, leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
-        trajectory = trace(x, *leaves)
+    def sample_paper_step(x: Array, k: int) -> SampledStep:
+        s, sample_states, leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
+        trajectory = sample_states(x, *leaves)
         columns, durations = _make_columns(s, trajectory), np.asarray(trajectory.durations)
         landing_foot = columns.pop("landing_foot_x"), columns.pop("landing_foot_z")
         columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
-        phases_occurred = np.flatnonzero(durations > 0.0)
-        step_length, rise = 0.0, 0.0
-        if phases_occurred.size:
-            step_length, rise = (float(x[phases_occurred[-1], -1]) for x in landing_foot)
+        occurred_phases = np.flatnonzero(durations > 0.0)
+        step_length, normal_rise = 0.0, 0.0
+        if occurred_phases.size:
+            step_length, normal_rise = (float(x[occurred_phases[-1], -1]) for x in landing_foot)
         return SampledStep(
             columns,
             durations,
@@ -339,18 +363,20 @@ def make_phase_spec(wheels: StepWheels, options: StepOptions, n_samples: int) ->
             trajectory.section_state,
             float(durations.sum()),
             step_length,
-            rise,
+            normal_rise,
         )
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
         "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
     }
-    return TrajectorySpec(sample_step, tuple(TRAJECTORY_MEASURES), PHASE_SLOPE_POSITIONS, {}, attrs)
+    return TrajectorySpec(
+        sample_paper_step, tuple(TRAJECTORY_MEASURES), PHASE_SLOPE_POSITIONS, {}, attrs
+    )
 
 
 PHASE_SLOPE_POSITIONS = ("x", "foot_1_x", "foot_2_x", "hub_x")
-"""Columns that are positions along the slope."""
+"""Names of the columns that are positions along the slope."""
 
 
 CONTACT_MOTION_NAMES = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
@@ -361,13 +387,13 @@ CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energ
 def _make_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """Return the samples of a step and its quantities, shape (phase, sample[, leg])."""
-    s, trace = params.symbols(), model.sample_step(params, x, options, n_samples)
+    """Return the trajectory of a step and its columns, shape (phase, sample[, leg])."""
+    s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
-    def describe(y: PackedState) -> dict[str, Array]:
-        """Return positions, rates and energies of one state."""
+    def compute_state_quantities(y: PackedState) -> dict[str, Array]:
+        """Return positions (m), rates and energies (J) of one state by column name."""
         motion, _ = unpack_state(y)
-        legs = leg_directions(s, motion.theta)
+        directions = leg_directions(s, motion.theta)
         gravitational, elastic = potential_energy(s, motion)
         return {
             "hub_x": motion.x,
@@ -379,55 +405,63 @@ def _make_contact_columns(
             "elastic_energy": elastic,
             "length": motion.L,
             "length_rate": motion.dL,
-            "foot_x": foot_positions(motion, legs),
-            "foot_z": foot_heights(motion, legs),
+            "foot_x": foot_positions(motion, directions),
+            "foot_z": foot_heights(motion, directions),
         }
 
-    columns = jax.vmap(jax.vmap(describe))(trace.state)
-    return trace, columns | {"tangential": trace.tangential, "normal": trace.normal}
+    columns = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
+    return trajectory, columns | {"tangential": trajectory.tangential, "normal": trajectory.normal}
 
 
-def make_contact_spec(wheels: StepWheels, options: StepOptions, n_samples: int) -> TrajectorySpec:
-    """Return the specification of a model with unilateral contact, over time and leg.
+def make_contact_spec(
+    model_and_wheel_by_step: StepWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpec:
+    """Return the specification of a trajectory for a model with unilateral contact, over time and
+    leg.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
     including both ends. For a `LadderWheel`, the variables `rung` and `reason` give the model used
-    at each time and the cause (see `ModelChoice`).
+    at each time and the reason (see `ModelChoice`).
     """
 
-    frictions = [float(model.friction) for model, _ in wheels]
-    n_legs = wheels[0][1].n_legs
+    frictions = [float(model.friction) for model, _ in model_and_wheel_by_step]
+    n_legs = model_and_wheel_by_step[0][1].n_legs
 
-    def sample_step(x: Array, k: int) -> SampledStep:
-        wheel = wheels[k if len(wheels) > 1 else 0]
-        trace, columns = jax.tree.map(
-            np.array, _make_contact_columns(*wheel, x, options, n_samples)
+    def sample_contact_step(x: Array, k: int) -> SampledStep:
+        model_and_wheel = model_and_wheel_by_step[k if len(model_and_wheel_by_step) > 1 else 0]
+        trajectory, columns = jax.tree.map(
+            np.array, _make_contact_columns(*model_and_wheel, x, options, n_samples)
         )
-        shape = (len(trace.duration), n_samples)
-        repeat_over_samples = lambda legs: np.repeat(legs[:, None], n_samples, axis=1)
-        columns |= {"time": trace.time, "contact": repeat_over_samples(trace.contact)}
+        sample_shape = (len(trajectory.duration), n_samples)
+        repeat_over_samples = lambda values_by_leg: np.repeat(
+            values_by_leg[:, None], n_samples, axis=1
+        )
+        columns |= {"time": trajectory.time, "contact": repeat_over_samples(trajectory.contact)}
         columns |= {
-            name: np.full(shape, int(value)) for name, value in trace.model_selection.items()
+            name: np.full(sample_shape, int(value))
+            for name, value in trajectory.model_selection.items()
         }
-        columns["on_stopper"] = repeat_over_samples(trace.locked)
-        intervals_occurred = np.flatnonzero(trace.duration > 0.0)
-        rise = 0.0
-        if intervals_occurred.size:  # height of the foremost foot, which has landed
-            rise = float(columns["foot_z"][intervals_occurred[-1], -1, -1])
+        columns["on_stopper"] = repeat_over_samples(trajectory.locked)
+        occurred_intervals = np.flatnonzero(trajectory.duration > 0.0)
+        normal_rise = 0.0
+        if occurred_intervals.size:  # The foremost foot has landed.
+            normal_rise = float(columns["foot_z"][occurred_intervals[-1], -1, -1])
         return SampledStep(
             columns,
-            trace.duration,
-            Outcome(int(trace.outcome)),
-            jnp.asarray(trace.section_state),
-            float(trace.duration.sum()),
-            float(trace.step_length),
-            rise,
+            trajectory.duration,
+            Outcome(int(trajectory.outcome)),
+            jnp.asarray(trajectory.section_state),
+            float(trajectory.duration.sum()),
+            float(trajectory.step_length),
+            normal_rise,
         )
 
     attrs: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first landing at the origin",
         "friction": frictions[0] if len(set(frictions)) == 1 else frictions,
     }
-    names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
+    variable_names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
     leg_coordinate = {"leg": np.arange(1, n_legs + 1)}
-    return TrajectorySpec(sample_step, names, ("hub_x", "foot_x"), leg_coordinate, attrs)
+    return TrajectorySpec(
+        sample_contact_step, variable_names, ("hub_x", "foot_x"), leg_coordinate, attrs
+    )

@@ -1,4 +1,4 @@
-"""Rows of the table of facts, the evidence for them, and the comparison of claims with numbers."""
+"""Facts of the table, their evidence, and the comparison of claims with computed numbers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Fact:
     published_value: str
     computed: str
     holds: bool
-    tolerance_reason: str  # reason for the tolerance, or what makes the fact fail
+    tolerance_reason: str  # reason for the tolerance, or condition of failure
 
     @property
     def is_from_reference_code(self) -> bool:
@@ -60,10 +60,10 @@ REFERENCE_CODE_LABEL = "independent code"
 """Source of a number that the paper does not print."""
 
 LAST_DIGIT_REASON = "half a unit of the last digit published"
-"""Reason for the usual tolerance."""
+"""Text of the reason for the usual tolerance."""
 
 SIGN_REASON = "a sign: no tolerance"
-"""Reason for a comparison without a tolerance."""
+"""Text of the reason for a comparison without a tolerance."""
 
 STEP_ERROR_TOLERANCE = 1e-9
 """Tolerance of a number in SI units, chosen as the error of a step at the default options."""
@@ -93,7 +93,7 @@ class ClaimGroup:
     claims: tuple[Claim, ...]
 
     def make_facts(self, evidence: Evidence) -> list[Fact]:
-        """Return the facts of the claims."""
+        """Return the facts of the claims, computed from the evidence."""
         numbers = self.compute_numbers(evidence)
         namespace = SimpleNamespace(**numbers)
         return [
@@ -113,7 +113,10 @@ class ClaimGroup:
 def agrees_within(
     **published_numbers: tuple[float | tuple[float, ...], float],
 ) -> Callable[[Any], bool]:
-    """Return the condition that each named number is within a tolerance of its published value."""
+    """Return a function that tests whether each named number is near its published value.
+
+    - `published_numbers`: published value and tolerance of each number, by name.
+    """
     return lambda n: all(
         bool(np.all(np.abs(np.asarray(getattr(n, name)) - value) <= tolerance))
         for name, (value, tolerance) in published_numbers.items()
@@ -126,5 +129,5 @@ def select_first_step(gait: xr.Dataset) -> xr.Dataset:
 
 
 def split_by_phase(gait: xr.Dataset) -> list[xr.Dataset]:
-    """Return the DLS, SLS-I and SLS-II of a trajectory."""
+    """Return the parts of a trajectory in DLS, SLS-I and SLS-II."""
     return [gait.isel(time=gait.phase.values == phase) for phase in range(len(PHASE_NAMES))]

@@ -23,50 +23,55 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
-    """Return numbers of the gait of Table 1."""
-    step = select_first_step(e.table_1_trajectory)
-    phases = dls, sls1, sls2 = split_by_phase(step)
-    change = e.settling_walk.change.values[1:]
-    shrink = float((change[12] / change[4]) ** (1.0 / 8.0))
-    rear_share = dls.lambda_4.values / (dls.lambda_2.values + dls.lambda_4.values)
-    period = float(step.time[-1] - step.time[0])
-    energy = step.total_energy.values
+    """Return the numbers of the gait of Table 1."""
+    first_step = select_first_step(e.table_1_trajectory)
+    phases = dls, sls1, sls2 = split_by_phase(first_step)
+    state_changes = e.settling_walk.change.values[1:]
+    convergence_ratio = float((state_changes[12] / state_changes[4]) ** (1.0 / 8.0))
+    rear_load_fraction = dls.lambda_4.values / (dls.lambda_2.values + dls.lambda_4.values)
+    period = float(first_step.time[-1] - first_step.time[0])
+    total_energy = first_step.total_energy.values
     count_maxima = lambda x: int(np.sum((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])))
     return {
-        "shrink": shrink,
-        "change": change[-1],
-        "settled": bool(e.settling_walk.settled and shrink < 1.0),
-        "theta": float(step.theta[0]),
-        "dtheta": float(step.dtheta[0]),
+        "shrink": convergence_ratio,
+        "change": state_changes[-1],
+        "settled": bool(e.settling_walk.settled and convergence_ratio < 1.0),
+        "theta": float(first_step.theta[0]),
+        "dtheta": float(first_step.dtheta[0]),
         "period": period,
         "speed": float(e.table_1_trajectory.x[-1] - e.table_1_trajectory.x[0]) / (2.0 * period),
         "share": 100 * float(e.table_1_gait.dls_fraction),
-        "durations": [float(phase.time[-1] - phase.time[0]) for phase in phases],
-        "least_rate": float(step.dtheta.min()),
-        "fore_rate": float(step.dL1.max()),
+        "durations": [
+            float(phase_trajectory.time[-1] - phase_trajectory.time[0])
+            for phase_trajectory in phases
+        ],
+        "least_rate": float(first_step.dtheta.min()),
+        "fore_rate": float(first_step.dL1.max()),
         "rear_rate": min(float(dls.dL2.min()), float(sls1.dL2.min())),
         "rear_length": float(sls1.L2[-1]),
         "off_stopper": abs(float(sls1.L2[-1]) - float(e.params.locked_length)),
-        "load_before": float(step.lambda_2[-1]),
-        "first_rear": 100 * rear_share[0],
-        "most_rear": 100 * rear_share.max(),
-        "last_rear": rear_share[-1],
+        "load_before": float(first_step.lambda_2[-1]),
+        "first_rear": 100 * rear_load_fraction[0],
+        "most_rear": 100 * rear_load_fraction.max(),
+        "last_rear": rear_load_fraction[-1],
         "load_grows": bool((np.diff(dls.lambda_2.values) > 0.0).all()),
         "jump": (float(dls.lambda_2[-1]), float(sls1.lambda_2[0])),
         "tangential": (float(dls.lambda_3[-1]), float(sls1.lambda_3[0])),
-        "peaks": sum(count_maxima(phase.lambda_2.values) for phase in phases),
-        "peak": float(step.lambda_2.max()),
+        "peaks": sum(count_maxima(phase_trajectory.lambda_2.values) for phase_trajectory in phases),
+        "peak": float(first_step.lambda_2.max()),
         "rise": 1e3 * float(np.diff(sls2.foot_2_z.values).min()),
-        "energy_rise": np.diff(energy).max(),
-        "energy_lost": energy[0] - energy[-1],
+        "energy_rise": np.diff(total_energy).max(),
+        "energy_lost": total_energy[0] - total_energy[-1],
     }
 
 
 def _compute_damping_numbers(e: Evidence) -> NumbersByName:
-    """Return numbers of foot height and rear force at three dampings."""
-    gaits = {g.attrs["parameter_damping"]: g for g in e.gaits_by_damping}
-    lowest_heights = {c: float(gaits[c].foot_2_z.min()) for c in sorted(gaits)}
-    first_forces = {c: float(gaits[c].lambda_4[0]) for c in sorted(gaits)}
+    """Return the numbers of foot height and rear force at three values of damping."""
+    gaits_by_damping = {g.attrs["parameter_damping"]: g for g in e.gaits_by_damping}
+    lowest_heights = {
+        c: float(gaits_by_damping[c].foot_2_z.min()) for c in sorted(gaits_by_damping)
+    }
+    first_forces = {c: float(gaits_by_damping[c].lambda_4[0]) for c in sorted(gaits_by_damping)}
     clearance = np.minimum(e.damping_branch.clearance_sls1, e.damping_branch.clearance_sls2)
     is_scuffing = e.damping_branch.settled.values & (clearance.values < 0.0)
     return {
@@ -129,7 +134,7 @@ TYPICAL_GAIT_CLAIMS = ClaimGroup(
           "{peaks}, of {peak:.1f} N", lambda n: n.peaks == 1,
           "smooth maxima of λ2 inside phases; jumps are no peaks"),
     Claim("foot 2 only rises after collision II", "§4 (d), Fig. 8", "ż2 > 0",
-          "least rise between samples {rise:.2f} mm", lambda n: n.rise > 0.0, SIGN_REASON),
+          "least rise between samples {rise:.2f} mm", lambda n: n.normal_rise > 0.0, SIGN_REASON),
     Claim("mechanical energy falls monotonically", "§3.5, eq. (29)", "Ė ≤ 0",
           "largest change between samples {energy_rise:.0e} J, "
           "{energy_lost:.1f} J lost between landings",
@@ -151,40 +156,40 @@ DAMPING_CLAIMS = ClaimGroup("Foot 2 and rear force for three dampings", _compute
 
 
 def _compute_indicator_numbers(e: Evidence) -> NumbersByName:
-    """Return numbers of the indicators along the damping."""
+    """Return the numbers of the double-support indicators along the damping."""
     branch = e.damping_branch
     lower_branch = branch.sel(damping=slice(1.0, 219.0))
     upper_branch = branch.sel(damping=slice(220.0, None))
-    value_at = lambda c, name: float(branch[name].sel(damping=c))
-    impulse = lower_branch.lambda_I4.values
+    branch_value = lambda c, name: float(branch[name].sel(damping=c))
+    branch_impulses = lower_branch.lambda_I4.values
     impulses = np.array(
         [printed.compute_landing(e.params, x).impulse for x in lower_branch.section_state.values]
     )
-    rear = {c: value_at(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
-    walks_on = bool((upper_branch.outcome == Outcome.STEPPED).all())
+    rear_forces = {c: branch_value(c, "lambda_4_plus") for c in (1.0, 218.0, 219.0)}
+    continues_walking = bool((upper_branch.outcome == Outcome.STEPPED).all())
     return {
         "n_settled": int(lower_branch.settled.sum()),
         "n": lower_branch.sizes["damping"],
-        "rear": (rear[1.0], rear[219.0], 2 * rear[219.0] - rear[218.0]),
-        "last_rear": rear[219.0],
+        "rear": (rear_forces[1.0], rear_forces[219.0], 2 * rear_forces[219.0] - rear_forces[218.0]),
+        "last_rear": rear_forces[219.0],
         "rear_falls": bool((np.diff(lower_branch.lambda_4_plus) < 0.0).all()),
-        "fore": (value_at(219.0, "lambda_2_plus"), value_at(1.0, "lambda_2_plus")),
-        "fore_5": value_at(5.0, "lambda_2_plus"),
-        "fore_4": value_at(4.0, "lambda_2_plus"),
+        "fore": (branch_value(219.0, "lambda_2_plus"), branch_value(1.0, "lambda_2_plus")),
+        "fore_5": branch_value(5.0, "lambda_2_plus"),
+        "fore_4": branch_value(4.0, "lambda_2_plus"),
         "fore_grows": bool((np.diff(lower_branch.lambda_2_plus) > 0.0).all()),
-        "least": impulse.min(),
-        "most": impulse.max(),
+        "least": branch_impulses.min(),
+        "most": branch_impulses.max(),
         "fore_impulse": (impulses[:, 1].min(), impulses[:, 1].max()),
         "smallest": [
-            min(value_at(c, name) for name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus"))
+            min(branch_value(c, name) for name in ("lambda_I4", "lambda_2_plus", "lambda_4_plus"))
             for c in (50.0, 100.0, 200.0)
         ],
-        "walks_on": walks_on,
-        "yes_or_no": "yes" if walks_on else "no",
+        "walks_on": continues_walking,
+        "yes_or_no": "yes" if continues_walking else "no",
         "never_settles": not bool(upper_branch.settled.any()),
         "change": float(upper_branch.change.min()),
         "end": float(upper_branch.damping.max()),
-        "share": 100 * value_at(219.0, "dls_fraction"),
+        "share": 100 * branch_value(219.0, "dls_fraction"),
         "too_fast": e.fast_start_walk.outcome,
         "too_fast_ends": str(e.fast_start_walk.outcome).lower().replace("_", " "),
     }
@@ -236,16 +241,18 @@ INDICATOR_CLAIMS = ClaimGroup("DLS indicators over c, slope 0.30 rad", _compute_
 
 
 def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
-    """Return numbers of the assumptions of the model at Table 1."""
+    """Return the numbers that test assumptions of the model at Table 1."""
     gait, step = e.table_1_gait, select_first_step(e.table_1_trajectory)
     dls, *_ = split_by_phase(step)
     natural_length, locked_length = float(e.params.natural_length), float(e.params.locked_length)
     impulses = gait.landing_stopper_impulse.values / float(e.params.leg_mass)
     separation_speeds = np.sort(impulses[impulses < 0.0])
-    impulse = printed.compute_landing(e.params, gait.section_state.values).impulse
+    landing_impulse = printed.compute_landing(e.params, gait.section_state.values).impulse
     needed_friction = np.abs(dls.lambda_3.values[:-1] / dls.lambda_4.values[:-1])
     phases = step.phase.values
-    order = [PHASE_NAMES[int(p)] for p in phases[np.r_[0, np.flatnonzero(np.diff(phases)) + 1]]]
+    phase_order = [
+        PHASE_NAMES[int(p)] for p in phases[np.r_[0, np.flatnonzero(np.diff(phases)) + 1]]
+    ]
     names = ("fore_foot_force", "rear_stopper_force", "energy_lost_landing", "hit_planted_impulse")
     return {name: float(gait[name]) for name in names} | {
         "rear_force": float(dls.lambda_4[:-1].min()),
@@ -254,14 +261,14 @@ def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
         "locked_force": float(gait.locked_stopper_force.min()),
         "preload": float(e.params.stiffness) * (natural_length - locked_length),
         "contraction": locked_length - float(step.L1[1:].max()),
-        "order": " → ".join(order),
-        "back_in_time": order == list(PHASE_NAMES) and float(dls.L2.max()) < locked_length,
+        "order": " → ".join(phase_order),
+        "back_in_time": phase_order == list(PHASE_NAMES) and float(dls.L2.max()) < locked_length,
         "friction_fore": float(np.abs(step.lambda_1 / step.lambda_2).max()),
         "friction_rear": needed_friction[0],
         "friction_last": needed_friction[-1],
         "last_tangential": float(dls.lambda_3[-1]),
-        "in_landing_rear": abs(impulse[2]) / impulse[3],
-        "in_landing_fore": abs(impulse[0]) / impulse[1],
+        "in_landing_rear": abs(landing_impulse[2]) / landing_impulse[3],
+        "in_landing_fore": abs(landing_impulse[0]) / landing_impulse[1],
         "thrown": (separation_speeds[-1], separation_speeds[0])
         if separation_speeds.size
         else (np.nan, np.nan),

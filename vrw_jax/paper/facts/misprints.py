@@ -1,4 +1,4 @@
-"""Misprints of the paper, each with numbers that show it."""
+"""Misprints of the paper, each with numbers that demonstrate the misprint."""
 
 import math
 
@@ -17,12 +17,18 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
-    """Return numbers of the equations as printed and as corrected."""
-    state, library_impulse = e.table_1_gait.section_state.values, float(e.table_1_gait.lambda_I4)
-    landing = printed.compute_landing(e.params, state)
-    reference = printed.differentiate_landing_foot_position(e.params, state)
+    """Return the numbers that compare the equations as printed with the corrected ones."""
+    section_state, library_impulse = (
+        e.table_1_gait.section_state.values,
+        float(e.table_1_gait.lambda_I4),
+    )
+    landing = printed.compute_landing(e.params, section_state)
+    reference_velocity = printed.differentiate_landing_foot_position(e.params, section_state)
     velocity_error = lambda rate: float(
-        np.abs(printed.compute_landing_foot_velocity(e.params, state, rate) - reference).max()
+        np.abs(
+            printed.compute_landing_foot_velocity(e.params, section_state, rate)
+            - reference_velocity
+        ).max()
     )
     gentle_gait = e.slope_branch.sel(slope=0.10, method="nearest")
     is_settled = e.gentle_slope_branch.settled.values
@@ -35,7 +41,7 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
         "here": library_impulse,
         "off": abs(landing.impulse[3] - library_impulse),
         "off_new": velocity_error(0.0),
-        "off_old": velocity_error(float(state[2])),
+        "off_old": velocity_error(float(section_state[2])),
         "slow_settled": bool(gentle_gait.settled),
         "share": 100.0 * float(gentle_gait.dls_fraction),
         "period": float(gentle_gait.period),

@@ -1,4 +1,4 @@
-"""Table of every fact that the paper publishes, with the computed value; each fact can fail."""
+"""Table of every fact that the paper publishes, with the computed value. Each fact can fail."""
 
 import csv
 import itertools
@@ -35,19 +35,19 @@ CLAIM_GROUPS = (
 
 
 def compute_facts(evidence: Evidence) -> list[Fact]:
-    """Return the facts of all groups."""
+    """Return the facts of all groups of claims."""
     return [fact for group in CLAIM_GROUPS for fact in group.make_facts(evidence)]
 
 
 def summarize_facts(facts: Sequence[Fact]) -> str:
-    """Return a sentence on how many facts hold and where their numbers come from."""
-    n, n_by_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
-    sources_text = f"{n - n_by_code} with published numbers, {n_by_code} with independent code"
+    """Return a sentence with the number of facts that hold and the sources of their numbers."""
+    n, n_from_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
+    sources_text = f"{n - n_from_code} with published numbers, {n_from_code} with independent code"
     return f"{sum(fact.holds for fact in facts)} of {n} facts hold: {sources_text}"
 
 
 def format_facts_page(facts: Sequence[Fact]) -> str:
-    """Return the table as a page of Markdown."""
+    """Return the table of facts as a page of Markdown."""
     failed_facts = [fact for fact in facts if not fact.holds]
     lines = [
         "# The paper's facts",
