@@ -1,9 +1,9 @@
 """Gait steps of batches of wheels: one function for several engines.
 
-On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU it is an
-XLA program for very many lanes, and stragglers are run again in smaller batches. In both cases
-every lane runs the same code, and no data pass between lanes. The result of a batch element is
-bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
+On a CPU the "lanes" engine is machine code for a few lanes at a time (`simd`). On a GPU the engine
+is an XLA program for very many lanes, and stragglers are run again in smaller batches. In both
+cases every lane runs the same code, and no data pass between lanes. The result of a batch element
+is bitwise the same alone, in any batch and in any order. Wheels of similar work are placed side by
 side.
 """
 

@@ -7,9 +7,9 @@ fixed number of Newton iterations ("sweeps") with one Jacobian. In the eigenvect
 rule they are two complex systems of the phase's size. In the last interval the duration is also
 corrected, towards the event.
 
-All lanes do the same work. A fixed amount of work does not detect its own errors, so each phase
-returns indicators of its accuracy. These are the last corrections, the residual of the equations of
-motion at each interval's start, which is no node, and the minimum of all guards. A lane that fails
+All lanes do the same work. A fixed amount of work does not detect errors, so each phase returns
+indicators of its accuracy. These are the last corrections, the minimum of all guards, and the
+residual of the equations of motion at each interval's start, which is no node. A lane that fails
 these checks is stepped again by the adaptive engine.
 """
 

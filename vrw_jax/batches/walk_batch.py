@@ -21,7 +21,7 @@ from vrw_jax.wheel import Outcome
 class StepSensitivity(eqx.Module):
     """Derivatives of the end of a walk with respect to its start or a parameter.
 
-    The start, and a parameter that is an array over steps, have their own axis, the last one.
+    The start, and a parameter that is an array over steps, have one more axis, the last one.
     """
 
     section_state: Float[np.ndarray, "lanes section *start"]
@@ -34,16 +34,16 @@ class StepBatchResult(AbstractPrintable):
     Arrays are numpy arrays: the conversion of thousands of values to JAX takes as long as some
     hundred steps.
 
-    - `section_state`: before the next touchdown; zeros if the step failed;
+    - `section_state`: state before the next touchdown; zeros if the step failed;
     - `durations`: of DLS, SLS-I, SLS-II, s; with unilateral contact see its step;
-    - `outcome`: an Outcome; the walk ends at the first that is not STEPPED;
+    - `outcome`: an Outcome. The walk ends at the first outcome that is not STEPPED;
     - `n_stepped`: number of steps that ended in a touchdown;
-    - `solver_steps`: number of solver steps tried, over all steps;
+    - `solver_steps`: number of attempted solver steps, over all steps;
     - `is_collocated`: whether the last step was computed by collocation, in a fixed amount of work;
-    - `solver_index`: index in `solver_names` of the solver of the element; "auto" selects it by
+    - `solver_index`: index of the element's solver in `solver_names`; "auto" selects the solver by
       stiffness;
     - `engine`: "lanes", "diffrax" or "collocation";
-    - `solver_names`: names of solvers; the one of the options is the first;
+    - `solver_names`: names of solvers; the solver of the options is the first;
     - `derivatives`: derivatives by the name of the requested input.
 
     Examples:
@@ -65,7 +65,7 @@ class StepBatchResult(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Description of how each walk ended, as an array of sentences."""
+        """Return how each walk ended, as an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:

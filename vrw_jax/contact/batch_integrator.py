@@ -78,8 +78,8 @@ class IntervalOptions:
     min_iterations_of_initiating_guard: int = 15
     """Number of event iterations after which an initiating guard can be the event."""
     max_roundoff_fall_time: float = 1e-3
-    """Time in which a guard that counts as falling falls by its own round-off. The unit is the
-    wheel's own: seconds for a wheel of Table 1's size."""
+    """Time in which a guard that counts as falling falls by its own round-off. The value is in the
+    wheel's unit of time: seconds for a wheel of Table 1's size."""
     event_time_tolerance_factor: float = 30.0
     """Largest last correction to the time of an event, in tolerances of the step.
 
@@ -249,7 +249,7 @@ def init_interval(
 
     A lane is at an event again if one of its guards falls immediately.
 
-    - `h`: size of the first attempt in the wheel's own unit of time.
+    - `h`: size of the first attempt in the wheel's unit of time.
     """
     point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
     guard_values, guard_rates = (
@@ -378,7 +378,7 @@ class AttemptedStep(NamedTuple):
 def compute_stage_state(
     tableau: ButcherTableau, i: Array | int, q: Array, v: Array, stage_rows: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return coordinates and rates at stage i, from the accelerations of the stages before it.
+    """Return coordinates and rates at stage i, from the accelerations of the earlier stages.
 
     - `h`: step size, s.
     """
@@ -584,7 +584,7 @@ def _search_event(
     options: StepOptions,
     interval_options: IntervalOptions,
 ) -> tuple[EventBracket, _LocatedEvent]:
-    """Return the bracket after one more iteration, and the event if the iteration has located it.
+    """Return the bracket after one more iteration, and the event if the iteration has located one.
 
     The proposed step size is a zero of the guards' parabolas or secants.
     """
@@ -676,10 +676,10 @@ def _is_initiating(state: IntervalState) -> Array:
 def _earliest_minimum_fraction(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
-    """Return the fraction of the step to the earliest negative minimum of a guard inside it; 1
-    without one.
+    """Return the fraction of the step to the earliest negative minimum of a guard; 1 without such a
+    minimum.
 
-    A guard that is positive at both ends may be negative between them: see
+    A guard that is positive at both ends of a step may be negative between them: see
     `integrator.find_guard_minimum`. Initiating guards are not considered.
     """
     has_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
@@ -709,8 +709,8 @@ def _earliest_secant(
     guard's index.
 
     The secants go through the last two attempts, because their ends are as accurate as the
-    integration and inner stages are not. The step size is infinite if no guard falls. The step size
-    is minus infinity if a guard is below zero and no longer falls, because the guard fell before.
+    integration and inner stages are not. The step size is infinite if no guard falls. It is minus
+    infinity if a guard is below zero and does not fall, because the guard fell earlier.
     """
     secant_slope = (guard_values - bracket.guard_values) / jnp.where(
         h == bracket.previous_h, jnp.inf, h - bracket.previous_h

@@ -239,9 +239,11 @@ class _IndependentRates(NamedTuple):
 
     def convert_to_si(self, units: np.ndarray) -> "_IndependentRates":
         """Return the independent rates in SI units, given rates in `units`, (wheels, rates)."""
-        own_units = np.take_along_axis(units, self.indices, 1)
+        independent_rate_units = np.take_along_axis(units, self.indices, 1)
         return self._replace(
-            combination_weights=self.combination_weights * own_units[:, :, None] / units[:, None]
+            combination_weights=self.combination_weights
+            * independent_rate_units[:, :, None]
+            / units[:, None]
         )
 
     def is_independent(self) -> np.ndarray:
@@ -300,7 +302,8 @@ SECTION_STATE_FUNCTIONS: dict[str, Callable[[Symbols, Array], Array]] = {
 def _apply_to_rows(n: int, function_name: str, lane_rows: list[np.ndarray]) -> np.ndarray:
     """Return one of `SECTION_STATE_FUNCTIONS`, evaluated at rows of parameters and section states.
 
-    One program serves any number of wheels. JAX alone would compile a new one for each number.
+    One program is compiled for any number of wheels. JAX alone would compile a new program for each
+    number.
     """
     program = _compile_for_rows(n, function_name, len(lane_rows), lane_rows[0].dtype)
     return np.stack(program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
@@ -331,7 +334,7 @@ def _compile_for_rows(
 def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callable[..., Any]:
     """Return a function of lane-independent numbers and rows, compiled by XLA in blocks of lanes.
 
-    The function serves platforms without machine code.
+    This function is used on platforms without machine code.
     """
     move_axis = lambda results, source, destination: tuple(
         jnp.moveaxis(x, source, destination) for x in results

@@ -1,9 +1,9 @@
 """Contact modes (stick, slip, lift-off) of the feet and stopper states, by enumeration.
 
-Every combination of contact modes and stoppers of the two slots is solved. In an admissible one,
-normal forces push, friction lies in Coulomb's cone and opposes the slip, and open constraints do
-not close. Of several, the one with the most sticking feet is chosen. The same table serves impacts
-(impulses and the velocities after them) and motion (forces and accelerations).
+Every combination of contact modes and stoppers of the two slots is solved. In an admissible
+combination, normal forces push, friction lies in Coulomb's cone and opposes the slip, and open
+constraints do not close. Of several, the one with the most sticking feet is chosen. The same table
+is used for impacts (impulses and the velocities after them) and motion (forces and accelerations).
 
 Infinite friction is the limit of large friction. In Coulomb's law |t| = mu n, a finite t requires n
 = 0. So a sliding foot is carried by friction alone, which acts against the slip. A resting foot
@@ -42,7 +42,7 @@ Friction = Elementwise | SlotPair
 
 
 class ContactMode(IntEnum):
-    """Contact mode of a foot, as it is stored in section states and trajectories."""
+    """Contact mode of a foot. Section states and trajectories contain these numbers."""
 
     OFF = 0  # in the air
     STICK = 1  # at rest on the ground
@@ -647,8 +647,9 @@ def choose_combination(
     - `counts_all_solutions`: whether all admissible combinations are counted; otherwise the search
       ends at the first.
 
-    If there is none, the least violating combination is returned. It counts as a solution if its
-    violation is at most `MAX_VIOLATION`: round-off may close or open two contacts.
+    Without an admissible combination, the least violating one is returned. That combination counts
+    as a solution if its violation is at most `MAX_VIOLATION`: round-off may close or open two
+    contacts.
     """
     evaluate_modes = functools.partial(
         _evaluate_violation,
@@ -747,7 +748,7 @@ def is_release_consistent(
     - `release_direction`: 0 off the ground, 1 downhill, -1 uphill.
 
     The margin of the mode must grow with the acceleration in that direction. If the margin shrinks,
-    the following mode would end before it begins, and the forces jump instead (Painlevé).
+    the next mode would end at once, and the forces jump instead (Painlevé).
     """
     slot_modes, is_held = slot_state
     slot_weights = jnp.stack([~is_second_slot, is_second_slot]).astype(inertia.sin[0].dtype)

@@ -1,7 +1,7 @@
 """Dynamics of the wheel between two events, and the guards that detect the next event.
 
-A *contact state* is the set of contact modes of all feet and of stopper flags of all legs. It is
-constant between two events.
+A *contact state* is the set of contact modes of all feet and of stopper flags of all legs. The
+contact state is constant between two events.
 """
 
 from collections.abc import Iterable
@@ -223,7 +223,7 @@ class GuardLayout(NamedTuple):
 
     @property
     def foremost_landing(self) -> int:
-        """Index of the guard of the foremost foot, whose landing ends a step."""
+        """Return the index of the guard of the foremost foot, whose landing ends a step."""
         return self.stopper - 1
 
 
@@ -337,7 +337,7 @@ def compute_guard_scales(dynamics: ModeDynamics) -> Array:
 
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
-    """Return the wheel's own units of (hub x, z, theta, lengths) and of their rates."""
+    """Return the wheel's units of (hub x, z, theta, lengths) and of their rates."""
     units, dimensionless = compute_wheel_units(s), jnp.ones_like(s.L0)
     position_units = [units.length, units.length, dimensionless, *[units.length] * s.n]
     rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
@@ -349,7 +349,7 @@ def is_wheel_at_rest(
 ) -> Bool[Array, "..."]:
     """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
 
-    - `atol`: absolute tolerance in the wheel's own units.
+    - `atol`: absolute tolerance in the wheel's units.
     """
     rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time
     return is_at_rest(rates, accelerations, rate_units, time_unit, atol)
@@ -379,7 +379,7 @@ def choose_stopping_guard(
 
 
 def compute_packed_units(s: Symbols) -> PackedState:
-    """Return the wheel's own unit of each entry of `pack_state`."""
+    """Return the wheel's unit of each entry of `pack_state`."""
     units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
     accumulator_units = Accumulators(units.time, units.energy, units.energy, units.length)
     packed_units = (

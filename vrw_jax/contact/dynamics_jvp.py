@@ -47,7 +47,7 @@ class ContactConfiguration(NamedTuple):
 
     @property
     def has_fixed_length(self) -> Array:
-        """Whether the length of each leg is fixed by a stopper."""
+        """Return whether the length of each leg is fixed by a stopper."""
         return self.is_airborne_locked | (self.slots.scatter(self.is_held) > 0)
 
 
@@ -334,9 +334,11 @@ def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
 def free_motion_tangent(
     inertia: ContactInverseInertia, leg_motion: LegArray, total_tangent: TotalTangent
 ) -> FreeMotion:
-    """Return the tangent of the motion without contact forces, from that of the residual.
+    """Return the tangent of the motion without contact forces that has the same effect as the
+    residual's.
 
-    Both have the same effect on the forces.
+    - `leg_motion`: tangent of the legs' motion;
+    - `total_tangent`: tangent of the residual, summed over all legs.
     """
     hub_tangent, slot_lengths, (u, v) = (
         apply_inverse(inertia.inverse_inertia, total_tangent.hub),

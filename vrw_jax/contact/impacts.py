@@ -58,7 +58,7 @@ from vrw_jax.wheel import Symbols
 
 
 class Event(NamedTuple):
-    """Kind of an event, with the leg or slot that it concerns: one flag is set."""
+    """Kind of an event. One flag is set, for one leg or slot."""
 
     lands: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
     meets_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
@@ -71,7 +71,7 @@ class Event(NamedTuple):
 
     @property
     def is_impact(self) -> Bool[Array, "..."]:
-        """Whether velocities jump at the event."""
+        """Return whether velocities jump at the event."""
         return jnp.any(self.lands, axis=0) | jnp.any(self.meets_stopper, axis=0)
 
 
@@ -102,7 +102,7 @@ def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
 
 
 class ContactLaw(NamedTuple):
-    """Wheel, ground and contact options that all events of a walk share."""
+    """Wheel, ground and contact options of all events of a walk."""
 
     s: Symbols
     friction: Friction  # of all feet; or of the last landed foot and of the others
@@ -160,8 +160,8 @@ def _solve_stopper_lcp(
     inwards. Pivots first switch all legs of the wrong sign together. Later pivots switch only the
     last of these legs, which prevents cycles. This is principal pivoting, which is finite if no
     friction couples the legs (Murty 1974, Kostreva 1978). If pivoting fails, all combinations are
-    enumerated. The least violating solution is returned. It is admissible if its violation is at
-    most `MAX_VIOLATION`.
+    enumerated. The least violating solution is returned. That solution is admissible if its
+    violation is at most `MAX_VIOLATION`.
     """
     constant_inputs = stop_gradients((law, motion))
     tested_rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
@@ -587,11 +587,10 @@ def _bring_to_rest(
 def _merge_touching(
     law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> Event:
-    """Return the event extended to all contacts that touch, whether or not their own guards are
-    zero.
+    """Return the event extended to all contacts that touch, whether or not their guards are zero.
 
-    A contact touches if it is closer than the smallest resolved bounce and does not separate. If
-    such contacts were resolved one by one, they would push each other off forever.
+    A contact touches if its distance is below the smallest resolved bounce and it does not
+    separate. If such contacts were resolved one by one, they would push each other off forever.
     """
     s, legs = law.s, leg_directions(law.s, motion.theta)
     bounce_height = law.rest_speed**2 / (2.0 * s.g)
@@ -616,8 +615,8 @@ def _liftoff_to_slip(
 ) -> Event:
     """Return the event with lift-off replaced by slip, in the limit of large friction.
 
-    A resting foot whose normal force vanishes begins to slide in the direction that its tangential
-    force no longer resists.
+    A resting foot whose normal force vanishes begins to slide against the direction of its
+    tangential force.
     """
     law, motion = stop_gradients((law, motion))
     slots = find_slots(contact_state.contact_modes != ContactMode.OFF)

@@ -4,9 +4,9 @@ The coordinates are the hub (x, z), the angle theta of Leg 1 and the n leg lengt
 with the hub alone, so the mass matrix is an arrow matrix. Eliminating the legs of free length
 leaves a 3 x 3 system. Up to two *slots* hold the legs whose feet may be loaded. The force on a foot
 has a radial part along u (foot to hub) and a transverse part along e = du/dtheta. Only the
-transverse part acts on the hub. The same equations serve accelerations and, with momenta in place
-of forces, impacts. All functions work elementwise over a batch, on one more axis behind that of the
-legs.
+transverse part acts on the hub. The same equations are used for accelerations and, with momenta in
+place of forces, for impacts. All functions work elementwise over a batch, on one more axis behind
+that of the legs.
 """
 
 import math
@@ -100,7 +100,7 @@ class Slots(NamedTuple):
 
     @property
     def is_filled(self) -> Bool[Array, "n_legs ..."]:
-        """Whether each leg is in a slot."""
+        """Return whether each leg is in a slot."""
         return self.first_mask | self.second_mask
 
     def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
@@ -359,7 +359,7 @@ def free_velocity(
 
 
 class FootVelocity(NamedTuple):
-    """Velocity of the slots' feet along the slope and normal to it, m/s."""
+    """Velocity of the slots' feet along the slope and normal to the slope, m/s."""
 
     x: SlotPair
     z: SlotPair
@@ -368,7 +368,7 @@ class FootVelocity(NamedTuple):
 def foot_velocity(
     motion: WheelMotion, slots: Slots, posture: ContactInverseInertia | Posture
 ) -> FootVelocity:
-    """Return the velocity of the slots' feet along the slope and normal to it, m/s."""
+    """Return the velocity of the slots' feet along the slope and normal to the slope, m/s."""
     dL = slots.gather(motion.dL)
     x = [
         motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
@@ -399,7 +399,7 @@ def foot_heights(
 
 
 def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:
-    """Return the velocity of every foot along the slope and normal to it, m/s."""
+    """Return the velocity of every foot along the slope and normal to the slope, m/s."""
     transverse_velocity = motion.L * motion.dtheta
     tangential_speed = motion.vx - motion.dL * legs.sin - transverse_velocity * legs.cos
     return tangential_speed, motion.vz - motion.dL * legs.cos + transverse_velocity * legs.sin

@@ -28,7 +28,7 @@ def full_section_size(n: int) -> int:
 
 
 def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
-    """Return the wheel's own unit of each entry of a full section state, as a list.
+    """Return the wheel's unit of each entry of a full section state, as a list.
 
     Angles and codes have the unit 1.
     """
@@ -69,7 +69,7 @@ def replace_invalid_start(
     Invalid elements are replaced by the start of Table 1's wheel with a friction of 1. The result
     is (is_valid, parameters, friction, section state).
 
-    - `friction`: coefficient of the ground, invalid if it is negative;
+    - `friction`: coefficient of the ground, invalid if negative;
     - `tilt`: angle by which the next line is steeper, rad. On such uneven ground, feet may be below
       the line that continues the one of the last foothold.
     """
@@ -121,9 +121,10 @@ def _unpack_posture(
 
 
 def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:
-    """Return whether no foot is below the ground, loaded feet are on it, and no leg is too long.
+    """Return whether the feet and leg lengths of a section state are consistent with the ground.
 
-    The tolerance is `PENETRATION_TOLERANCE`.
+    No foot is below the ground, loaded feet are on the ground, and no leg is longer than its
+    stopper allows. The tolerance is `PENETRATION_TOLERANCE`.
     """
     theta, (_, z), L, _, contact_modes, _ = _unpack_posture(s, x)
     foot_height, height_tolerance = (

@@ -2,8 +2,8 @@
 programs.
 
 `build_contact_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes. For
-derivatives, each tangent is a lane of its own beside the wheel's motion. For samples of a step, a
-JAX program advances from event to event and records the start of each interval. Then every interval
+derivatives, each tangent has one lane beside the lane of the motion. For samples of a step, a JAX
+program advances from event to event and records the start of each interval. Then every interval
 becomes a lane that is integrated again, sample by sample.
 """
 

@@ -102,7 +102,7 @@ def process_event(
     max_events: int,
     rest_options: RestOptions = REST_OPTIONS,
 ) -> tuple[EventResult, Event, Int[Array, "..."]]:
-    """Return the result of a guard's event, the event, and the outcome (STEPPED if it was
+    """Return the result of a guard's event, the event, and the outcome (STEPPED if the event was
     resolved).
 
     - `n_events`: number of earlier events in this step, of at most `max_events`.

@@ -1,7 +1,7 @@
 """Tangents of the dynamics along many directions, from the responses to unit coordinates.
 
 The tangent at a point is linear in the direction: a unit of the angle has the same effect in every
-direction. A length and its rate affect only their own leg, the hub and the slots. So legs that do
+direction. A length and its rate affect only the same leg, the hub and the slots. So legs that do
 not move along any direction are skipped, and so are constant input columns.
 """
 
@@ -226,7 +226,7 @@ def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> Con
 
 
 class TangentBasis(NamedTuple):
-    """Quantities at a point that all tangents share.
+    """Quantities at a point that are common to all tangents.
 
     - `all_leg_residual`: function to the residual of all legs along any tangent;
     - `length_responses`: those of the first legs, and those of the others;

@@ -142,7 +142,7 @@ class _EventLoopState(NamedTuple):
 
 
 class UnevenGround(NamedTuple):
-    """Uneven ground: quantities of a step that differ from those of its own landing."""
+    """Quantities of a step on uneven ground, besides the slope and friction of its landing."""
 
     friction: Scalar  # friction coefficient of the feet that landed earlier
     tilt: Scalar  # angle by which the next line is steeper, rad
@@ -167,19 +167,21 @@ def _convert_restitution(value: Any) -> Array | None:
 
 @refuse_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractWheel):
-    """Feet push on the ground and slide by Coulomb's law; no leg has a fixed role.
+    """Model of the wheel whose feet push on the ground and slide by Coulomb's law; no leg has a
+    fixed role.
 
     - `friction`: coefficient of the ground, `inf` for feet that never slide;
-    - `max_events`: largest number of events of one step; after a quarter of them (at least 100),
+    - `max_events`: largest number of events of one step. After a quarter of them (at least 100),
       the rest speed grows with each event;
-    - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays on it until its
-      foot is loaded; with "one-sided", it leaves as soon as the stopper would have to pull;
-    - `restitution`: ratio of a striking foot's speed after to its speed before, as far as energy
-      allows; None has the effect of 0 and compiles to a smaller program;
-    - `infinite_friction_rule`: meaning of infinite friction: the limit of large friction, or with
-      "paper" the rule of the paper, (A1) to (A4), continued to where it stops;
-    - `uneven`: what differs between footholds; `vrw.walk` sets it from slopes and friction
-      over steps.
+    - `stoppers`: with "bilateral", a leg in the air that has met its stopper stays there until its
+      foot is loaded. With "one-sided", the leg leaves as soon as the stopper would have to pull;
+    - `restitution`: ratio of a striking foot's speeds after and before the impact, as far as energy
+      allows. None has the effect of 0 and compiles to a smaller program;
+    - `infinite_friction_rule`: meaning of infinite friction. With "limit" it is the limit of large
+      friction, with "paper" the rule of the paper, (A1) to (A4), continued to where that rule
+      stops;
+    - `uneven`: differences between footholds, which `vrw.walk` sets from slopes and friction over
+      steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -232,12 +234,14 @@ class UnilateralWheel(AbstractWheel):
 
     @property
     def has_one_sided_stoppers(self) -> bool:
-        """Whether stoppers of legs in the air only push, so that they may release their legs."""
+        """Return whether stoppers of legs in the air only push, so that a leg can leave its
+        stopper.
+        """
         return self.stoppers == STOPPERS_ONE_SIDED
 
     @property
     def uses_paper_rule(self) -> bool:
-        """Whether infinite friction means the paper's rule."""
+        """Return whether infinite friction means the paper's rule."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
     def default_start(self, params: WheelParams) -> FullState:

@@ -1,7 +1,7 @@
 """Walks of a batch with unilateral contact, with tangents along many directions.
 
 Events, contacts and step sizes determine the motion and are computed once. At each stage of a
-Runge-Kutta step and at each event, quantities that all tangents share are computed once. Each
+Runge-Kutta step and at each event, quantities common to all tangents are computed once. Each
 tangent then needs only linear operations. The derivatives are those of the discrete flow at the
 accepted step sizes, and of the times of its events: see `integrator.tangents`.
 """

@@ -1,7 +1,8 @@
 """Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
 
 Every labeled result takes its units and long names from here, so that scans, trajectories and
-figures use the same names. In the frame, x points downhill along the slope and z is normal to it.
+figures use the same names. In the frame, x points downhill along the slope and z is normal to the
+slope.
 """
 
 from __future__ import annotations

@@ -338,7 +338,7 @@ def run_batch_phases(
 def can_use_lanes(options: StepOptions) -> bool:
     """Return whether the batch kernel can take the step: machine code and an explicit solver.
 
-    Raises `ValueError` if the options require that engine and it is not available.
+    Raises `ValueError` if the options require the batch kernel and it is not available.
     """
     is_explicit = load_explicit_tableau(options.solver) is not None
     if options.engine == "lanes" and not (is_explicit and simd.is_available()):
@@ -358,7 +358,7 @@ class _StaticConfig(NamedTuple):
 
     @property
     def cache_key(self) -> tuple:
-        """Key of the trace in caches, compared by `repr`."""
+        """Return the key of the trace in caches, compared by `repr`."""
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
     def run_lanes(self, *leaves: Array) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
@@ -553,7 +553,8 @@ def compute_jacobian_columns(
 def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
     """Return for each leaf its part of the unit vectors of all leaves, on the leading axis.
 
-    Each number has its own ones and zeros, so that machine code omits products with zeros.
+    The ones and zeros of each number are separate constants, so that machine code omits products
+    with zeros.
     """
     sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
     unit_vectors, tangents, entry_offset = np.eye(sum(sizes)), [], 0

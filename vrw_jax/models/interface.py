@@ -58,8 +58,9 @@ class AbstractWheel(eqx.Module):
 
     @property
     def fallback_model(self) -> "AbstractWheel":
-        """Model that is valid for any start: the model itself, or the most general one of a
-        ladder.
+        """Return the model that is valid for any start.
+
+        This is the model itself, or the most general model of a ladder.
         """
         return self
 
@@ -150,7 +151,7 @@ class AbstractWheel(eqx.Module):
         return self.section_size(params)
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        """Return the wheel's own unit of each entry of a section state, as a list."""
+        """Return the wheel's unit of each entry of a section state, as a list."""
         return [units.length / units.length, units.rate, units.speed]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:

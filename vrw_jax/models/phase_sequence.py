@@ -1,7 +1,7 @@
 """The paper's step from landing to landing, for any engine that integrates its phases.
 
 An engine provides a `PhaseRunner`, which integrates one phase to its end. This module determines
-which phases take place, where they start, how the step ends and its results. All functions work
+the phases that take place, their starts, the end of the step and its results. All functions work
 elementwise, for one wheel or a batch.
 """
 

@@ -66,11 +66,12 @@ class RigidWheel(AbstractWheel):
     start are ignored. The whole step counts as SLS-II.
 
     - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
-    - `stop_at_lift_off`: end a step where the normal force of the ground would become negative;
-    - `held_landing`: False is the classic landing, whose rear foot leaves without an impulse
-      (angular momentum about the new foot is kept). True is the stiff limit of the paper's own
-      landing (A4), whose rear foot is held during the impulse: the limit of `ViscoelasticWheel`, as
-      docs/explanation/physics.md derives it.
+    - `stop_at_lift_off`: whether a step ends if the normal force of the ground would become
+      negative;
+    - `held_landing`: whether the rear foot is held during the impulse of a landing. False is the
+      classic landing, whose rear foot leaves without an impulse, so that angular momentum about the
+      new foot is constant. True is the stiff limit of the paper's landing (A4), that is, the limit
+      of `ViscoelasticWheel`; docs/explanation/physics.md derives this limit.
 
     Examples:
         >>> params = vrw.WheelParams(slope=0.15)
@@ -362,7 +363,7 @@ class RollingMotion(eqx.Module):
         return state, forces, jnp.stack(dynamics.mechanical_energy(self.s, motion))
 
     def margins_at_angles(self, theta: Array) -> Array:
-        """Return the margins, each at its own angle `theta[i]`.
+        """Return each margin at the angle `theta[i]` of the same index.
 
         The margins are the normal force (N), minus the required friction, and the stopper forces of
         legs 2..n (N).
@@ -442,11 +443,11 @@ def _rolling_time(
     min_rate_squared: Elementwise,
     kappa: Elementwise,
 ) -> Elementwise:
-    """Return the time between two half-angles on one side of the vertical, given by their squares,
-    s.
+    """Return the time between two half-angles on one side of the vertical, s.
 
-    The time is the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)) over t = sin^2,
-    as 2 R_F (DLMF 19.29.4). The result is zero if both ends coincide.
+    The half-angles are given by their squares. The time is the integral of dt / sqrt(t (1 - t)
+    (min_rate_squared + 2 kappa t)) over t = sin^2. Its closed form is 2 R_F (DLMF 19.29.4). The
+    result is zero if both ends coincide.
     """
     is_nonempty = end_angle_squared > begin_angle_squared
     lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)

@@ -44,11 +44,11 @@ class AbstractMeasures(AbstractPrintable):
 
 
 class DoubleSupportIndicators(AbstractMeasures):
-    """The double-limb-support indicators of Section 5.1, for the landing that opens the step.
+    """Indicators of double-limb support of Section 5.1, for the landing that opens the step.
 
     - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
-    - `lambda_2`: normal force of the fore foot just after it, N;
-    - `lambda_4`: normal force of the rear foot just after it, N.
+    - `lambda_2`: normal force of the fore foot just after the landing, N;
+    - `lambda_4`: normal force of the rear foot just after the landing, N.
 
     Examples:
         >>> indicators = vrw.limit_cycle(vrw.WheelParams()).indicators
@@ -85,29 +85,30 @@ class EnergyLoss(AbstractMeasures):
 
 
 class Margins(AbstractMeasures):
-    """Assumptions of the viscoelastic model as signed margins over one step: negative where
-    violated.
+    """Margins of the viscoelastic model's assumptions over one step: negative if violated.
 
     Margins do not affect the motion. Forces and lengths are minima over the step, accurate to the
     integrator's tolerance. A quantity may be zero by construction at the start of a phase: for a
-    foot that leaves the ground, or for Leg 1 landing on its stopper. It then counts from its first
-    later minimum on. Friction margins are the model's `friction` minus the required coefficient.
-    The rear foot's margin is taken just after landing, because it grows without bound as the foot
-    unloads. A phase that did not happen does not count. A step that did not begin has zero margins.
+    foot that leaves the ground, or for Leg 1 landing on its stopper. The quantity then counts from
+    its first later minimum on. Friction margins are the model's `friction` minus the required
+    coefficient. The rear foot's margin is taken just after landing, because it grows without bound
+    as the foot unloads. A phase that did not happen does not count. A step that did not begin has
+    zero margins.
 
     - `fore_foot_force`: lambda_2, N;
-    - `takeoff_acceleration`: of foot 2 normal to the slope at the start of SLS-I, m/s^2; it
-      determines whether the foot rises or scuffs; it is smooth at the boundary of scuffing, where
-      `clearance_sls1` is not;
+    - `takeoff_acceleration`: acceleration of foot 2 normal to the slope at the start of SLS-I,
+      m/s^2. The sign determines whether the foot rises or scuffs. At the boundary of scuffing the
+      value is smooth, and `clearance_sls1` is not;
     - `clearance_sls1`: height of foot 2 in SLS-I, m;
     - `clearance_sls2`: height of foot 2 in SLS-II, m;
-    - `locked_stopper_force`: of legs 3..n on their stoppers, N;
-    - `rear_stopper_force`: of Leg 2 on its stopper in SLS-II, N;
+    - `locked_stopper_force`: stopper force of legs 3..n, N;
+    - `rear_stopper_force`: stopper force of Leg 2 in SLS-II, N;
     - `contraction`: L0 - L1 after landing, m;
     - `friction_fore`: friction margin of the fore foot;
     - `friction_rear`: friction margin of the rear foot just after landing;
-    - `landing_stopper_impulse`: on legs 3..n at the landing, N s;
-    - `hit_stopper_impulse`: on legs 3..n at the collision of Leg 2 with its stopper, N s;
+    - `landing_stopper_impulse`: stopper impulse of legs 3..n at the landing, N s;
+    - `hit_stopper_impulse`: stopper impulse of legs 3..n at the collision of Leg 2 with its
+      stopper, N s;
     - `hit_planted_impulse`: normal impulse of the planted foot in the same collision, N s;
     - `landing_friction_fore`: friction margin of the fore foot in the landing impulse;
     - `landing_friction_rear`: friction margin of the rear foot in the landing impulse.
@@ -148,17 +149,17 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Description of how the step ended, as a sentence; a batch has an array of sentences."""
+        """Return how the step ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     @property
     def period(self) -> Array:
-        """Duration of the step, s."""
+        """Return the duration of the step, s."""
         return jnp.sum(self.durations, axis=-1)
 
     @property
     def dls_fraction(self) -> Array:
-        """Fraction of the step with two loaded feet; 0 for a step of zero duration."""
+        """Return the fraction of the step with two loaded feet; 0 for a step of zero duration."""
         period = self.period
         return self.durations[..., 0] / jnp.where(period > 0.0, period, 1.0)
 

@@ -88,11 +88,12 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
 
 
 class ViscoelasticWheel(AbstractWheel):
-    """The paper's model: fixed leg roles, no slip, no scuffing; margins are measured, not enforced.
+    """Model of the paper: fixed leg roles, no slip, no scuffing; margins are measured, not
+    enforced.
 
     - `friction`: coefficient of the ground, which enters the friction margins but not the motion;
-    - `stop_at_lift_off`: end a step where the ground would have to pull on Leg 1 (bouncing, which
-      the model does not describe). Without it the step continues formally, as in the paper for
+    - `stop_at_lift_off`: whether a step ends if the ground would have to pull on Leg 1, since the
+      model does not describe bouncing. Otherwise the step continues formally, as in the paper for
       scuffing, and the margins report the violation.
 
     Examples:

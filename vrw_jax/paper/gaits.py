@@ -105,7 +105,8 @@ def walk_into_gait(
 def walk_along_parameter(
     params: WheelParams, name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
-    """Yield the walk at each of `values` of the parameter `name`, as `walk_into_gait` returns it.
+    """Yield a dataset of the walk at each of `values` of the parameter `name`, see
+    `walk_into_gait`.
 
     The start is extrapolated from the last two settled gaits. Walks that fail or do not settle are
     not used for this.

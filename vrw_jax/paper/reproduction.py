@@ -32,7 +32,7 @@ FIGURE_DAMPINGS = (50.0, 100.0, 200.0)
 
 
 def ignore_progress(completed_fraction: float, task: str) -> None:
-    """Do nothing with the reported progress."""
+    """Take a report of progress and do nothing."""
 
 
 def walk_into_table_1_gait() -> xr.Dataset:

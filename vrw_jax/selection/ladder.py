@@ -97,15 +97,15 @@ SELECTION_ATTRS: dict[str, dict[str, object]] = {
 
 
 class ModelChoice(AbstractPrintable):
-    """Choice of the model, and its reason. Batched under vmap: every field gains the axis.
-
-    `reason_code` is 0 if the viscoelastic model holds. If a margin is violated, it is 1 + the index
-    of the first one in `SELECTION_MARGINS`. It is `REASON_START_NOT_EMBEDDABLE` if a leg other than
-    Leg 1 is loaded or off its stopper at the start. If the viscoelastic step does not reach a
-    touchdown, it is minus the outcome.
+    """Selection of a model for one step, and its reason. Batched under vmap: every field gains the
+    axis.
 
     - `model_code`: a `ModelCode`, VISCOELASTIC or UNILATERAL;
-    - `margins`: of `SELECTION_MARGINS`, negative if violated;
+    - `reason_code`: 0 if the viscoelastic model holds. If a margin is violated, the code is 1 + the
+      index of the first such margin in `SELECTION_MARGINS`. If a leg other than Leg 1 is loaded or
+      off its stopper at the start, the code is `REASON_START_NOT_EMBEDDABLE`. If the viscoelastic
+      step does not reach a touchdown, the code is minus the outcome;
+    - `margins`: margins of `SELECTION_MARGINS`, negative if violated;
     - `friction`: coefficient of the ground.
 
     Examples:
@@ -144,14 +144,14 @@ class ModelChoice(AbstractPrintable):
 
     @property
     def model(self) -> AbstractWheel:
-        """Selected model, for one wheel."""
+        """Return the selected model, for one wheel."""
         if int(self.model_code) == ModelCode.VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)
 
     @property
     def why(self) -> Any:
-        """Reason of the selection as one sentence; a batch has an array of sentences."""
+        """Return the reason of the selection as one sentence; a batch has an array of sentences."""
         return describe_elements(describe_reason, self.reason_code)
 
 
@@ -226,7 +226,8 @@ class LadderStep(AbstractContactStep):
 
 
 class LadderWheel(AbstractWheel):
-    """The viscoelastic model if it is valid, otherwise the unilateral model with `friction`.
+    """Viscoelastic model if that model is valid for the step, otherwise the unilateral model with
+    `friction`.
 
     Section states are those of `UnilateralWheel`; three-number states of the paper are accepted.
 
@@ -257,7 +258,7 @@ class LadderWheel(AbstractWheel):
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
-        """Model of the steps for which the viscoelastic model does not hold."""
+        """Return the model of the steps for which the viscoelastic model does not hold."""
         return UnilateralWheel(friction=self.friction)
 
     @property

@@ -186,7 +186,7 @@ def _invert_landing(params: WheelParams, post_landing_states: np.ndarray) -> np.
     """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+); NaN without
     one.
 
-    With dL1- = 0, the angular rate after the landing is proportional to the rate before it.
+    With dL1- = 0, the angular rates before and after the landing are proportional.
     """
     s = params.symbols()
 

@@ -304,7 +304,7 @@ class Walk(AbstractPrintable):
 
     @property
     def outcome(self) -> Array:
-        """Outcome of the walk: that of the first failed step, or STEPPED."""
+        """Return the outcome of the walk: that of the first failed step, or STEPPED."""
         last_index = self.steps.outcome.shape[-1] - 1
         return jnp.take_along_axis(
             self.steps.outcome, jnp.minimum(self.n_stepped, last_index)[..., None], axis=-1
@@ -312,7 +312,7 @@ class Walk(AbstractPrintable):
 
     @property
     def ending(self) -> Any:
-        """Description of how the walk ended, as a sentence; a batch has an array of sentences."""
+        """Return how the walk ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:

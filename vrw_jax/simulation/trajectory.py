@@ -1,7 +1,8 @@
 """Labelled trajectories of walks: motion, forces, energy and positions, with units and provenance.
 
-In the frame, x points downhill along the slope, z is normal to it, and the origin is the first
-foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a landing.
+In the frame, x points downhill along the slope, z is normal to the slope, and the origin is the
+first foot. Angles and leg labels refer to the present step, so theta and the lengths jump at a
+landing.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def free_acceleration(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acce
 def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
     """Return the normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
 
-    Foot 2 is at rest on the ground at that instant, so the foot rises if the value is positive and
+    Foot 2 is at rest on the ground at that instant. The foot rises if the value is positive and
     scuffs if the value is negative. The jump from zero is the effect of the lost tangential force
     of the ground. The value is smooth at the boundary of scuffing. The clearance is the lowest
     later height, which is not smooth. On one side, the clearance vanishes with the cube of the
@@ -372,7 +372,7 @@ class Energy(NamedTuple):
 
     @property
     def total(self) -> Elementwise:
-        """Total energy E of eq. (26), J."""
+        """Return the total energy E of eq. (26), J."""
         return self.kinetic + self.gravitational + self.elastic
 
 

@@ -1,10 +1,10 @@
 """Positions of the wheel's points: hub, feet and the distances in guards.
 
-The frame is tilted with the slope: x points downhill along it, and z is normal to it. Angles are
-measured from the normal, and theta grows as the wheel rolls downhill. Leg j has the angle theta +
-(j - 1) alpha. Leg 1 is the fore leg on the ground, Leg 2 is the rear leg, and leg n, at theta -
-alpha, lands next. The origin is the foot of Leg 1. A posture depends on theta only through its sine
-and cosine.
+The frame is tilted with the slope: x points downhill along the slope, and z is normal to the slope.
+Angles are measured from the normal, and theta grows as the wheel rolls downhill. Leg j has the
+angle theta + (j - 1) alpha. Leg 1 is the fore leg on the ground, Leg 2 is the rear leg, and leg n,
+at theta - alpha, lands next. The origin is the foot of Leg 1. A posture depends on theta only
+through its sine and cosine.
 """
 
 from typing import NamedTuple

@@ -13,7 +13,7 @@ class ParameterSet:
 
     - `values`: parameters that differ from Table 1 at slope 0.30 rad, in SI units;
     - `description`: property of the wheel that the set demonstrates;
-    - `source`: source of the numbers, and how they were confirmed.
+    - `source`: source of the numbers and of their confirmation.
 
     Examples:
         >>> two_peaks = vrw.parameter_sets["two_peaks"]
@@ -27,7 +27,7 @@ class ParameterSet:
 
     @property
     def params(self) -> WheelParams:
-        """Wheel with these parameters."""
+        """Return the wheel with these parameters."""
         return WheelParams(**self.values)  # type: ignore[arg-type]
 
 

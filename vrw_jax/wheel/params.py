@@ -87,7 +87,7 @@ outputs."""
 
 
 class Symbols(NamedTuple):
-    """Symbols of the paper, and quantities that several formulas share."""
+    """Symbols of the paper, and quantities that several formulas use."""
 
     m: Elementwise
     a: Elementwise
@@ -213,7 +213,7 @@ class WheelParams(AbstractPrintable):
 
     @property
     def in_axes(self) -> "WheelParams":
-        """Argument `in_axes` of `jax.vmap`: 0 for each parameter with an axis and None for the
+        """Return the argument `in_axes` of `jax.vmap`: 0 for each parameter with an axis, None for
         others.
 
         For example `jax.vmap(vrw.limit_cycle, in_axes=(params.in_axes,))(params)`.
@@ -230,7 +230,7 @@ class WheelParams(AbstractPrintable):
 
     @property
     def title(self) -> str:
-        """Class name, with a note if a parameter is out of its domain."""
+        """Return the class name, with a note if a parameter is out of its domain."""
         title_suffix = (
             "" if np.all(self.is_in_domain()) else " out of its domain: a gradient or a difference"
         )
@@ -255,7 +255,7 @@ class WheelParams(AbstractPrintable):
 
     @property
     def leg_angle(self) -> float:
-        """Angle between neighboring legs, alpha = 2 pi / n_legs, rad."""
+        """Return the angle between neighboring legs, alpha = 2 pi / n_legs, rad."""
         return 2.0 * math.pi / self.n_legs
 
     def is_in_domain(self) -> Bool[Array, "..."]:

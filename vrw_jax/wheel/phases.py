@@ -155,7 +155,7 @@ class AbstractPhase(abc.ABC):
 
     @property
     def coordinate_units(self) -> Vector:
-        """The wheel's units of the phase's coordinates, then of their rates."""
+        """Return the wheel's units of the phase's coordinates, then of their rates."""
         units = compute_wheel_units(self.s)
         position_units = jnp.ones_like(units.length), units.length, units.length
         rate_units = units.rate, units.speed, units.speed
@@ -182,7 +182,7 @@ class AbstractPhase(abc.ABC):
 
     @property
     def all_guard_outcomes(self) -> tuple[Outcome, ...]:
-        """Outcomes of all guards, in the order of `guards`."""
+        """Return the outcomes of all guards, in the order of `guards`."""
         return self.guard_outcomes + (
             SHARED_FAILURE_OUTCOMES if self.stop_at_lift_off else SHARED_FAILURE_OUTCOMES[:-1]
         )
@@ -200,7 +200,7 @@ class AbstractPhase(abc.ABC):
 
     @property
     def margins_counted_at_start(self) -> tuple[bool, ...]:
-        """Whether each margin counts at the start of the phase."""
+        """Return whether each margin counts at the start of the phase."""
         locked_flags = (True,) * (self.s.n - 2)
         return (
             True,
@@ -251,19 +251,19 @@ class PhaseInstant:
 
     @functools.cached_property
     def acceleration(self) -> Acceleration:
-        """Accelerations of all three coordinates."""
+        """Return the accelerations of all three coordinates."""
         if self._phase_acceleration is None:
             return self.phase.acceleration(self.motion)
         return self.phase.complete_acceleration(self.motion, self._phase_acceleration)
 
     @functools.cached_property
     def rear_force(self) -> FootForce | None:
-        """Force of the ground on the rear foot, N; None if the foot is in the air."""
+        """Return the force of the ground on the rear foot, N; None if the foot is in the air."""
         return self.phase.rear_force(self.motion, self.acceleration)
 
     @functools.cached_property
     def fore_force(self) -> FootForce:
-        """Force of the ground on the fore foot, N."""
+        """Return the force of the ground on the fore foot, N."""
         return dynamics.fore_foot_force(
             self.phase.s, self.motion, self.acceleration, self.rear_force
         )
@@ -325,7 +325,7 @@ class DoubleSupport(AbstractPhase):
 
 
 class SingleSupport1(AbstractPhase):
-    """SLS-I, in (theta, L1, L2): Leg 2 moves freely until its stopper stops it (Section 3.3.2)."""
+    """SLS-I, in (theta, L1, L2): Leg 2 moves freely until its stopper (Section 3.3.2)."""
 
     name, n_dof = "SLS-I", 3
     guard_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER

@@ -1,7 +1,7 @@
 """Units of length, time and mass of a wheel, in which numerical options hold.
 
 The tolerances and time limits of a step are stated for a wheel of Table 1's length, mass and
-gravity. In its own units every wheel has that size, so no result depends on the units of the
+gravity. In its units every wheel has that size, so no result depends on the units of the
 parameters.
 """
 
@@ -40,17 +40,17 @@ class WheelUnits(NamedTuple):
 
     @property
     def speed(self) -> Elementwise:
-        """Unit of a speed, m/s."""
+        """Return the unit of a speed, m/s."""
         return self.length / self.time
 
     @property
     def rate(self) -> Elementwise:
-        """Unit of an angular velocity, rad/s."""
+        """Return the unit of an angular velocity, rad/s."""
         return 1.0 / self.time
 
     @property
     def energy(self) -> Elementwise:
-        """Unit of an energy, J."""
+        """Return the unit of an energy, J."""
         return self.mass * self.speed * self.speed
 
     def scale_times(self, options: StepOptions) -> StepOptions:

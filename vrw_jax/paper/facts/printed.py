@@ -1,8 +1,8 @@
 """Equations of the paper, as printed and in corrected form, if numbers can distinguish the two
 forms.
 
-The equations use the paper's five coordinates q = (x, z, theta, L1, L2). They share only the mass
-matrix and the momentum with the simulator.
+The equations use the paper's five coordinates q = (x, z, theta, L1, L2). Only the mass matrix and
+the momentum are those of the simulator.
 """
 
 from typing import NamedTuple
