@@ -147,7 +147,7 @@ def step_batch(
     parameter_columns = _check_parameters(params, checked_states, checked_model, options, n_steps)
     checked_states = checked_states.astype(parameter_columns[0].dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
-    arguments = (
+    step_arguments = (
         checked_model,
         parameter_columns,
         checked_states,
@@ -160,16 +160,16 @@ def step_batch(
         derivatives, CONTACT_STEP_INPUTS if has_contact_kernel else PAPER_STEP_INPUTS, engine
     )
     return (
-        step_batch_with_contact(*arguments, derivative_names)
+        step_batch_with_contact(*step_arguments, derivative_names)
         if has_contact_kernel
-        else _step_paper_model(*arguments, durations, derivative_names)
+        else _step_paper_model(*step_arguments, durations, derivative_names)
     )
 
 
 def _check_derivatives(
     derivatives: Sequence[str], known_names: tuple[str, ...], engine: str
 ) -> list[str]:
-    """Return the requested derivatives as a list.
+    """Return the names of the requested derivatives as a list.
 
     Raises `ValueError` if one is not available.
     """
@@ -250,8 +250,10 @@ def _step_paper_model(
     ]
     work_order = sort_by_work(parameter_columns, states)
     parameter_rows = np.empty((len(parameter_columns), len(states)), states.dtype)
-    for parameter_row, column in zip(parameter_rows, parameter_columns, strict=True):
-        parameter_row[:] = column[work_order] if column.ndim else column
+    for parameter_row, parameter_values in zip(parameter_rows, parameter_columns, strict=True):
+        parameter_row[:] = (
+            parameter_values[work_order] if parameter_values.ndim else parameter_values
+        )
     is_uneven = bool(stepwise_parameters)
     slopes = slopes.take(work_order, -1) if is_uneven else slopes
     walks = WalkBatch(
@@ -325,7 +327,7 @@ def _step_paper_model(
                     has_failed = result[2] == Outcome.SOLVER_FAILED
                     solver_index[lane_indices[has_failed]] = SolverIndex.IMPLICIT
                     lane_indices = lane_indices[~has_failed]
-                    result = tuple(part[..., ~has_failed] for part in result)
+                    result = tuple(result_part[..., ~has_failed] for result_part in result)
                 walks.record_step(lane_indices, result, np.zeros(len(lane_indices), bool))
     return walks.to_result(work_order, solver_index, engine_name, solver_names)
 
@@ -412,39 +414,45 @@ def _step_by_lanes(
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    wheels: np.ndarray,
+    parameter_rows: np.ndarray,
     states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return one gait step by the lane engine; see `_BatchEngine.take_step`."""
     option_leaves, options_structure = jax.tree.flatten(options)
-    lane_independent = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    lane_independent = [np.asarray(leaf, parameter_rows.dtype) for leaf in option_leaves]
     tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
     assert tableau is not None  # `_select_engine` has checked the solver.
 
-    def lane_step(lane_independent: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
+    def lane_step(
+        lane_independent: Any, lane_inputs: Any, straggler_count: Array | None = None
+    ) -> tuple:
         current_options = jax.tree.unflatten(options_structure, lane_independent)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
 
-        def step_outputs(*lanes: Array) -> tuple:
-            params = wheel_from_parameters(lanes[:n_parameters], n_legs, *lanes[NEXT_SLOPE_INDEX:])
-            x = lanes[n_parameters:NEXT_SLOPE_INDEX]
-            result = take_gait_step(
+        def step_outputs(*lane_inputs: Array) -> tuple:
+            params = wheel_from_parameters(
+                lane_inputs[:n_parameters], n_legs, *lane_inputs[NEXT_SLOPE_INDEX:]
+            )
+            x = lane_inputs[n_parameters:NEXT_SLOPE_INDEX]
+            step_result = take_gait_step(
                 params, x, current_options, tableau, stop_at_lift_off, straggler_count
             )
-            diagnostics = result.is_unfinished, result.outcome, result.solver_steps
-            return jnp.stack([*result.section_state, *result.durations]), diagnostics
+            diagnostics = step_result.is_unfinished, step_result.outcome, step_result.solver_steps
+            return jnp.stack([*step_result.section_state, *step_result.durations]), diagnostics
 
         if not input_indices:
-            step_values, diagnostics = step_outputs(*lanes)
+            step_values, diagnostics = step_outputs(*lane_inputs)
             return (*diagnostics, step_values)
         # With respect to all inputs, two columns follow from the units.
-        needs_all_inputs = len(input_indices) == len(lanes)
+        needs_all_inputs = len(input_indices) == len(lane_inputs)
         compute_columns = (
             complete_jacobian_columns if needs_all_inputs else compute_jacobian_columns
         )
-        jacobian, step_values, diagnostics = compute_columns(step_outputs, lanes, input_indices)
+        jacobian, step_values, diagnostics = compute_columns(
+            step_outputs, lane_inputs, input_indices
+        )
         return (*diagnostics, step_values, jacobian)
 
     cache_key = (
@@ -457,7 +465,7 @@ def _step_by_lanes(
     )
     n_inputs = N_STEP_INPUTS + len(next_slopes)
     register_limits = simd.RegisterLimits(n_inputs) if input_indices else simd.DEFAULT_LIMITS
-    lane_arrays = [*wheels, *states, *next_slopes]
+    lane_arrays = [*parameter_rows, *states, *next_slopes]
     results = run_compiled(lane_step, lane_independent, lane_arrays, cache_key, register_limits)
     _, outcome, n_solver_steps, step_values, *jacobian = results
     return step_values[:3], step_values[3:], outcome, n_solver_steps, *jacobian
@@ -467,7 +475,7 @@ def _step_by_collocation(
     lane_engine: _BatchEngine,
     model: Any,
     n_legs: int,
-    wheels: np.ndarray,
+    parameter_rows: np.ndarray,
     states: np.ndarray,
     durations: np.ndarray,
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
@@ -478,24 +486,26 @@ def _step_by_collocation(
     """
     stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
 
-    def lane_step(lane_independent: Any, lanes: Any, straggler_count: Array | None = None) -> tuple:
-        params = wheel_from_parameters(lanes[:n_parameters], n_legs)
-        x, expected_durations = tuple(lanes[n_parameters:-3]), tuple(lanes[-3:])
-        result = collocation_gait_step(params, x, expected_durations, stop_at_lift_off)
-        is_unfinished = jnp.zeros_like(result.is_trusted)
-        step_values = jnp.stack([*result.section_state, *result.durations])
-        return is_unfinished, result.is_trusted, step_values
+    def lane_step(
+        lane_independent: Any, lane_inputs: Any, straggler_count: Array | None = None
+    ) -> tuple:
+        params = wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
+        x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
+        collocation_step = collocation_gait_step(params, x, expected_durations, stop_at_lift_off)
+        is_unfinished = jnp.zeros_like(collocation_step.is_trusted)
+        step_values = jnp.stack([*collocation_step.section_state, *collocation_step.durations])
+        return is_unfinished, collocation_step.is_trusted, step_values
 
     cache_key = ("gait step by collocation", n_legs, stop_at_lift_off)
     _, is_trusted, step_values = run_compiled(
-        lane_step, [], [*wheels, *states, *durations], cache_key
+        lane_step, [], [*parameter_rows, *states, *durations], cache_key
     )
     outcome, n_solver_steps = np.zeros((2, len(is_trusted)), np.int32)
     step_results = step_values[:3], step_values[3:], outcome, n_solver_steps
     untrusted_lanes = np.flatnonzero(~is_trusted)
     if len(untrusted_lanes) > 0:
         repeated_results = lane_engine.take_step(
-            wheels[:, untrusted_lanes], states[:, untrusted_lanes]
+            parameter_rows[:, untrusted_lanes], states[:, untrusted_lanes]
         )
         for all_values, new_values in zip(step_results, repeated_results, strict=True):
             all_values[..., untrusted_lanes] = new_values
@@ -507,16 +517,18 @@ def _step_by_diffrax(
     options: StepOptions,
     n_legs: int,
     input_indices: tuple[int, ...],
-    wheels: np.ndarray,
+    parameter_rows: np.ndarray,
     states: np.ndarray,
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return one step by the model's step under `jax.vmap`; see `_BatchEngine.take_step`."""
-    convert_leaves = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf, wheels.dtype))
+    convert_leaves = functools.partial(
+        jax.tree.map, lambda leaf: np.asarray(leaf, parameter_rows.dtype)
+    )
     tight_options = convert_leaves(options.with_derivative_tolerances())
     options = convert_leaves(options)
     input_rows = np.concatenate(
-        [wheels, states, *(slope_values[None] for slope_values in next_slopes)]
+        [parameter_rows, states, *(slope_values[None] for slope_values in next_slopes)]
     ).T
 
     def step_rows(
@@ -537,7 +549,7 @@ def _step_by_diffrax(
         except eqx.EquinoxRuntimeError:
             *step_values, n_solver_steps = step_rows(input_rows, tight_options, ())
             outcome = step_values[2]
-            jacobian = np.zeros((len(input_indices), 6, len(input_rows)), wheels.dtype)
+            jacobian = np.zeros((len(input_indices), 6, len(input_rows)), parameter_rows.dtype)
             results = (*step_values, n_solver_steps, jacobian)
             has_stepped = np.flatnonzero(outcome == Outcome.STEPPED)
             if len(has_stepped) < len(input_rows):

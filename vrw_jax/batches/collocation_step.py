@@ -205,7 +205,7 @@ def _estimate_correction(sweep_state: _SweepState) -> Array:
 def _weighted_sum(
     weights: np.ndarray, node_accelerations: NodeAccelerations, coordinate: int
 ) -> Any:
-    """Return the weighted sum of one coordinate over the nodes."""
+    """Return the weighted sum over the nodes of one coordinate's acceleration."""
     return sum(
         float(weight) * acceleration[coordinate]
         for weight, acceleration in zip(weights, node_accelerations, strict=True)
@@ -287,10 +287,13 @@ def _solve_step(
         corrections = []
         for inverse_matrix, projection in zip(inverse_stage_matrices, projections, strict=True):
             products = [
-                [_multiply(entry, x) for entry, x in zip(row, projection, strict=True)]
-                for row in inverse_matrix
+                [
+                    _multiply(matrix_entry, x)
+                    for matrix_entry, x in zip(matrix_row, projection, strict=True)
+                ]
+                for matrix_row in inverse_matrix
             ]
-            corrections.append([_add_terms(row) for row in products])
+            corrections.append([_add_terms(matrix_row) for matrix_row in products])
         return _correct_nodes(node_accelerations, corrections, h)
 
     def run_sweep(sweep_state: _SweepState, _: None) -> tuple[_SweepState, None]:
@@ -384,11 +387,13 @@ def _solve_step(
 
 
 def _add_nodes(
-    node_accelerations: NodeAccelerations, other_accelerations: NodeAccelerations, factor: float
+    node_accelerations: NodeAccelerations, other_accelerations: NodeAccelerations, weight: float
 ) -> NodeAccelerations:
     """Return the accelerations plus a factor times other accelerations."""
     pairs = zip(node_accelerations, other_accelerations, strict=True)
-    return tuple(tuple(x + factor * y for x, y in zip(*pair, strict=True)) for pair in pairs)
+    return tuple(
+        tuple(x + weight * y for x, y in zip(*node_pair, strict=True)) for node_pair in pairs
+    )
 
 
 def _stretch_nodes(
@@ -441,9 +446,9 @@ def _subtract(x: ComplexPair, y: ComplexPair) -> ComplexPair:
 
 def _add_terms(terms: Sequence[ComplexPair]) -> ComplexPair:
     """Return the sum of complex numbers."""
-    first, *others = terms
-    real_part, imaginary_part = first
-    for term in others:
+    first_term, *other_terms = terms
+    real_part, imaginary_part = first_term
+    for term in other_terms:
         real_part, imaginary_part = real_part + term[0], imaginary_part + term[1]
     return real_part, imaginary_part
 
@@ -475,7 +480,10 @@ def _invert_stage_matrix(
 
     squared_modulus = determinant[0] * determinant[0] + determinant[1] * determinant[1]
     reciprocal = (determinant[0] / squared_modulus, -determinant[1] / squared_modulus)
-    return [[_multiply(reciprocal, entry) for entry in row] for row in adjugate]
+    return [
+        [_multiply(reciprocal, matrix_entry) for matrix_entry in matrix_row]
+        for matrix_row in adjugate
+    ]
 
 
 def _adjugate_and_determinant(matrix: list[list[ComplexPair]]) -> tuple[Any, ComplexPair]:
@@ -520,7 +528,9 @@ def _project_linear_residuals(
     middle.
     """
     n = range(len(v))
-    multiply_columns = lambda columns, x: tuple(sum(columns[j][i] * x[j] for j in n) for i in n)
+    multiply_columns = lambda derivative_columns, x: tuple(
+        sum(derivative_columns[j][i] * x[j] for j in n) for i in n
+    )
     damping_term = multiply_columns(residual_by_v, a)
     stiffness_rate_term = multiply_columns(residual_by_q, v)
     stiffness_acceleration_term = multiply_columns(residual_by_q, a)
@@ -559,15 +569,15 @@ def _correct_nodes(
     for node_index in range(N_GAUSS_NODES):
         corrected_node = []
         for coordinate in range(len(node_accelerations[0])):
-            change = sum(
+            acceleration_change = sum(
                 float(2.0 * EIGENVECTOR_COLUMNS[node_index, pair_index].real)
                 * complex_pair[coordinate][0]
                 - float(2.0 * EIGENVECTOR_COLUMNS[node_index, pair_index].imag)
                 * complex_pair[coordinate][1]
                 for pair_index, complex_pair in enumerate(corrections)
             )
-            corrected_node.append(node_accelerations[node_index][coordinate] + change)
-            largest_change = jnp.maximum(largest_change, jnp.abs(change))
+            corrected_node.append(node_accelerations[node_index][coordinate] + acceleration_change)
+            largest_change = jnp.maximum(largest_change, jnp.abs(acceleration_change))
         corrected_nodes.append(tuple(corrected_node))
     return tuple(corrected_nodes), h * largest_change
 

@@ -54,7 +54,7 @@ class LandingSteps(NamedTuple):
 
 
 def step_batch_after_landing(
-    wheels: np.ndarray,
+    parameter_rows: np.ndarray,
     states: np.ndarray,
     next_slopes: np.ndarray,
     *,
@@ -86,37 +86,46 @@ def step_batch_after_landing(
             f"solver is {options.solver}, but lanes need an explicit one: take Dopri8."
         )
     option_leaves, options_structure = jax.tree.flatten(options)
-    lane_independent = [np.asarray(leaf, wheels.dtype) for leaf in option_leaves]
+    lane_independent = [np.asarray(leaf, parameter_rows.dtype) for leaf in option_leaves]
     n_parameters, stop_at_lift_off = len(PARAMETER_NAMES), model.stop_at_lift_off
     input_indices = tuple(LANDING_STEP_INPUTS.index(name) for name in derivatives)
 
     def step_lanes_after_landing(
-        lane_independent: Any, lanes: Any, straggler_count: Array | None = None
+        lane_independent: Any, lane_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
         current_options = jax.tree.unflatten(options_structure, lane_independent)
         if input_indices:
             current_options = current_options.with_derivative_tolerances()
 
-        def landing_outputs(*lanes: Array) -> tuple:
-            params = wheel_from_parameters(lanes[:n_parameters], n_legs, lanes[-1])
-            state = lanes[n_parameters:-1]
-            result = take_step_after_landing(
-                params, state, current_options, tableau, stop_at_lift_off, straggler_count
+        def landing_outputs(*lane_inputs: Array) -> tuple:
+            params = wheel_from_parameters(lane_inputs[:n_parameters], n_legs, lane_inputs[-1])
+            post_landing_state = lane_inputs[n_parameters:-1]
+            landing_step = take_step_after_landing(
+                params,
+                post_landing_state,
+                current_options,
+                tableau,
+                stop_at_lift_off,
+                straggler_count,
             )
-            diagnostics = result.is_unfinished, result.outcome, jnp.stack(result.durations)
-            return result.landing_quantities, diagnostics
+            diagnostics = (
+                landing_step.is_unfinished,
+                landing_step.outcome,
+                jnp.stack(landing_step.durations),
+            )
+            return landing_step.landing_quantities, diagnostics
 
         if not input_indices:
-            landing_quantities, diagnostics = landing_outputs(*lanes)
+            landing_quantities, diagnostics = landing_outputs(*lane_inputs)
             return (*diagnostics, landing_quantities)
         jacobian_columns, landing_quantities, diagnostics = compute_jacobian_columns(
-            landing_outputs, lanes, input_indices
+            landing_outputs, lane_inputs, input_indices
         )
         return (*diagnostics, landing_quantities, jacobian_columns)
 
     cache_key = ("step after landing", n_legs, stop_at_lift_off, options_structure, input_indices)
     register_limits = simd.RegisterLimits(N_STEP_INPUTS) if input_indices else simd.DEFAULT_LIMITS
-    lane_arrays = [*wheels, *states, next_slopes]
+    lane_arrays = [*parameter_rows, *states, next_slopes]
     results = run_compiled(
         step_lanes_after_landing, lane_independent, lane_arrays, cache_key, register_limits
     )

@@ -66,7 +66,7 @@ def _run_xla_blocks(
 
     Stragglers of all blocks are run again together.
     """
-    results: list[np.ndarray] = []
+    result_arrays: list[np.ndarray] = []
     unfinished_lanes = np.arange(len(lane_arrays[0]))
     while len(unfinished_lanes) > 0:
         is_last_round = len(unfinished_lanes) <= block_size
@@ -82,11 +82,13 @@ def _run_xla_blocks(
                 np.asarray(x)[..., : len(block_lanes)]
                 for x in program(tuple(lane_independent_values), block_arrays, straggler_count)
             ]
-            results = results or [
+            result_arrays = result_arrays or [
                 np.empty((*x.shape[:-1], len(lane_arrays[0])), x.dtype) for x in block_outputs
             ]
-            for result, block_result in zip(results, block_outputs, strict=True):
-                result[..., block_lanes[~block_outputs[0]]] = block_result[..., ~block_outputs[0]]
+            for result_array, block_result in zip(result_arrays, block_outputs, strict=True):
+                result_array[..., block_lanes[~block_outputs[0]]] = block_result[
+                    ..., ~block_outputs[0]
+                ]
             straggler_lanes.append(block_lanes[block_outputs[0]])
         unfinished_lanes = np.concatenate(straggler_lanes)
-    return results
+    return result_arrays

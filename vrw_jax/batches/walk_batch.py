@@ -69,12 +69,12 @@ class StepBatchResult(AbstractPrintable):
         return describe_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return label and text of each row of the printed result."""
+        """Return the rows of the printed result as pairs of label and text."""
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
         solver_texts = (
-            f"{count:,} by {name}"
-            for count, name in zip(n_by_solver, self.solver_names, strict=True)
-            if count
+            f"{n_elements:,} by {name}"
+            for n_elements, name in zip(n_by_solver, self.solver_names, strict=True)
+            if n_elements
         )
         return [
             ("lanes", format_outcome_counts(self.outcome, Outcome)),
@@ -198,11 +198,14 @@ class WalkBatch:
         }
 
     def record_step(
-        self, lanes: np.ndarray, step_values: tuple[np.ndarray, ...], is_collocated: np.ndarray
+        self,
+        lane_indices: np.ndarray,
+        step_values: tuple[np.ndarray, ...],
+        is_collocated: np.ndarray,
     ) -> None:
         """Record a step of these lanes: state, durations, outcome, solver steps and Jacobian."""
         section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
-        lane_index = make_lane_index(lanes, self)
+        lane_index = make_lane_index(lane_indices, self)
         if step_jacobian:
             self.jacobian = _replace_lanes(
                 self.jacobian, lane_index, self._chain_jacobian(lane_index, *step_jacobian)
@@ -246,8 +249,8 @@ class WalkBatch:
             chained_jacobian[first_start_row:] = step_jacobian[n_inputs:]
         else:
             used_row_ranges = [
-                range(first, min(first + k + 1, end))
-                for first, end in itertools.pairwise(self.first_jacobian_rows)
+                range(first_row, min(first_row + k + 1, end_row))
+                for first_row, end_row in itertools.pairwise(self.first_jacobian_rows)
             ]
             used_rows = np.array(
                 [*itertools.chain(*used_row_ranges), *range(first_start_row, len(chained_jacobian))]
@@ -261,24 +264,24 @@ class WalkBatch:
         for parameter, first_row in zip(
             self.parameters, self.first_jacobian_rows[:-1], strict=True
         ):
-            for input_position, value_index, factor in parameter.chain_rule_terms(k):
+            for input_position, value_index, weight in parameter.chain_rule_terms(k):
                 chained_jacobian[first_row + value_index] += (
-                    factor * step_jacobian[first_input_row + input_position]
+                    weight * step_jacobian[first_input_row + input_position]
                 )
             first_input_row += len(parameter.input_indices)
         return chained_jacobian
 
 
-def make_lane_index(lanes: np.ndarray, walks: WalkBatch) -> Any:
+def make_lane_index(lane_indices: np.ndarray, walks: WalkBatch) -> Any:
     """Return an index of these lanes: a slice, which copies nothing, if they are all lanes."""
-    return slice(None) if len(lanes) == len(walks.outcome) else lanes
+    return slice(None) if len(lane_indices) == len(walks.outcome) else lane_indices
 
 
-def _replace_lanes(values: np.ndarray, lane_index: Any, new_values: np.ndarray) -> np.ndarray:
+def _replace_lanes(lane_values: np.ndarray, lane_index: Any, new_values: np.ndarray) -> np.ndarray:
     """Return the array with the values of the lanes at `lane_index` replaced, in place if
     possible.
     """
     if isinstance(lane_index, slice):
         return new_values
-    values[..., lane_index] = new_values
-    return values
+    lane_values[..., lane_index] = new_values
+    return lane_values

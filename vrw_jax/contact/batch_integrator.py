@@ -195,11 +195,11 @@ def evaluate_guards_at_point(dynamics: ModeDynamics, point: IntervalPoint) -> Ar
         if dynamics.is_one_sided
         else None
     )
-    legs, slot_pairs = (
+    directions, slot_pairs = (
         leg_directions(dynamics.s, motion.theta),
         ((n1, n2), (t1, t2), (s1, s2), (x1, x2)),
     )
-    quantities = ContactQuantities(legs, *slot_pairs, painleve_determinant, airborne_stopper)
+    quantities = ContactQuantities(directions, *slot_pairs, painleve_determinant, airborne_stopper)
     is_after_start = jnp.ones(point.q.shape[-1:], bool)
     return jnp.concatenate(evaluate_guards(dynamics, motion, quantities, is_after_start))
 
@@ -251,10 +251,10 @@ def init_interval(
 
     - `h`: size of the first attempt in the wheel's unit of time.
     """
-    point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
+    start_point, is_initiating = make_point(dynamics, motion), find_initiating_guards(dynamics)
     guard_values, guard_rates = (
-        evaluate_guards_at_point(dynamics, point),
-        compute_guard_rates(dynamics, point),
+        evaluate_guards_at_point(dynamics, start_point),
+        compute_guard_rates(dynamics, start_point),
     )
     # The guard of a contact released from rest is within round-off for 1e-8 s and longer. A guard
     # that rises from below zero has no event before it falls. Several events at one time leave
@@ -263,18 +263,18 @@ def init_interval(
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
     time_unit = compute_wheel_units(dynamics.s).time
-    min_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
-    is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_rate))
+    min_guard_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
+    is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_guard_rate))
     is_triggered = ~is_initiating & (
         (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
     )
     triggered_guard = jnp.zeros(is_triggered.shape[1:], jnp.int32)
-    for index in reversed(range(len(is_triggered))):
-        triggered_guard = jnp.where(is_triggered[index], index, triggered_guard)
+    for guard_index in reversed(range(len(is_triggered))):
+        triggered_guard = jnp.where(is_triggered[guard_index], guard_index, triggered_guard)
     guard_offset = jnp.where(is_initiating, guard_values - 2.0 * roundoff, 0.0)
     float_zeros, int_zeros = jnp.zeros_like(motion.x), jnp.zeros(motion.x.shape, jnp.int32)
     return IntervalState(
-        point=point,
+        point=start_point,
         contact_state=dynamics.contact_state,
         guard_values=guard_values - guard_offset,
         guard_offset=guard_offset,
@@ -328,7 +328,11 @@ def integrate_interval(
 
     def try_step(state: IntervalState) -> IntervalState:
         return integrator_step(
-            state, attempt_step(dynamics, tableau, options, state), guard_scales, tableau, options
+            state,
+            attempt_solver_step(dynamics, tableau, options, state),
+            guard_scales,
+            tableau,
+            options,
         )
 
     return iterate_until_stopped(
@@ -353,8 +357,8 @@ def iterate_until_stopped(
     """
 
     def should_continue(loop_state: tuple) -> Array:
-        state, n_attempts = loop_state
-        is_active = is_running(state)
+        lane_state, n_attempts = loop_state
+        is_active = is_running(lane_state)
         has_stopped = jnp.any(has_unfinished_walk & ~is_active)
         return jnp.any(is_active) & ((n_attempts < max_wait_attempts) | ~has_stopped)
 
@@ -363,7 +367,7 @@ def iterate_until_stopped(
     return lax.while_loop(should_continue, advance_loop, (initial_state, n_initial))[0]
 
 
-class AttemptedStep(NamedTuple):
+class AttemptedSolverStep(NamedTuple):
     """Result of one attempted solver step of every lane."""
 
     end_point: IntervalPoint
@@ -391,36 +395,36 @@ def compute_stage_state(
     return q + h * (node * v + h * second_sum), v + h * first_sum
 
 
-def attempt_step(
+def attempt_solver_step(
     dynamics: ModeDynamics, tableau: ButcherTableau, options: StepOptions, state: IntervalState
-) -> AttemptedStep:
+) -> AttemptedSolverStep:
     """Return one attempted step of every lane."""
-    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    h, start_point, last_stage = state.h, state.point, len(tableau.nodes) - 1
 
     def evaluate_stage(i: Array, stage_rows: Array) -> Array:
         stage_row = evaluate_dynamics(
-            dynamics, *compute_stage_state(tableau, i, point.q, point.v, stage_rows, h)
+            dynamics, *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h)
         )
         return lax.dynamic_update_index_in_dim(stage_rows, stage_row, i, 0)
 
-    later_stage_rows = jnp.zeros((last_stage, *point.dynamics_rows.shape), h.dtype)
-    stage_rows = jnp.concatenate([point.dynamics_rows[None], later_stage_rows])
+    later_stage_rows = jnp.zeros((last_stage, *start_point.dynamics_rows.shape), h.dtype)
+    stage_rows = jnp.concatenate([start_point.dynamics_rows[None], later_stage_rows])
     stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage, stage_rows)
-    return complete_attempt(dynamics, tableau, options, state, stage_rows)
+    return complete_solver_step(dynamics, tableau, options, state, stage_rows)
 
 
-def complete_attempt(
+def complete_solver_step(
     dynamics: ModeDynamics,
     tableau: ButcherTableau,
     options: StepOptions,
     state: IntervalState,
     stage_rows: Array,
-) -> AttemptedStep:
+) -> AttemptedSolverStep:
     """Return the attempted step whose dynamics rows at all stages are `stage_rows`."""
-    h, point, last_stage = state.h, state.point, len(tableau.nodes) - 1
-    n = len(point.q)
+    h, start_point, last_stage = state.h, state.point, len(tableau.nodes) - 1
+    n = len(start_point.q)
     end_point = IntervalPoint(
-        *compute_stage_state(tableau, last_stage, point.q, point.v, stage_rows, h),
+        *compute_stage_state(tableau, last_stage, start_point.q, start_point.v, stage_rows, h),
         stage_rows[last_stage],
     )
     accumulator_increments = None
@@ -431,7 +435,8 @@ def complete_attempt(
         )
     inner_stage_points = {
         i: IntervalPoint(
-            *compute_stage_state(tableau, i, point.q, point.v, stage_rows, h), stage_rows[i]
+            *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h),
+            stage_rows[i],
         )
         for i in tableau.guard_stages
     }
@@ -445,7 +450,7 @@ def complete_attempt(
     )
     error_estimates = h * h * sum_stages(tableau.b_error_position), h * sum_stages(tableau.b_error)
     squared_error = _squared_error(
-        dynamics.s, options, error_estimates, point, guard_points[-1], end_guard_values
+        dynamics.s, options, error_estimates, start_point, guard_points[-1], end_guard_values
     )
     middle_guard_values = (
         inner_guard_values[tableau.guard_stages.index(tableau.middle_stage)]
@@ -458,7 +463,7 @@ def complete_attempt(
     minimum_fraction = _earliest_minimum_fraction(
         tableau, [state.guard_values, *inner_guard_values, end_guard_values], _is_initiating(state)
     )
-    return AttemptedStep(
+    return AttemptedSolverStep(
         end_point,
         squared_error,
         end_guard_values,
@@ -485,16 +490,17 @@ def is_at_singularity(
 
 def integrator_step(
     state: IntervalState,
-    attempt: AttemptedStep,
+    attempt: AttemptedSolverStep,
     guard_scales: Array,
     tableau: ButcherTableau,
     options: StepOptions,
     interval_options: IntervalOptions = INTERVAL_OPTIONS,
 ) -> IntervalState:
-    """Return the lanes after one attempt: accepted, repeated with another step size, or at an
-    event.
+    """Return the lanes after one attempted solver step.
+
+    A lane accepts the step, repeats the step with another size, or stops at an event.
     """
-    point, h, event_bracket, end_point = (
+    start_point, h, event_bracket, end_point = (
         state.point,
         state.h,
         state.event_bracket,
@@ -544,8 +550,8 @@ def integrator_step(
         state.n_solver_steps + 1 >= options.max_solver_steps
     )
     has_failed = has_failed | (~event_bracket.is_active & (state.time + next_h == state.time))
-    determinant_row = len(point.q) + N_CONTACT_ROWS - 1
-    determinant_before = point.dynamics_rows[determinant_row]
+    determinant_row = len(start_point.q) + N_CONTACT_ROWS - 1
+    determinant_before = start_point.dynamics_rows[determinant_row]
     determinant_after = end_point.dynamics_rows[determinant_row]
     status = jnp.where(has_failed, Outcome.SOLVER_FAILED, LaneStatus.RUNNING)
     status = jnp.where(has_reached_event, LaneStatus.EVENT, status)
@@ -555,7 +561,7 @@ def integrator_step(
     )
     status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
     return state._replace(
-        point=tree_where(is_state_updated, end_point, point),
+        point=tree_where(is_state_updated, end_point, start_point),
         guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
         interval_accumulators=interval_accumulators,
         h=jnp.where(is_running, next_h, h),
@@ -578,7 +584,7 @@ class _LocatedEvent(NamedTuple):
 
 def _search_event(
     state: IntervalState,
-    attempt: AttemptedStep,
+    attempt: AttemptedSolverStep,
     has_crossed: Array,
     guard_scales: Array,
     options: StepOptions,
@@ -647,7 +653,7 @@ def _squared_error(
     s: Symbols,
     options: StepOptions,
     error_estimates: tuple[Array, Array],
-    point: IntervalPoint,
+    start_point: IntervalPoint,
     end_point: IntervalPoint,
     guard_values: Array,
 ) -> Array:
@@ -657,13 +663,13 @@ def _squared_error(
     total_error = 0.0 * jnp.sum(guard_values, axis=0)
     units = compute_state_units(s)
     for error, a, b, coordinate_unit in zip(
-        error_estimates, point[:2], end_point[:2], units, strict=True
+        error_estimates, start_point[:2], end_point[:2], units, strict=True
     ):
         tolerance = options.atol * coordinate_unit + options.rtol * jnp.maximum(
             jnp.abs(a), jnp.abs(b)
         )
         total_error = total_error + jnp.sum(jnp.square(error / tolerance), axis=0)
-    return jnp.where(jnp.isfinite(total_error), total_error / (2 * point.q.shape[0]), jnp.inf)
+    return jnp.where(jnp.isfinite(total_error), total_error / (2 * start_point.q.shape[0]), jnp.inf)
 
 
 def _is_initiating(state: IntervalState) -> Array:
@@ -690,15 +696,17 @@ def _earliest_minimum_fraction(
 
 
 def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
-    """Return the index of the lowest crossing guard, and its value; infinite if none crosses."""
+    """Return the index of the lowest guard that crosses zero, and its value; infinite if none
+    crosses.
+    """
     lowest_value, guard = (
         jnp.full_like(guard_values[0], jnp.inf),
         jnp.zeros(guard_values.shape[1:], jnp.int32),
     )
-    for index in range(len(guard_values)):
-        is_lower = is_crossing[index] & (guard_values[index] < lowest_value)
-        lowest_value = jnp.where(is_lower, guard_values[index], lowest_value)
-        guard = jnp.where(is_lower, index, guard)
+    for guard_index in range(len(guard_values)):
+        is_lower = is_crossing[guard_index] & (guard_values[guard_index] < lowest_value)
+        lowest_value = jnp.where(is_lower, guard_values[guard_index], lowest_value)
+        guard = jnp.where(is_lower, guard_index, guard)
     return guard, lowest_value
 
 
@@ -716,14 +724,18 @@ def _earliest_secant(
         h == bracket.previous_h, jnp.inf, h - bracket.previous_h
     )
     earliest_h, guard = jnp.full_like(h, jnp.inf), jnp.zeros(h.shape, jnp.int32)
-    for index in range(len(guard_values)):
-        is_falling = is_crossing[index] & (secant_slope[index] < 0.0)
-        root_h = h - guard_values[index] / jnp.where(is_falling, secant_slope[index], 1.0)
-        is_already_below = is_crossing[index] & ~is_falling & (guard_values[index] < 0.0)
+    for guard_index in range(len(guard_values)):
+        is_falling = is_crossing[guard_index] & (secant_slope[guard_index] < 0.0)
+        root_h = h - guard_values[guard_index] / jnp.where(
+            is_falling, secant_slope[guard_index], 1.0
+        )
+        is_already_below = (
+            is_crossing[guard_index] & ~is_falling & (guard_values[guard_index] < 0.0)
+        )
         root_h = jnp.where(is_already_below, -jnp.inf, root_h)
         is_earlier = (is_falling | is_already_below) & (root_h < earliest_h)
         earliest_h = jnp.where(is_earlier, root_h, earliest_h)
-        guard = jnp.where(is_earlier, index, guard)
+        guard = jnp.where(is_earlier, guard_index, guard)
     return earliest_h, guard
 
 
@@ -752,10 +764,10 @@ def _earliest_root(
     )
     earliest_fraction = jnp.full_like(root_fraction[0], jnp.inf)
     guard = jnp.zeros(root_fraction.shape[-1:], jnp.int32)
-    for index in reversed(range(len(root_fraction))):
-        guard = jnp.where(is_crossing[index], index, guard)
-    for index in range(len(root_fraction)):
-        is_earlier = has_root[index] & (root_fraction[index] < earliest_fraction)
-        earliest_fraction = jnp.where(is_earlier, root_fraction[index], earliest_fraction)
-        guard = jnp.where(is_earlier, index, guard)
+    for guard_index in reversed(range(len(root_fraction))):
+        guard = jnp.where(is_crossing[guard_index], guard_index, guard)
+    for guard_index in range(len(root_fraction)):
+        is_earlier = has_root[guard_index] & (root_fraction[guard_index] < earliest_fraction)
+        earliest_fraction = jnp.where(is_earlier, root_fraction[guard_index], earliest_fraction)
+        guard = jnp.where(is_earlier, guard_index, guard)
     return earliest_fraction, guard

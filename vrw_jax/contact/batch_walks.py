@@ -85,7 +85,9 @@ def step_batch_with_jacobian(
     config = _WalkConfig.from_model(model, options, n, True, len(input_columns))
     if len(states):  # The longest compilation starts first.
         _compile_walk(
-            config, input_columns.dtype, jax.tree.structure(eqx.filter(options, eqx.is_array))
+            config,
+            input_columns.dtype,
+            jax.tree.structure(eqx.filter(options, eqx.is_array)),
         )
     contact_codes = np.round(states[:, 4 + 2 * n :]).astype(int)
     step_inputs = np.concatenate([input_columns.T, states], 1)
@@ -336,8 +338,8 @@ def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callabl
 
     This function is used on platforms without machine code.
     """
-    move_axis = lambda results, source, destination: tuple(
-        jnp.moveaxis(x, source, destination) for x in results
+    move_axis = lambda result_arrays, source, destination: tuple(
+        jnp.moveaxis(x, source, destination) for x in result_arrays
     )
     compiled_function = jax.jit(
         lambda lane_independent, lane_rows: move_axis(
@@ -346,7 +348,7 @@ def _compile_with_xla(lane_function: Callable[[tuple, tuple], tuple]) -> Callabl
     )
 
     def run_in_blocks(lane_independent: list, lane_rows: list) -> tuple:
-        run_block = lambda *rows: compiled_function(tuple(lane_independent), rows)
+        run_block = lambda *block_rows: compiled_function(tuple(lane_independent), block_rows)
         return move_axis(
             map_in_batches(run_block, (batch_sizes.CONTACT_XLA_BATCH_SIZE,), *lane_rows), 0, -1
         )
@@ -400,7 +402,7 @@ class _WalkConfig(NamedTuple):
         options = eqx.combine(traced_options, self.static_options)
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # The caller has checked the solver.
-        rules = (
+        contact_rules = (
             self.is_one_sided,
             self.uses_paper_rule,
             self.has_tangents,
@@ -408,7 +410,7 @@ class _WalkConfig(NamedTuple):
             tableau,
             self.is_uneven,
         )
-        return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *rules)
+        return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *contact_rules)
 
     def input_row_counts(self) -> tuple[int, ...]:
         """Return the number of rows of each input: columns, states and, if requested, tangent
@@ -422,16 +424,16 @@ class _WalkConfig(NamedTuple):
 
     def result_structure(self, dtype: Any) -> Any:
         """Return shapes and dtypes of the results of one lane."""
-        result = _result_shapes(self.n_legs, dtype, self.has_tangents)
+        result_shapes = _result_shapes(self.n_legs, dtype, self.has_tangents)
         if not self.has_tangents:
-            return result
+            return result_shapes
         float_leaves = eqx.filter(
-            result.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
+            result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
         )
         add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
             (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
         )
-        return result, jax.tree.map(add_tangent_axis, float_leaves)
+        return result_shapes, jax.tree.map(add_tangent_axis, float_leaves)
 
 
 @functools.cache
@@ -460,11 +462,11 @@ def _run_walk(
         else None
     )
     inverse_lane_order = np.argsort(lane_order, kind="stable")
-    leaves, structure = _result_structure(config, dtype)
+    result_leaves, result_structure = _result_structure(config, dtype)
     if result_rows is None:
-        result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in leaves]
+        result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in result_leaves]
     return jax.tree.unflatten(
-        structure,
+        result_structure,
         [
             np.moveaxis(np.asarray(input_array), -1, 0)[inverse_lane_order]
             for input_array in result_rows

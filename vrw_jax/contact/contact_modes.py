@@ -129,7 +129,9 @@ class _FootEquations(NamedTuple):
 def _make_foot_equations(
     s: Symbols, inertia: ContactInverseInertia, slot_modes: Array, friction: Friction
 ) -> _FootEquations:
-    """Return the equations at the feet for these contact modes and friction."""
+    """Return the equations at both slots' feet for these contact modes and friction
+    coefficients.
+    """
     sin, cos = inertia.sin, inertia.cos
     sliding_coefficient = map_friction(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
@@ -402,8 +404,8 @@ CONTACT_MODE_TABLE, HELD_STOPPER_TABLE = _enumerate_combinations()
 the same shape and marks the held stoppers."""
 PAPER_RULE_ORDER = np.argsort(
     [
-        sum({ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(m), 5) for m in row)
-        for row in CONTACT_MODE_TABLE
+        sum({ContactMode.STICK: 0, ContactMode.OFF: 2}.get(ContactMode(mode), 5) for mode in modes)
+        for modes in CONTACT_MODE_TABLE
     ],
     kind="stable",
 )
@@ -430,13 +432,13 @@ class _OrderedTable(NamedTuple):
     def from_indices(cls, indices: np.ndarray) -> "_OrderedTable":
         """Return the table whose combinations are in the order of these indices."""
 
-        def pack_bits(flags: np.ndarray) -> CombinationMask:
-            masks = np.packbits(np.append(flags, False), bitorder="little").view("<i4")
+        def pack_bits(is_member: np.ndarray) -> CombinationMask:
+            masks = np.packbits(np.append(is_member, False), bitorder="little").view("<i4")
             return masks[0], masks[1]
 
-        modes, is_held = CONTACT_MODE_TABLE[indices].T, HELD_STOPPER_TABLE[indices].T
+        slot_modes, is_held = CONTACT_MODE_TABLE[indices].T, HELD_STOPPER_TABLE[indices].T
         mode_masks = [
-            [pack_bits(slot_values == mode) for mode in ContactMode] for slot_values in modes
+            [pack_bits(slot_values == mode) for mode in ContactMode] for slot_values in slot_modes
         ]
         return cls(mode_masks, [pack_bits(slot_values) for slot_values in is_held])
 
@@ -490,9 +492,9 @@ class AllowedModes(NamedTuple):
         return combine_masks(0), combine_masks(1)
 
 
-def contains_mode(modes: Array, mode: Array | int) -> Bool[Array, "..."]:
+def contains_mode(mode_set: Array, mode: Array | int) -> Bool[Array, "..."]:
     """Return whether a set of modes contains a mode."""
-    return ((modes >> mode) & 1) > 0
+    return ((mode_set >> mode) & 1) > 0
 
 
 class ChosenCombination(NamedTuple):
@@ -536,8 +538,10 @@ def _evaluate_violation(
     is_held: Array,
 ) -> Array:
     """Return the largest sign violation of a combination, in units of `tolerances`."""
-    is_infinite = map_friction(lambda value: ~jnp.isfinite(value), friction)
-    uses_friction_limit = map_friction(lambda value: value == jnp.inf, friction)
+    is_infinite = map_friction(lambda coefficient_value: ~jnp.isfinite(coefficient_value), friction)
+    uses_friction_limit = map_friction(
+        lambda coefficient_value: coefficient_value == jnp.inf, friction
+    )
     coefficient = finite_friction(friction)
     solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
     max_violation, holds_along_slope = jnp.zeros_like(solution.hub[0]), []
@@ -548,7 +552,9 @@ def _evaluate_violation(
             & (mode != ContactMode.OFF)
             & ((mode == ContactMode.STICK) | _friction_of_slot(i, uses_friction_limit))
         )
-        zero_if = lambda is_untested, value: jnp.where(is_untested, 0.0, value)
+        zero_if = lambda is_untested, coefficient_value: jnp.where(
+            is_untested, 0.0, coefficient_value
+        )
         is_untested = contains_mode(allowed_modes.untested_modes[i], mode)
         t, n, x, z = (
             slot_pair[i]
@@ -605,7 +611,7 @@ def _evaluate_violation(
 
 
 def _least_violating(
-    violation_of: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
+    evaluate_combination: Callable[[CombinationMask], Array], combinations: list[CombinationMask]
 ) -> tuple[CombinationMask, Array, Array]:
     """Return the first of the least violating combinations, its violation, and the number of
     admissible ones.
@@ -614,19 +620,19 @@ def _least_violating(
     would duplicate the code of `violation_of` for each use.
     """
     if len(combinations) == 1:
-        violation = violation_of(combinations[0])
+        violation = evaluate_combination(combinations[0])
         return combinations[0], violation, violation == 0.0
     first_masks, second_masks = (jnp.stack(masks) for masks in zip(*combinations, strict=True))
-    violations = jax.vmap(violation_of)((first_masks, second_masks))
+    violations = jax.vmap(evaluate_combination)((first_masks, second_masks))
     combination_indices = lax.broadcasted_iota(jnp.int32, violations.shape, 0)
 
     def pick_better(a: tuple, b: tuple) -> tuple:
         a_is_better = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
         return jnp.where(a_is_better, a[0], b[0]), jnp.where(a_is_better, a[1], b[1]), a[2] + b[2]
 
-    initial = np.array(np.inf, violations.dtype), np.int32(len(combinations)), np.int32(0)
+    initial_minimum = np.array(np.inf, violations.dtype), np.int32(len(combinations)), np.int32(0)
     operands = violations, combination_indices, (violations == 0.0).astype(jnp.int32)
-    violation, best_index, n_admissible = lax.reduce(operands, initial, pick_better, (0,))
+    violation, best_index, n_admissible = lax.reduce(operands, initial_minimum, pick_better, (0,))
     select_mask = lambda masks: jnp.sum(
         jnp.where(best_index == combination_indices, masks, 0), axis=0, dtype=jnp.int32
     )

@@ -172,7 +172,9 @@ def min_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> Elementw
 def accumulator_rates(
     dynamics: ModeDynamics, motion: WheelMotion, forces: ContactForces
 ) -> Accumulators:
-    """Return the time derivatives of the accumulators: 1, W, W, m/s."""
+    """Return the time derivatives of the accumulators: 1 (time), damping and sliding loss in W,
+    slip in m/s.
+    """
     slip_signs = slip_sign(dynamics.slot_modes)
     slip_speeds = [slip_signs[i] * forces.foot_velocity.x[i] for i in range(2)]
     friction_forces = [-forces.solution.tangential[i] * slip_signs[i] for i in range(2)]
@@ -234,7 +236,7 @@ def make_guard_layout(n: int, is_one_sided: bool) -> GuardLayout:
     """
     sizes = (n, n, 2, 2, 2, 2, 2, 1, 1, n if is_one_sided else 0)
     offsets = np.concatenate([[0], np.cumsum(sizes)])
-    return GuardLayout(*(int(offset) for offset in offsets))
+    return GuardLayout(*(int(guard_offset) for guard_offset in offsets))
 
 
 class ContactQuantities(NamedTuple):
@@ -302,7 +304,7 @@ def evaluate_guards(
         stack_friction(dynamics.friction)
     )
     is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
-    if_evaluated = lambda condition, value: jnp.where(condition, value, 1.0)
+    if_evaluated = lambda condition, guard_value: jnp.where(condition, guard_value, 1.0)
     airborne_guards = (
         []
         if quantities.airborne_stopper is None
@@ -338,8 +340,8 @@ def compute_guard_scales(dynamics: ModeDynamics) -> Array:
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's units of (hub x, z, theta, lengths) and of their rates."""
-    units, dimensionless = compute_wheel_units(s), jnp.ones_like(s.L0)
-    position_units = [units.length, units.length, dimensionless, *[units.length] * s.n]
+    units, angle_unit = compute_wheel_units(s), jnp.ones_like(s.L0)
+    position_units = [units.length, units.length, angle_unit, *[units.length] * s.n]
     rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
     return jnp.stack(position_units), jnp.stack(rate_units)
 

@@ -67,10 +67,10 @@ class ForceSolution(NamedTuple):
 
 def slip_sign(slot_modes: Array) -> SlotPair:
     """Return 1 for each slot's foot that slides downhill, -1 for uphill and 0 otherwise."""
-    sign = lambda mode: jnp.where(
+    sign_of_mode = lambda mode: jnp.where(
         mode == ContactMode.SLIP_DOWN, 1.0, jnp.where(mode == ContactMode.SLIP_UP, -1.0, 0.0)
     )
-    return sign(slot_modes[0]), sign(slot_modes[1])
+    return sign_of_mode(slot_modes[0]), sign_of_mode(slot_modes[1])
 
 
 class _FrozenTerms(NamedTuple):
@@ -128,8 +128,8 @@ def solve_configuration(
     length_motion = jnp.where(
         configuration.has_fixed_length, 0.0, outward_motion - slots.scatter(solution.pull) / s.m
     )
-    forces = solution.tangential, solution.normal, solution.stopper, solution.pull
-    return ForceSolution(*forces, solution.hub, solution.painleve_determinant, length_motion)
+    force_pairs = solution.tangential, solution.normal, solution.stopper, solution.pull
+    return ForceSolution(*force_pairs, solution.hub, solution.painleve_determinant, length_motion)
 
 
 def _solve_with_free_motion(
@@ -200,7 +200,10 @@ def _differentiable_solution(
             (free_motion,),
             (free_tangent,),
         )
-        add_pairs = lambda first, second: (first[0] + second[0], first[1] + second[1])
+        add_pairs = lambda first_pair, second_pair: (
+            first_pair[0] + second_pair[0],
+            first_pair[1] + second_pair[1],
+        )
         return solution, solution_tangent._replace(
             tangential=add_pairs(solution_tangent.tangential, residual.friction_force),
             pull=add_pairs(solution_tangent.pull, residual.pull),
@@ -367,7 +370,9 @@ def motion_equation_tangents(
     inertia: ContactInverseInertia,
     solution: ForceSolution,
 ) -> tuple[_FrozenTerms, _EquationTangents]:
-    """Return the frozen terms, and the tangents of the equations of motion."""
+    """Return the accelerations that are held constant, and the tangents of the equations of
+    motion.
+    """
     s, motion, slots = configuration.s, configuration.motion, configuration.slots
     ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
     b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
@@ -417,7 +422,9 @@ def _impact_equation_tangents(
     inertia: ContactInverseInertia,
     solution: ForceSolution,
 ) -> tuple[_FrozenTerms, _EquationTangents]:
-    """Return the frozen terms, and the tangents of the impact equations."""
+    """Return the velocity jumps that are held constant, and the tangents of the impact
+    equations.
+    """
     s = configuration.s
     motion = configuration.motion
     motion_tangent = tangent.motion

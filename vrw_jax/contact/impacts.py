@@ -83,7 +83,9 @@ def _leg_indices(n: int, reference: Array) -> np.ndarray:
 def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
     """Return the event of a guard, from the guard's index in `layout`."""
     n = layout.n_legs
-    select_flags = lambda start, count: guard == start + _leg_indices(count, guard)
+    select_flags = lambda first_index, n_guards: (
+        guard == first_index + _leg_indices(n_guards, guard)
+    )
     leaves_stopper = (
         select_flags(layout.airborne_release, n)
         if layout.n_guards > layout.airborne_release
@@ -263,24 +265,24 @@ def _apply_restitution(
     motion: WheelMotion,
     slots: Slots,
     inertia: ContactInverseInertia,
-    free: FreeMotion,
+    free_motion: FreeMotion,
 ) -> FreeMotion:
     """Return the velocities without impulses, changed by the rebound of striking feet by Newton's
     law.
     """
     if law.restitution is None:
-        return free
+        return free_motion
     rebound_speeds = [law.restitution * z for z in foot_velocity(motion, slots, inertia).z]
     # A foot whose rebound is slower than the rest speed is at rest.
     rebound_speeds = [jnp.where(z < -law.rest_speed, z, 0.0) for z in rebound_speeds]
-    return free._replace(
+    return free_motion._replace(
         foot_transverse=(
-            free.foot_transverse[0] - inertia.sin[0] * rebound_speeds[0],
-            free.foot_transverse[1] - inertia.sin[1] * rebound_speeds[1],
+            free_motion.foot_transverse[0] - inertia.sin[0] * rebound_speeds[0],
+            free_motion.foot_transverse[1] - inertia.sin[1] * rebound_speeds[1],
         ),
         foot_radial=(
-            free.foot_radial[0] + inertia.cos[0] * rebound_speeds[0],
-            free.foot_radial[1] + inertia.cos[1] * rebound_speeds[1],
+            free_motion.foot_radial[0] + inertia.cos[0] * rebound_speeds[0],
+            free_motion.foot_radial[1] + inertia.cos[1] * rebound_speeds[1],
         ),
     )
 
@@ -298,7 +300,7 @@ def _limit_energy_gain(
     energy. The result is the largest part of the rebound without an energy gain. Impulses stay in
     the cone of friction, because the cone is convex.
     """
-    compute_energy = lambda state: kinetic_energy(law.s, state)
+    compute_energy = lambda motion_state: kinetic_energy(law.s, motion_state)
     energy_inelastic, energy_newton = (
         compute_energy(inelastic_solution.motion),
         compute_energy(newton_solution.motion),
@@ -350,11 +352,13 @@ def _solve_velocity_level(
         & ~is_landing
         & (stack_friction(friction) == PAPER_RULE_SENTINEL)
     )
-    modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(jnp.int32)
-    modes = jnp.where(is_planted, 1 << slot_modes, modes)
+    allowed_slot_modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(
+        jnp.int32
+    )
+    allowed_slot_modes = jnp.where(is_planted, 1 << slot_modes, allowed_slot_modes)
     allowed = AllowedModes(
         allowed_modes=jnp.where(
-            event.is_impact, modes, 0
+            event.is_impact, allowed_slot_modes, 0
         ),  # Without an impact, no mode is examined.
         can_hold_stopper=slot_locked,
         has_fixed_mode=is_planted,
@@ -403,8 +407,10 @@ def _solve_velocity_level(
     if not law.is_one_sided:
         return solve(law, motion, is_airborne_locked, None), slots, is_airborne_locked
     is_tested = is_airborne_locked & event.is_impact
-    level, held = _solve_stopper_lcp(solve, law, motion, is_airborne_locked, is_tested, tolerances)
-    return level, slots, held
+    level_solution, is_held_airborne = _solve_stopper_lcp(
+        solve, law, motion, is_airborne_locked, is_tested, tolerances
+    )
+    return level_solution, slots, is_held_airborne
 
 
 def _following_modes(
@@ -477,9 +483,9 @@ def _solve_acceleration_level(
     )
     slides_up, slides_down = event.slides_up, event.slides_down
     is_second = (event.lifts_off | slides_up | slides_down)[1]
-    any_slot = lambda flags: jnp.any(flags, axis=0).astype(jnp.int32)
-    direction = any_slot(slides_down) - any_slot(slides_up)
-    may_open = ~slot_locked | event.releases_stopper
+    any_slot = lambda event_flags: jnp.any(event_flags, axis=0).astype(jnp.int32)
+    release_direction = any_slot(slides_down) - any_slot(slides_up)
+    may_leave_stopper = ~slot_locked | event.releases_stopper
     tolerances = SignTolerances(FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g)
 
     def solve(
@@ -492,12 +498,20 @@ def _solve_acceleration_level(
         free_motion = free_acceleration(s, motion, slots, inertia)
         if chosen_combination is None:
             is_consistent = is_release_consistent(
-                s, inertia, free_motion, (slot_modes, slot_locked), friction, is_second, direction
+                s,
+                inertia,
+                free_motion,
+                (slot_modes, slot_locked),
+                friction,
+                is_second,
+                release_direction,
             )
-            modes, untested = _following_modes(
+            possible_modes, untested = _following_modes(
                 event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
             )
-            allowed = AllowedModes(modes, ~may_open, was_resting & False, untested, may_open)
+            allowed = AllowedModes(
+                possible_modes, ~may_leave_stopper, was_resting & False, untested, may_leave_stopper
+            )
             chosen_combination = choose_combination(
                 s, inertia, free_motion, allowed, friction, tolerances, law.counts_solutions
             )
@@ -523,10 +537,10 @@ def _solve_acceleration_level(
             was_resting,
             is_airborne_locked,
         )
-    level, held = _solve_stopper_lcp(
+    level_solution, is_held_airborne = _solve_stopper_lcp(
         solve, law, motion, is_airborne_locked, is_airborne_locked, tolerances
     )
-    return level.chosen_combination, slots, was_resting, held
+    return level_solution.chosen_combination, slots, was_resting, is_held_airborne
 
 
 def _bring_to_rest(
@@ -592,10 +606,12 @@ def _merge_touching(
     A contact touches if its distance is below the smallest resolved bounce and it does not
     separate. If such contacts were resolved one by one, they would push each other off forever.
     """
-    s, legs = law.s, leg_directions(law.s, motion.theta)
+    s, directions = law.s, leg_directions(law.s, motion.theta)
     bounce_height = law.rest_speed**2 / (2.0 * s.g)
-    heights = foot_heights(motion, legs, law.tilt)
-    is_touching = (heights <= bounce_height) & (foot_speeds(motion, legs)[1] <= law.rest_speed)
+    heights = foot_heights(motion, directions, law.tilt)
+    is_touching = (heights <= bounce_height) & (
+        foot_speeds(motion, directions)[1] <= law.rest_speed
+    )
     lands = event.lands | (
         is_touching & (contact_state.contact_modes == ContactMode.OFF) & event.is_impact
     )
@@ -742,8 +758,10 @@ def project_motion(
 
     - `friction`: coefficient of sliding feet during the projection; None means 0.
     """
-    legs = leg_directions(s, motion.theta)
-    L = jnp.where((contact_modes != ContactMode.OFF) & ~is_locked, motion.z / legs.cos, motion.L)
+    directions = leg_directions(s, motion.theta)
+    L = jnp.where(
+        (contact_modes != ContactMode.OFF) & ~is_locked, motion.z / directions.cos, motion.L
+    )
     motion = motion._replace(L=jnp.where(is_locked, s.L0, L))
     slots = find_slots(contact_modes != ContactMode.OFF)
     is_airborne_locked = is_locked & ~slots.is_filled

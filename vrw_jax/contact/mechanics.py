@@ -85,8 +85,8 @@ def opaque_one(motion: "WheelMotion") -> Array:
 
 def stop_gradients(tree: Any) -> Any:
     """Return the tree with its floats constant for differentiation."""
-    floats, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(lax.stop_gradient(floats), rest)
+    float_leaves, other_leaves = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(float_leaves), other_leaves)
 
 
 class Slots(NamedTuple):
@@ -119,18 +119,20 @@ class Slots(NamedTuple):
 
     def gather(self, values: Array) -> SlotPair:
         """Return the entries of a quantity per leg for both slots; 0 for an empty slot."""
-        zero = jnp.zeros_like(values)
+        zeros = jnp.zeros_like(values)
         return (
-            sum_over_legs(jnp.where(self.first_mask, values, zero)),
-            sum_over_legs(jnp.where(self.second_mask, values, zero)),
+            sum_over_legs(jnp.where(self.first_mask, values, zeros)),
+            sum_over_legs(jnp.where(self.second_mask, values, zeros)),
         )
 
-    def scatter(self, pair: Any) -> LegArray:
+    def scatter(self, slot_pair: Any) -> LegArray:
         """Return a quantity per leg from that of both slots; 0 for legs in no slot.
 
         This is the inverse of `gather`.
         """
-        return jnp.where(self.first_mask, pair[0], 0.0) + jnp.where(self.second_mask, pair[1], 0.0)
+        return jnp.where(self.first_mask, slot_pair[0], 0.0) + jnp.where(
+            self.second_mask, slot_pair[1], 0.0
+        )
 
 
 def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> Slots:
@@ -167,30 +169,30 @@ class ContactInverseInertia(NamedTuple):
     K: tuple[Any, Any, Any]  # 11, 12, 22: of legs to stopper forces
 
 
-def apply_inverse(inverse_inertia: tuple[Any, ...], force: HubVector) -> HubVector:
+def apply_inverse(inverse_inertia: tuple[Any, ...], generalized_force: HubVector) -> HubVector:
     """Return the product of the symmetric inverse inertia and a vector."""
     xx, xz, xt, zz, zt, tt = inverse_inertia
     return (
-        xx * force[0] + xz * force[1] + xt * force[2],
-        xz * force[0] + zz * force[1] + zt * force[2],
-        xt * force[0] + zt * force[1] + tt * force[2],
+        xx * generalized_force[0] + xz * generalized_force[1] + xt * generalized_force[2],
+        xz * generalized_force[0] + zz * generalized_force[1] + zt * generalized_force[2],
+        xt * generalized_force[0] + zt * generalized_force[1] + tt * generalized_force[2],
     )
 
 
 def _invert_inertia(
-    s: Symbols, legs: LegDirections, b: LegArray, is_released: Array
+    s: Symbols, directions: LegDirections, b: LegArray, is_released: Array
 ) -> tuple[Any, ...]:
     """Return the inverse of the hub's 3 x 3 inertia after elimination of the released legs.
 
     The entries are xx, xz, x theta, zz, z theta, theta theta.
     """
-    sin = jnp.where(is_released, legs.sin, 0.0)
-    cos = jnp.where(is_released, legs.cos, 0.0)
+    sin = jnp.where(is_released, directions.sin, 0.0)
+    cos = jnp.where(is_released, directions.cos, 0.0)
     xx = s.Mt - s.m * sum_over_legs(sin * sin)
     xz = -s.m * sum_over_legs(sin * cos)
     zz = s.Mt - s.m * sum_over_legs(cos * cos)
-    xt = -s.m * sum_over_legs(b * legs.cos)
-    zt = s.m * sum_over_legs(b * legs.sin)
+    xt = -s.m * sum_over_legs(b * directions.cos)
+    zt = s.m * sum_over_legs(b * directions.sin)
     tt = s.m * sum_over_legs(b * b)
     c_xx, c_xz, c_xt = zz * tt - zt * zt, xt * zt - xz * tt, xz * zt - zz * xt
     inverse_determinant = 1.0 / (xx * c_xx + xz * c_xz + xt * c_xt)
@@ -215,8 +217,13 @@ class Posture(NamedTuple):
 
 def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
     """Return the directions of all legs, and the directions and lengths of the slots' legs."""
-    legs = leg_directions(s, motion.theta)
-    return Posture(legs, slots.gather(legs.sin), slots.gather(legs.cos), slots.gather(motion.L))
+    directions = leg_directions(s, motion.theta)
+    return Posture(
+        directions,
+        slots.gather(directions.sin),
+        slots.gather(directions.cos),
+        slots.gather(motion.L),
+    )
 
 
 def make_inverse_inertia(
@@ -226,9 +233,9 @@ def make_inverse_inertia(
 
     - `is_airborne_locked`: whether a leg is in the air on its stopper.
     """
-    legs, sin, cos, L = make_posture(s, motion, slots)
+    directions, sin, cos, L = make_posture(s, motion, slots)
     is_released = slots.is_filled | ~is_airborne_locked
-    inverse_inertia = _invert_inertia(s, legs, motion.L - s.a, is_released)
+    inverse_inertia = _invert_inertia(s, directions, motion.L - s.a, is_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
     z = (apply_inverse(inverse_inertia, e[0]), apply_inverse(inverse_inertia, e[1]))
@@ -236,7 +243,7 @@ def make_inverse_inertia(
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     plane_dot = lambda a, b: a[0] * b[0] + a[1] * b[1]
     return ContactInverseInertia(
-        legs,
+        directions,
         is_released,
         inverse_inertia,
         sin,
@@ -265,7 +272,7 @@ class FreeMotion(NamedTuple):
     foot_radial: SlotPair  # of the slots' feet, along the leg
 
 
-def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> LegArray:
+def free_leg_motion(s: Symbols, motion: WheelMotion, directions: LegDirections) -> LegArray:
     """Return the acceleration of each leg's length without contact force, m/s^2.
 
     The hub's acceleration along the leg is not included.
@@ -273,7 +280,9 @@ def free_leg_motion(s: Symbols, motion: WheelMotion, legs: LegDirections) -> Leg
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
     spring_force = s.k * (s.Ls - motion.L) - s.c * motion.dL
-    return centrifugal_acceleration - (legs.sin * gx + legs.cos * gz) + spring_force / s.m
+    return (
+        centrifugal_acceleration - (directions.sin * gx + directions.cos * gz) + spring_force / s.m
+    )
 
 
 def free_acceleration(
@@ -382,32 +391,35 @@ def foot_velocity(
 
 
 def foot_heights(
-    motion: WheelMotion, legs: LegDirections, tilt: Elementwise | None = None
+    motion: WheelMotion, directions: LegDirections, tilt: Elementwise | None = None
 ) -> LegArray:
     """Return the height of every foot above the slope, m.
 
     - `tilt`: angle by which the next line is steeper, rad. The height of the foremost foot is then
       that above the next line, which begins under the foot of Leg 1.
     """
-    heights = motion.z - motion.L * legs.cos
+    heights = motion.z - motion.L * directions.cos
     if tilt is None:
         return heights
-    downhill_positions = foot_positions(motion, legs)
+    downhill_positions = foot_positions(motion, directions)
     foremost_distance = downhill_positions[-1] - downhill_positions[0]
     foremost_height = heights[-1] * jnp.cos(tilt) + foremost_distance * jnp.sin(tilt)
     return jnp.concatenate([heights[:-1], foremost_height[None]])
 
 
-def foot_speeds(motion: WheelMotion, legs: LegDirections) -> tuple[LegArray, LegArray]:
+def foot_speeds(motion: WheelMotion, directions: LegDirections) -> tuple[LegArray, LegArray]:
     """Return the velocity of every foot along the slope and normal to the slope, m/s."""
     transverse_velocity = motion.L * motion.dtheta
-    tangential_speed = motion.vx - motion.dL * legs.sin - transverse_velocity * legs.cos
-    return tangential_speed, motion.vz - motion.dL * legs.cos + transverse_velocity * legs.sin
+    tangential_speed = motion.vx - motion.dL * directions.sin - transverse_velocity * directions.cos
+    return (
+        tangential_speed,
+        motion.vz - motion.dL * directions.cos + transverse_velocity * directions.sin,
+    )
 
 
-def foot_positions(motion: WheelMotion, legs: LegDirections) -> LegArray:
+def foot_positions(motion: WheelMotion, directions: LegDirections) -> LegArray:
     """Return the downhill position of every foot, m."""
-    return motion.x - motion.L * legs.sin
+    return motion.x - motion.L * directions.sin
 
 
 def landing_position(n: int, motion: WheelMotion) -> Elementwise:
@@ -418,10 +430,10 @@ def landing_position(n: int, motion: WheelMotion) -> Elementwise:
 
 def kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     """Return the kinetic energy of the hub and all leg masses, J."""
-    legs = leg_directions(s, motion.theta)
+    directions = leg_directions(s, motion.theta)
     transverse_velocity = (motion.L - s.a) * motion.dtheta
-    x = motion.vx - motion.dL * legs.sin - transverse_velocity * legs.cos
-    z = motion.vz - motion.dL * legs.cos + transverse_velocity * legs.sin
+    x = motion.vx - motion.dL * directions.sin - transverse_velocity * directions.cos
+    z = motion.vz - motion.dL * directions.cos + transverse_velocity * directions.sin
     hub_mass = s.Mt - s.n * s.m
     return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
 
@@ -430,8 +442,8 @@ def potential_energy(s: Symbols, motion: WheelMotion) -> SlotPair:
     """Return the gravitational energy relative to the origin, and the elastic energy of all
     springs, J.
     """
-    legs = leg_directions(s, motion.theta)
-    x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * legs.sin)
-    z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * legs.cos)
+    directions = leg_directions(s, motion.theta)
+    x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * directions.sin)
+    z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * directions.cos)
     elastic_energy = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
     return s.g * (z * s.cos_phi - x * s.sin_phi), elastic_energy

@@ -32,9 +32,9 @@ def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
 
     Angles and codes have the unit 1.
     """
-    dimensionless = units.length / units.length
-    hub_units = [dimensionless, units.rate, units.speed, units.speed]
-    return [*hub_units, *[units.length] * n, *[units.speed] * n, *[dimensionless] * n]
+    angle_unit = units.length / units.length
+    hub_units = [angle_unit, units.rate, units.speed, units.speed]
+    return [*hub_units, *[units.length] * n, *[units.speed] * n, *[angle_unit] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
@@ -115,9 +115,11 @@ def _unpack_posture(
     )
     L = jnp.where(is_locked, s.L0, L)
     directions = leg_directions(s, theta)
-    hub = L[0] * directions.sin[0], L[0] * directions.cos[0]
-    L = jnp.where((contact_modes != ContactMode.OFF) & ~is_locked, hub[1] / directions.cos, L)
-    return theta, hub, L, dL, contact_modes, is_locked
+    hub_position = L[0] * directions.sin[0], L[0] * directions.cos[0]
+    L = jnp.where(
+        (contact_modes != ContactMode.OFF) & ~is_locked, hub_position[1] / directions.cos, L
+    )
+    return theta, hub_position, L, dL, contact_modes, is_locked
 
 
 def _is_consistent_posture(s: Symbols, x: FullState) -> Bool[Array, "..."]:

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from vrw_jax.contact.batch_integrator import (
     IntervalPoint,
-    attempt_step,
+    attempt_solver_step,
     init_interval,
     motion_from_point,
 )
@@ -54,19 +54,19 @@ from vrw_jax.wheel import stack_parameters
 class ContactStepConfig(NamedTuple):
     """Static configuration of a step, and the functions of its array leaves."""
 
-    structure: Any  # tree structure of (wheel, params, x, options)
+    argument_structure: Any  # tree structure of (wheel, params, x, options)
     is_detailed: bool
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return the lanes' input columns and section states, and (wheel, params, options)."""
-        wheel, params, x, options = jax.tree.unflatten(self.structure, leaves)
+        wheel, params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
         uneven_columns = () if wheel.uneven is None else wheel.uneven
         input_columns = jnp.stack([*stack_parameters(params), wheel.friction, *uneven_columns])
         return input_columns, x, (wheel, params, options)
 
-    def make_walk_settings(self, settings: Any) -> BatchWalkSettings:
+    def make_walk_settings(self, step_settings: Any) -> BatchWalkSettings:
         """Return the settings of a batch of walks of one step each."""
-        wheel, params, options = settings
+        wheel, params, options = step_settings
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # The caller has checked the solver.
         contact_rules = (
@@ -91,19 +91,21 @@ class ContactStepConfig(NamedTuple):
 
         The leaves have the lanes on their last axis.
         """
-        input_columns, x, settings = self.unpack_leaves(leaves)
-        return _partition_result(run_walks(self.make_walk_settings(settings), input_columns, x))
+        input_columns, x, step_settings = self.unpack_leaves(leaves)
+        return _partition_result(
+            run_walks(self.make_walk_settings(step_settings), input_columns, x)
+        )
 
     def compute_tangents(self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
         """Return the tangents of the result's floats, the floats, and the other arrays.
 
         Each lane has one tangent of its leaves.
         """
-        input_columns, x, settings = self.unpack_leaves(leaves)
+        input_columns, x, step_settings = self.unpack_leaves(leaves)
         d_columns, d_x = (tangent_rows[None] for tangent_rows in self.unpack_leaves(tangents)[:2])
         n_tangents = jnp.ones_like(input_columns[0], jnp.int32)
         walk_result, result_tangents = walk_with_tangents(
-            self.make_walk_settings(settings), input_columns, x, d_columns, d_x, n_tangents
+            self.make_walk_settings(step_settings), input_columns, x, d_columns, d_x, n_tangents
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
         return _partition_result(walk_result._replace(step_result=result_tangents))[
@@ -128,38 +130,38 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     return eqx.partition(step_result, eqx.is_inexact_array)
 
 
-def build_contact_step_function(structure: Any, is_detailed: bool) -> ForwardFunction:
+def build_contact_step_function(argument_structure: Any, is_detailed: bool) -> ForwardFunction:
     """Return a function from the leaves of (wheel, params, x, options) to the floats and others of
     a step.
 
     The function is a forward rule from which all AD modes are built.
     """
-    config = ContactStepConfig(structure, is_detailed)
-    cache_key = "step on real ground", str(structure), is_detailed
+    config = ContactStepConfig(argument_structure, is_detailed)
+    cache_key = "step on real ground", str(argument_structure), is_detailed
     return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
 
 
 def build_contact_step_jacobian(
-    structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
+    argument_structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
     """Return a function that computes the Jacobian of `build_contact_step_function`.
 
     The function returns (Jacobian with respect to the leaves at `input_indices`, floats) and the
     other outputs.
     """
-    config = ContactStepConfig(structure, is_detailed)
+    config = ContactStepConfig(argument_structure, is_detailed)
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
-        value, other_outputs = config.make_template(*leaves)
-        return value, value, other_outputs
+        float_outputs, other_outputs = config.make_template(*leaves)
+        return float_outputs, float_outputs, other_outputs
 
-    cache_key = "step on real ground along directions", str(structure), is_detailed
+    cache_key = "step on real ground along directions", str(argument_structure), is_detailed
     compute_tangents = unbatch(
         cached_lane_function(config.compute_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
-        *settings, options = jax.tree.unflatten(structure, leaves)
+        *settings, options = jax.tree.unflatten(argument_structure, leaves)
         leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
         unit_tangents = np.eye(sum(np.size(leaves[i]) for i in input_indices))
         tangents, leaf_offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
@@ -170,12 +172,15 @@ def build_contact_step_jacobian(
             tangents[i] = jnp.asarray(
                 leaf_tangents.reshape(-1, *jnp.shape(leaves[i])), leaves[i].dtype
             )
-        axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
-        jacobian_columns, value, other_outputs = jax.vmap(compute_tangents, (None, axes))(
-            leaves, tuple(tangents)
-        )
-        value, other_outputs = jax.tree.map(lambda x: x[0], (value, other_outputs))
-        return (split_jacobian(jacobian_columns, leaves, input_indices), value), other_outputs
+        batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
+        jacobian_columns, float_outputs, other_outputs = jax.vmap(
+            compute_tangents, (None, batch_axes)
+        )(leaves, tuple(tangents))
+        float_outputs, other_outputs = jax.tree.map(lambda x: x[0], (float_outputs, other_outputs))
+        return (
+            split_jacobian(jacobian_columns, leaves, input_indices),
+            float_outputs,
+        ), other_outputs
 
     return evaluate_jacobian
 
@@ -223,7 +228,7 @@ def sample_interval(
         sample_state: tuple[IntervalPoint, Array], step_size: Array
     ) -> tuple[tuple[IntervalPoint, Array], Array]:
         start_point, accumulators = sample_state
-        attempt = attempt_step(
+        attempt = attempt_solver_step(
             dynamics, tableau, options, initial_interval._replace(point=start_point, h=step_size)
         )
         assert attempt.accumulator_increments is not None
@@ -248,22 +253,24 @@ def sample_interval(
 
 
 @functools.cache
-def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., SampledIntervals]:
+def build_contact_step_sampler(
+    argument_structure: Any, n_samples: int
+) -> Callable[..., SampledIntervals]:
     """Return a function from the leaves of (wheel, params, x, options) to the sampled motion of a
     step.
 
     The function has no derivatives.
     """
-    config = ContactStepConfig(structure, True)
-    cache_key = str(structure)
+    config = ContactStepConfig(argument_structure, True)
+    cache_key = str(argument_structure)
 
     def begin_lane(*leaves: Array) -> Any:
-        input_columns, x, settings = config.unpack_leaves(leaves)
-        return init_lane_states(config.make_walk_settings(settings), input_columns, x)[1]
+        input_columns, x, step_settings = config.unpack_leaves(leaves)
+        return init_lane_states(config.make_walk_settings(step_settings), input_columns, x)[1]
 
     def advance_to_event(leaves: tuple[Array, ...], lane_state: Any) -> tuple[Any, IntervalLog]:
-        input_columns, x, settings = config.unpack_leaves(leaves)
-        walk_settings = config.make_walk_settings(settings)
+        input_columns, x, step_settings = config.unpack_leaves(leaves)
+        walk_settings = config.make_walk_settings(step_settings)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
             walk_settings.replace_invalid(input_columns, x)[0],
@@ -283,8 +290,8 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
         )
 
     def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
-        input_columns, x, settings = config.unpack_leaves(leaves)
-        walk_settings, no_leg_flags = config.make_walk_settings(settings), log.locked & False
+        input_columns, x, step_settings = config.unpack_leaves(leaves)
+        walk_settings, no_leg_flags = config.make_walk_settings(step_settings), log.locked & False
         contact_state = ContactState(
             log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags
         )
@@ -302,7 +309,7 @@ def build_contact_step_sampler(structure: Any, n_samples: int) -> Callable[..., 
         return sample_interval(dynamics, motion, *sampling_arguments)
 
     def sample_step(*leaves: Array) -> SampledIntervals:
-        wheel, params, *_ = jax.tree.unflatten(structure, leaves)
+        wheel, params, *_ = jax.tree.unflatten(argument_structure, leaves)
         initial_state = compiled_start(*leaves)
         log_template = jax.eval_shape(compiled_advance, leaves, initial_state)[1]
         allocate = lambda leaf: jnp.zeros((wheel.max_events, *leaf.shape), leaf.dtype)

@@ -361,7 +361,9 @@ def make_unilateral_step(
     - `tilt`: angle by which the next line is steeper, rad.
     """
     landing_place = landing_position(motion.L.shape[0], motion)
-    replace_nonfinite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
+    replace_nonfinite = lambda record_value: jnp.where(
+        jnp.isfinite(record_value), record_value, 0.0
+    )
     details = details._replace(
         margins=jax.tree.map(replace_nonfinite, details.margins),
         fewest_solutions=jnp.where(counters.n_events > 0, details.fewest_solutions, 0),

@@ -129,8 +129,8 @@ class _PointLinearization(NamedTuple):
     def make_leg_residual(
         self, leg_slice: slice
     ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]:
-        """Return a function from a tangent to the residual tangent of some legs, and to their
-        slots.
+        """Return a function of a tangent to the residual's tangent for some legs, and to the slots
+        of these legs.
         """
         static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
         configuration = _restrict_legs(self.configuration, leg_slice)
@@ -142,13 +142,13 @@ class _PointLinearization(NamedTuple):
 
         @jax.jit  # The residual is traced once.
         def compute_residual(tangent: ContactConfiguration) -> ResidualTangent:
-            arguments = (
+            residual_arguments = (
                 configuration,
                 _restrict_legs(eqx.combine(tangent, static_leaves), leg_slice),
                 hub,
                 solution,
             )
-            return residual_jvp(*arguments, *motion_equation_tangents(*arguments))
+            return residual_jvp(*residual_arguments, *motion_equation_tangents(*residual_arguments))
 
         return lambda tangent: (compute_residual(tangent), configuration.slots)
 
@@ -381,7 +381,9 @@ class TangentBasis(NamedTuple):
         q, v = coordinate_tangent_fn(slice(0, 3 + N_MOVING_LEGS))
         theta, dtheta, first_length_tangents = q[2], v[2], (q[3:], v[3:])
         later_length_tangents = lambda: coordinate_tangent_fn(slice(3 + N_MOVING_LEGS, None))
-        add_trees = lambda first, second: jax.tree.map(operator.add, first, second)
+        add_trees = lambda first_tree, second_tree: jax.tree.map(
+            operator.add, first_tree, second_tree
+        )
         length_response = self._propagate_lengths(0, *first_length_tangents)
         length_response = run_if_any(
             has_later_moving_legs,
@@ -475,7 +477,7 @@ class TangentBasis(NamedTuple):
         L: Any,
         dL: Any,
     ) -> Array:
-        """Return the tangents of the length accelerations of one group of legs."""
+        """Return the tangents of the length accelerations of one group of legs, m/s^2."""
         (length_response, rate_response), leg_slice, linearization = (
             self.length_responses[group_index],
             _LEG_GROUP_SLICES[group_index],
@@ -486,7 +488,7 @@ class TangentBasis(NamedTuple):
             column_leg_response[leg_slice],
         )
         configuration = _restrict_legs(linearization.configuration, leg_slice)
-        sin, cos = (row[leg_slice] for row in linearization.inertia.legs)
+        sin, cos = (leg_row[leg_slice] for leg_row in linearization.inertia.legs)
         outward_motion = (
             angle_response
             + length_response.leg_lengths * L

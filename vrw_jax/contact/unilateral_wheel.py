@@ -301,11 +301,11 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
         """Return the outputs of a step, and the name of the engine that computed them."""
-        (leaves, structure), engine = (
+        (leaves, argument_structure), engine = (
             self._flatten_arguments(params, x, options),
             self._choose_engine(options),
         )
-        return eqx.combine(*_compile_step(structure, is_detailed, engine)(*leaves)), engine
+        return eqx.combine(*_compile_step(argument_structure, is_detailed, engine)(*leaves)), engine
 
     def _flatten_arguments(
         self, params: WheelParams, x: FullState, options: StepOptions
@@ -338,8 +338,8 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
         if self._choose_engine(options) == "lanes":
-            leaves, structure = self._flatten_arguments(params, x, options)
-            samples = build_contact_step_sampler(structure, n_samples)(*leaves)
+            leaves, argument_structure = self._flatten_arguments(params, x, options)
+            samples = build_contact_step_sampler(argument_structure, n_samples)(*leaves)
         else:
             samples = self._sample_with_diffrax(params, x, options, n_samples)
         interval_log, step_summary = samples.log, samples.summary
@@ -405,7 +405,9 @@ class UnilateralWheel(AbstractWheel):
 
 
 def _foot_friction(wheel: UnilateralWheel, friction: Elementwise) -> Friction:
-    """Return the friction of all feet, or of the foot that landed last and of the others."""
+    """Return the coefficient of friction of all feet, or a pair: of the foot that landed last and
+    of the others.
+    """
     friction = apply_friction_rule(friction, wheel.uses_paper_rule)
     if wheel.uneven is None:
         return friction
@@ -464,15 +466,15 @@ def _advance_to_event(
     """Return the state of the event loop at the next event."""
     motion, accumulators = unpack_state(event_loop_state.state)
     event_arguments = event_loop_state.guard, event_loop_state.counters.n_events, max_events
-    result, event, outcome = process_event(
+    event_result, event, outcome = process_event(
         law, layout, motion, event_loop_state.contact_state, *event_arguments
     )
     dynamics = make_mode_dynamics(
-        law.s, law.friction, law.is_one_sided, result.contact_state, tilt=law.tilt
+        law.s, law.friction, law.is_one_sided, event_result.contact_state, tilt=law.tilt
     )
     is_valid = outcome == Outcome.STEPPED
     start_state = pack_state(
-        result.motion,
+        event_result.motion,
         accumulators._replace(time_since_event=jnp.zeros_like(accumulators.time_since_event)),
     )
     start_state = jnp.where(is_valid, start_state, event_loop_state.state)
@@ -488,10 +490,10 @@ def _advance_to_event(
 
     counters = event_loop_state.counters._replace(n_events=event_loop_state.counters.n_events + 1)
     counters = add_interval(
-        counters, result.contact_state, interval_end.duration, interval_end.solver_steps
+        counters, event_result.contact_state, interval_end.duration, interval_end.solver_steps
     )
     end_forces = (
-        compute_forces(dynamics, result.motion),
+        compute_forces(dynamics, event_result.motion),
         compute_forces(dynamics, unpack_state(interval_end.state)[0]),
     )
     determinant_before, determinant_after = (
@@ -517,7 +519,9 @@ def _advance_to_event(
     outcome = interval_outcome(*outcome_arguments, is_resting, max_events)
     details, log = event_loop_state.details, event_loop_state.log
     if details is not None:
-        details = record_event(details, event_loop_state.counters.n_events == 0, result, event)
+        details = record_event(
+            details, event_loop_state.counters.n_events == 0, event_result, event
+        )
         stopper_forces = [
             min_stopper_force(dynamics, event_arguments) for event_arguments in end_forces
         ]
@@ -527,8 +531,8 @@ def _advance_to_event(
     if log is not None:
         log_entry = IntervalLog(
             start_state,
-            result.contact_state.contact_modes,
-            result.contact_state.locked,
+            event_result.contact_state.contact_modes,
+            event_result.contact_state.locked,
             interval_end.duration,
         )
         log = jax.tree.map(
@@ -540,7 +544,7 @@ def _advance_to_event(
         )
     return _EventLoopState(
         state=interval_end.state,
-        contact_state=result.contact_state,
+        contact_state=event_result.contact_state,
         guard=guard,
         outcome=outcome.astype(jnp.int32),
         is_running=(outcome == Outcome.STEPPED) & ~has_landed,
@@ -554,13 +558,13 @@ _embed_compiled = jax.jit(lambda params, x: embed_section_state(params.symbols()
 
 
 @functools.cache
-def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
+def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> ForwardFunction:
     """Return the step over the leaves of (wheel, params, x, options), differentiable in any
     mode.
     """
 
     def compute_step(tightens_tolerances: bool, *leaves: Array) -> tuple:
-        wheel, params, x, options = jax.tree.unflatten(structure, leaves)
+        wheel, params, x, options = jax.tree.unflatten(argument_structure, leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options
         event_loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
         tilt = None if wheel.uneven is None else wheel.uneven.tilt
@@ -571,13 +575,13 @@ def _compile_step(structure: Any, is_detailed: bool, engine: str) -> ForwardFunc
         )
         return eqx.partition(outputs, eqx.is_inexact_array)
 
-    evaluate, evaluate_tighter = partial(compute_step, False), partial(compute_step, True)
+    step_fn, tight_step_fn = partial(compute_step, False), partial(compute_step, True)
     if engine == "diffrax":
-        return enable_all_ad_modes(evaluate, evaluate_tighter)
-    static_config = structure, is_detailed
+        return enable_all_ad_modes(step_fn, tight_step_fn)
+    static_config = argument_structure, is_detailed
     return enable_all_ad_modes(
         build_contact_step_function(*static_config),
-        evaluate_tighter,
+        tight_step_fn,
         partial(build_contact_step_jacobian, *static_config),
     )
 

@@ -139,24 +139,26 @@ class LaneState(NamedTuple):
     outcome: Array
 
     def get_differentiable(self) -> DifferentiableLaneState:
-        """Return the differentiable part of the state."""
+        """Return the differentiable part of the lane state."""
         point, details = self.interval.point, eqx.filter(self.details, eqx.is_inexact_array)
         accumulators = self.step_accumulators, self.interval.interval_accumulators
         return DifferentiableLaneState(
             point.q, point.v, accumulators, self.interval.time, self.counters.durations, details
         )
 
-    def replace_differentiable(self, differentiable: DifferentiableLaneState) -> "LaneState":
-        """Return the state with another differentiable part."""
-        step_accumulators, interval_accumulators = differentiable.accumulators
-        point = self.interval.point._replace(q=differentiable.q, v=differentiable.v)
+    def replace_differentiable(self, differentiable_state: DifferentiableLaneState) -> "LaneState":
+        """Return the lane state with its differentiable part replaced."""
+        step_accumulators, interval_accumulators = differentiable_state.accumulators
+        point = self.interval.point._replace(q=differentiable_state.q, v=differentiable_state.v)
         other_details = eqx.filter(self.details, eqx.is_inexact_array, inverse=True)
         return self._replace(
             interval=self.interval._replace(
-                point=point, interval_accumulators=interval_accumulators, time=differentiable.time
+                point=point,
+                interval_accumulators=interval_accumulators,
+                time=differentiable_state.time,
             ),
-            counters=self.counters._replace(durations=differentiable.durations),
-            details=eqx.combine(differentiable.details, other_details),
+            counters=self.counters._replace(durations=differentiable_state.durations),
+            details=eqx.combine(differentiable_state.details, other_details),
             step_accumulators=step_accumulators,
         )
 
@@ -201,7 +203,9 @@ class BatchWalkSettings(NamedTuple):
         return input_columns[N_PARAMETERS + 2] if self.is_uneven else None
 
     def begin_walk(self, input_columns: Array, x: Array) -> LaneState:
-        """Return the lanes at the first landing of their walk, before its impact is resolved."""
+        """Return the state of the lanes at the first landing of their walk, before the impact is
+        resolved.
+        """
         motion, contact_state = unpack_section_state(self.unpack_columns(input_columns)[0], x)
         dynamics = self.make_dynamics(input_columns, contact_state)
         interval = zeros_like_output(lambda: init_interval(dynamics, motion, self.options.dt0))
@@ -300,20 +304,22 @@ class BatchWalkSettings(NamedTuple):
         law_arguments = s, friction, self.options, self.is_one_sided, self.is_detailed
         law = make_contact_law(*law_arguments, tilt=self.tilt(input_columns))
         event_arguments = guard, counters.n_events, self.max_events
-        result, event, event_outcome = process_event(
+        event_result, event, event_outcome = process_event(
             law, layout, motion, contact_state, *event_arguments
         )
-        dynamics = self.make_dynamics(input_columns, result.contact_state)
-        next_interval = init_interval(*stop_gradients((dynamics, result.motion, self.options.dt0)))
-        q, v = pack_coordinates(result.motion)
+        dynamics = self.make_dynamics(input_columns, event_result.contact_state)
+        next_interval = init_interval(
+            *stop_gradients((dynamics, event_result.motion, self.options.dt0))
+        )
+        q, v = pack_coordinates(event_result.motion)
         status = jnp.where(event_outcome != Outcome.STEPPED, event_outcome, next_interval.status)
         next_interval = next_interval._replace(
             point=next_interval.point._replace(q=q, v=v), status=status
         )
         if details is not None:
-            details = record_event(details, counters.n_events == 0, result, event)
+            details = record_event(details, counters.n_events == 0, event_result, event)
             zero_duration = jnp.zeros_like(motion.x)
-            details = record_stopper_force(details, dynamics, result.motion, zero_duration)
+            details = record_stopper_force(details, dynamics, event_result.motion, zero_duration)
         counters = counters._replace(n_events=counters.n_events + 1)
         continued_lane = LaneState(
             next_interval, counters, details, step_accumulators, n_stepped, lane_state.outcome
@@ -389,8 +395,8 @@ def record_stopper_force(
     details: StepDetails, dynamics: ModeDynamics, motion: WheelMotion, duration: Array
 ) -> StepDetails:
     """Return the details with the stopper forces at one end of an interval of this duration (s)."""
-    force = min_stopper_force(dynamics, compute_forces(dynamics, motion))
-    return record_interval(details, dynamics.slot_modes, duration, force)
+    stopper_force = min_stopper_force(dynamics, compute_forces(dynamics, motion))
+    return record_interval(details, dynamics.slot_modes, duration, stopper_force)
 
 
 def init_lane_states(
@@ -415,8 +421,8 @@ def process_and_integrate(
     """
     state_after_events = walk_settings.process_events(input_columns, lane_state)
     has_unfinished_walk = state_after_events.outcome == STATUS_UNFINISHED
-    dynamics_fn = lambda columns: walk_settings.make_dynamics(
-        columns, state_after_events.interval.contact_state
+    dynamics_fn = lambda input_columns_at: walk_settings.make_dynamics(
+        input_columns_at, state_after_events.interval.contact_state
     )
     has_unfinished_walk = has_unfinished_walk & (not waits_for_events)
     interval = integrate_interval(

@@ -23,7 +23,7 @@ from vrw_jax.contact.batch_integrator import (
     IntervalPoint,
     IntervalState,
     LaneStatus,
-    complete_attempt,
+    complete_solver_step,
     compute_stage_state,
     evaluate_dynamics,
     evaluate_guards_at_point,
@@ -144,12 +144,12 @@ def _pack_rows(tree: Any) -> Array:
 def _unpack_rows(rows: Array, template: Any) -> Any:
     """Return rows as a tree of the template's structure: the inverse of `_pack_rows`."""
     leaves, structure = jax.tree.flatten(template)
-    arrays, offset = [], 0
+    arrays, row_offset = [], 0
     for leaf in leaves:
-        size = math.prod(leaf.shape[:-1])
-        leaf_rows = rows[..., offset : offset + size, :]
+        n_leaf_rows = math.prod(leaf.shape[:-1])
+        leaf_rows = rows[..., row_offset : row_offset + n_leaf_rows, :]
         arrays.append(leaf_rows.reshape(*rows.shape[:-2], *leaf.shape))
-        offset += size
+        row_offset += n_leaf_rows
     return jax.tree.unflatten(structure, arrays)
 
 
@@ -316,7 +316,7 @@ def _integrate_with_tangents(
             tableau,
             has_later_moving_legs,
         )
-        attempt = complete_attempt(dynamics, tableau, options, interval, stage_rows)
+        attempt = complete_solver_step(dynamics, tableau, options, interval, stage_rows)
         next_interval = integrator_step(interval, attempt, guard_scales, tableau, options)
         is_state_updated, n = next_interval.time != interval.time, len(interval.point.q)
 
@@ -551,13 +551,16 @@ def _shift_to_event(
         guard_tangents = guard_pushforward(
             _unpack_tangent(tangents.column_tangents, k, input_columns), tangent.q, tangent.v
         )
-        for index in range(len(guard_tangents)):
+        for guard_index in range(len(guard_tangents)):
             is_at_guard = (
-                has_reached_event & (interval.triggered_guard == index) & (guard_rates[index] < 0.0)
+                has_reached_event
+                & (interval.triggered_guard == guard_index)
+                & (guard_rates[guard_index] < 0.0)
             )
             time_tangent = jnp.where(
                 is_at_guard,
-                -guard_tangents[index] / jnp.where(is_at_guard, guard_rates[index], -1.0),
+                -guard_tangents[guard_index]
+                / jnp.where(is_at_guard, guard_rates[guard_index], -1.0),
                 time_tangent,
             )
         interval_accumulators = tangent.interval_accumulators

@@ -90,7 +90,7 @@ STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class BatchAdvanceResult(NamedTuple):
-    """Minimal results of one gait step of every lane."""
+    """Minimal results of one gait step of every lane: next section state, durations, outcome."""
 
     section_state: Vector  # (theta-, dtheta-, dL1-), three arrays
     durations: Vector  # of DLS, SLS-I, SLS-II, s
@@ -133,7 +133,9 @@ def make_batch_phase(
         lambda stage: phase.dynamics_residual(
             motion_at_stage(stage), stage.acceleration.acceleration
         ),
-        lambda stage, rows: phase.solve_dynamics(motion_at_stage(stage), rows),
+        lambda stage, right_hand_side: phase.solve_dynamics(
+            motion_at_stage(stage), right_hand_side
+        ),
     )
     margin_functions = lambda stage: phase.margins(make_instant(stage))
     monitored_margins = (
@@ -164,7 +166,7 @@ def take_gait_step(
 
     - `straggler_count`: see `integrate_batch_phase`.
     """
-    sequence = run_batch_phases(
+    phase_sequence = run_batch_phases(
         params,
         x,
         options,
@@ -173,12 +175,12 @@ def take_gait_step(
         records_margins=False,
         straggler_count=straggler_count,
     )
-    phase_ends, has_stepped = sequence.phase_ends, sequence.outcome == Outcome.STEPPED
-    next_section = next_section_state(sequence)
+    phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
+    next_section = next_section_state(phase_sequence)
     return BatchAdvanceResult(
         section_state=tuple(jnp.where(has_stepped, value, 0.0) for value in next_section),
-        durations=tuple(end.duration for end in phase_ends),
-        outcome=sequence.outcome,
+        durations=tuple(phase_end.duration for phase_end in phase_ends),
+        outcome=phase_sequence.outcome,
         solver_steps=phase_ends[0].n_solver_steps
         + phase_ends[1].n_solver_steps
         + phase_ends[2].n_solver_steps,
@@ -215,7 +217,7 @@ def take_step_after_landing(
       in the frame of the next line, see `split_slopes`.
     """
     theta, dtheta = y
-    sequence = run_batch_phases(
+    phase_sequence = run_batch_phases(
         params,
         (theta + params.leg_angle, dtheta, 0.0 * dtheta),
         options,
@@ -225,23 +227,23 @@ def take_step_after_landing(
         straggler_count=straggler_count,
         land=transitions.start_on_both_feet,
     )
-    phase_ends, has_stepped = sequence.phase_ends, sequence.outcome == Outcome.STEPPED
+    phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
     next_section = tuple(
         jnp.where(has_stepped, value, jnp.asarray(safe_value, value.dtype))
-        for value, safe_value in zip(next_section_state(sequence), PAPER_START, strict=True)
+        for value, safe_value in zip(next_section_state(phase_sequence), PAPER_START, strict=True)
     )
-    landing = with_batched_jvp(transitions.land)(sequence.s, *next_section)
+    landing = with_batched_jvp(transitions.land)(phase_sequence.s, *next_section)
     landing_rows = landing.theta, landing.motion.dtheta, landing.rear_impulse.normal
-    landing_values = [jnp.where(has_stepped, row, 0.0) for row in landing_rows]
-    sls1 = sequence.phases[1]
+    landing_values = [jnp.where(has_stepped, landing_row, 0.0) for landing_row in landing_rows]
+    sls1 = phase_sequence.phases[1]
     order_margin = with_batched_jvp(_event_order_margin)(
-        sequence.s, sls1.tilt_sin_cos, phase_ends[1].q, phase_ends[1].v
+        phase_sequence.s, sls1.tilt_sin_cos, phase_ends[1].q, phase_ends[1].v
     )
-    order_margin = jnp.where(sequence.phases_happened[1], order_margin, 0.0)
+    order_margin = jnp.where(phase_sequence.phases_happened[1], order_margin, 0.0)
     return LandingStep(
         landing_quantities=jnp.stack([*landing_values, order_margin]),
-        outcome=sequence.outcome,
-        durations=tuple(end.duration for end in phase_ends),
+        outcome=phase_sequence.outcome,
+        durations=tuple(phase_end.duration for phase_end in phase_ends),
         solver_steps=phase_ends[0].n_solver_steps
         + phase_ends[1].n_solver_steps
         + phase_ends[2].n_solver_steps,
@@ -370,21 +372,23 @@ class _StaticConfig(NamedTuple):
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # `can_use_lanes` has checked the solver.
         records_margins = self.friction is not None
-        arguments = params, tuple(x), options, tableau, self.stop_at_lift_off, records_margins
-        return run_batch_phases(*arguments, is_noinline=True), tableau, options
+        phase_arguments = params, tuple(x), options, tableau, self.stop_at_lift_off, records_margins
+        return run_batch_phases(*phase_arguments, is_noinline=True), tableau, options
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the floats and the other outputs of the step."""
-        sequence, friction = self.run_lanes(*leaves)[0], self.friction
+        """Return the results of a step over lanes, split into floats and other arrays."""
+        phase_sequence, friction = self.run_lanes(*leaves)[0], self.friction
         if friction is None:
-            return eqx.partition(make_advance_result(sequence, "lanes"), eqx.is_inexact_array)
-        phase_ends = tuple(end._replace(engine_carry=None) for end in sequence.phase_ends)
-        float_sequence = sequence._replace(
+            return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
+        phase_ends = tuple(
+            phase_end._replace(engine_carry=None) for phase_end in phase_sequence.phase_ends
+        )
+        float_sequence = phase_sequence._replace(
             phases=(), phase_starts=(), phase_ends=phase_ends
         )  # only floats
-        result = with_batched_jvp(lambda sequence: make_step_result(sequence, friction, "lanes"))(
-            float_sequence
-        )
+        result = with_batched_jvp(
+            lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
+        )(float_sequence)
         return eqx.partition(result, eqx.is_inexact_array)
 
     def make_template(self, *leaves: Array) -> tuple:
@@ -435,21 +439,24 @@ def build_step_sampler(
     config = _StaticConfig(argument_structure, stop_at_lift_off, None)
 
     def sample_lanes(*leaves: Array) -> Trajectory:
-        sequence, tableau, options = config.run_lanes(*leaves)
+        phase_sequence, tableau, options = config.run_lanes(*leaves)
         samples = [
             sample_batch_phase(
                 make_batch_phase(phase, False),
                 tableau,
-                *start,
-                end.duration,
+                *phase_start,
+                phase_end.duration,
                 n_samples,
                 compute_wheel_units(phase.s).scale_times(options),
             )
-            for phase, start, end in zip(
-                sequence.phases, sequence.phase_starts, sequence.phase_ends, strict=True
+            for phase, phase_start, phase_end in zip(
+                phase_sequence.phases,
+                phase_sequence.phase_starts,
+                phase_sequence.phase_ends,
+                strict=True,
             )
         ]
-        return make_trajectory(sequence, samples)
+        return make_trajectory(phase_sequence, samples)
 
     def make_template(x: Array, *_: Array) -> Trajectory:
         make_rows = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
@@ -480,8 +487,8 @@ def build_step_jacobian(
         return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
 
     def make_template(*leaves: Array) -> tuple:
-        value, other_outputs = config.make_template(*leaves)
-        return value, value, other_outputs
+        float_outputs, other_outputs = config.make_template(*leaves)
+        return float_outputs, float_outputs, other_outputs
 
     evaluate_lanes = lambda *leaves: compute_jacobian_columns(
         config.compute_outputs, leaves, input_indices
@@ -497,8 +504,13 @@ def build_step_jacobian(
     def evaluate_jacobian(*leaves: Array) -> tuple:
         n_directions = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
         evaluate_columns = compiled_by_size[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
-        jacobian_columns, value, other_outputs = evaluate_columns(*tighten_tolerances(*leaves))
-        return (split_jacobian(jacobian_columns, leaves, input_indices), value), other_outputs
+        jacobian_columns, float_outputs, other_outputs = evaluate_columns(
+            *tighten_tolerances(*leaves)
+        )
+        return (
+            split_jacobian(jacobian_columns, leaves, input_indices),
+            float_outputs,
+        ), other_outputs
 
     return evaluate_jacobian
 
@@ -510,15 +522,15 @@ def split_jacobian(
 
     The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
-    jacobians, offset = [], 0
+    jacobians, column_offset = [], 0
     for i in input_indices:
-        shape = jnp.shape(leaves[i])
-        column_range = slice(offset, offset + int(np.prod(shape)))
-        select_columns = lambda x, column_range=column_range, shape=shape: jnp.moveaxis(
+        leaf_shape = jnp.shape(leaves[i])
+        column_range = slice(column_offset, column_offset + int(np.prod(leaf_shape)))
+        select_columns = lambda x, column_range=column_range, leaf_shape=leaf_shape: jnp.moveaxis(
             x[column_range], 0, -1
-        ).reshape(*x.shape[1:], *shape)
+        ).reshape(*x.shape[1:], *leaf_shape)
         jacobians.append(jax.tree.map(select_columns, jacobian_columns))
-        offset = column_range.stop
+        column_offset = column_range.stop
     return tuple(jacobians)
 
 
@@ -544,10 +556,10 @@ def compute_jacobian_columns(
 
     primals = [leaves[i] for i in input_indices]
     compute_jvp = lambda tangents: jax.jvp(evaluate_at, primals, tangents, has_aux=True)
-    value, jacobian_columns, other_outputs = jax.vmap(compute_jvp, out_axes=(None, 0, None))(
-        _unit_tangents(primals)
-    )
-    return jacobian_columns, value, other_outputs
+    float_outputs, jacobian_columns, other_outputs = jax.vmap(
+        compute_jvp, out_axes=(None, 0, None)
+    )(_unit_tangents(primals))
+    return jacobian_columns, float_outputs, other_outputs
 
 
 def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
@@ -558,15 +570,15 @@ def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
     """
     sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
     unit_vectors, tangents, entry_offset = np.eye(sum(sizes)), [], 0
-    for leaf, size in zip(leaves, sizes, strict=True):
+    for leaf, n_entries in zip(leaves, sizes, strict=True):
         entry_tangents = [
             jnp.asarray(unit_vectors[:, i], leaf.dtype)[:, None]
-            for i in range(entry_offset, entry_offset + size)
+            for i in range(entry_offset, entry_offset + n_entries)
         ]
         lane_tangents = [
             jnp.broadcast_to(entry_tangent, (len(unit_vectors), leaf.shape[-1]))
             for entry_tangent in entry_tangents
         ]
         tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
-        entry_offset += size
+        entry_offset += n_entries
     return tangents

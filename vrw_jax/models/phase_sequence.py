@@ -141,40 +141,43 @@ def run_phases(
     )
 
 
-def next_section_state(sequence: PhaseSequenceResult) -> Vector:
+def next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
     """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line of the next
     landing.
 
     The units are rad, rad/s and m/s.
     """
-    theta, rates = sequence.phase_ends[2].q[0], sequence.phase_ends[2].v
-    return (theta if sequence.tilt is None else theta - sequence.tilt), *rates
+    theta, rates = phase_sequence.phase_ends[2].q[0], phase_sequence.phase_ends[2].v
+    return (theta if phase_sequence.tilt is None else theta - phase_sequence.tilt), *rates
 
 
-def make_advance_result(sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
+def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
     """Return the minimal results of a step; the section state is zero if the step failed."""
-    theta, dtheta, dL1 = next_section_state(sequence)
-    has_stepped = sequence.outcome == Outcome.STEPPED
-    solver_steps = [end.n_solver_steps for end in sequence.phase_ends]
+    theta, dtheta, dL1 = next_section_state(phase_sequence)
+    has_stepped = phase_sequence.outcome == Outcome.STEPPED
+    solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in (theta, dtheta, dL1)]),
-        durations=jnp.stack([end.duration for end in sequence.phase_ends]),
-        outcome=sequence.outcome,
+        durations=jnp.stack([phase_end.duration for phase_end in phase_sequence.phase_ends]),
+        outcome=phase_sequence.outcome,
         solver_steps=solver_steps[0] + solver_steps[1] + solver_steps[2],
         engine=engine,
     )
 
 
 def make_step_result(
-    sequence: PhaseSequenceResult, friction: Elementwise | float, engine: str
+    phase_sequence: PhaseSequenceResult, friction: Elementwise | float, engine: str
 ) -> StepResult:
     """Return all results of a step, for one wheel or a batch.
 
     The margins must have been recorded.
     """
-    s, landing, phase_ends = sequence.s, sequence.landing, sequence.phase_ends
-    has_begun = sequence.outcome != Outcome.BAD_INPUT
-    hits_stopper, has_stepped = sequence.phases_happened[2], sequence.outcome == Outcome.STEPPED
+    s, landing, phase_ends = phase_sequence.s, phase_sequence.landing, phase_sequence.phase_ends
+    has_begun = phase_sequence.outcome != Outcome.BAD_INPUT
+    hits_stopper, has_stepped = (
+        phase_sequence.phases_happened[2],
+        phase_sequence.outcome == Outcome.STEPPED,
+    )
     dls, sls1, sls2 = make_phases(s, landing.distance, stop_at_lift_off=True)
     liftoff_motion = dls.motion_at(phase_ends[0].q, phase_ends[0].v)
     stopper_state = [
@@ -191,7 +194,7 @@ def make_step_result(
         dynamics.mechanical_energy(s, m).total for m in (landing.motion, last_motion)
     )
     fore_force, rear_force = transitions.landing_forces(s, landing)
-    advance_result = make_advance_result(sequence, engine)
+    advance_result = make_advance_result(phase_sequence, engine)
     return StepResult(
         section_state=advance_result.section_state,
         post_impact=jnp.stack(
@@ -204,7 +207,7 @@ def make_step_result(
             lambda_2=jnp.where(has_begun, fore_force.normal, 0.0),
             lambda_4=jnp.where(has_begun, rear_force.normal, 0.0),
         ),
-        margins=_make_margins(sequence, rear_force, liftoff_motion, stopper_hit, friction),
+        margins=_make_margins(phase_sequence, rear_force, liftoff_motion, stopper_hit, friction),
         energy=EnergyLoss(
             landing=jnp.where(has_begun, landing.energy_lost, 0.0),
             stopper=jnp.where(hits_stopper, stopper_hit.energy_lost, 0.0),
@@ -218,12 +221,12 @@ def make_step_result(
     )
 
 
-def make_trajectory(sequence: PhaseSequenceResult, samples: Sequence[Array]) -> Trajectory:
+def make_trajectory(phase_sequence: PhaseSequenceResult, samples: Sequence[Array]) -> Trajectory:
     """Return the trajectory of a step from samples at equal times of each phase.
 
     - `samples`: of each phase, with axes (sample, coordinates and rates, ...).
     """
-    advance_result = make_advance_result(sequence, "")
+    advance_result = make_advance_result(phase_sequence, "")
     durations, n_samples = advance_result.durations, len(samples[0])
     start_times = jnp.stack([0.0 * durations[0], durations[0], durations[0] + durations[1]])
     time_fractions = jnp.linspace(0.0, 1.0, n_samples).reshape(
@@ -231,7 +234,7 @@ def make_trajectory(sequence: PhaseSequenceResult, samples: Sequence[Array]) -> 
     )
     phase_arrays = [
         evaluate_states(phase, jnp.moveaxis(states, 1, 0))
-        for phase, states in zip(sequence.phases, samples, strict=True)
+        for phase, states in zip(phase_sequence.phases, samples, strict=True)
     ]
     states, forces, energies = (
         jnp.stack([jnp.moveaxis(phase_rows, 0, 1) for phase_rows in arrays])
@@ -261,7 +264,7 @@ def evaluate_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array
 
 
 def _make_margins(
-    sequence: PhaseSequenceResult,
+    phase_sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
     stopper_hit: transitions.StopperHit,
@@ -273,12 +276,20 @@ def _make_margins(
     - `liftoff_motion`: motion at the end of double support;
     - `stopper_hit`: collision of Leg 2 with its stopper.
     """
-    s, landing, phases_happened = sequence.s, sequence.landing, sequence.phases_happened
-    has_begun, hits_stopper = sequence.outcome != Outcome.BAD_INPUT, phases_happened[2]
+    s, landing, phases_happened = (
+        phase_sequence.s,
+        phase_sequence.landing,
+        phase_sequence.phases_happened,
+    )
+    has_begun, hits_stopper = phase_sequence.outcome != Outcome.BAD_INPUT, phases_happened[2]
     margin_rows = [
-        end.margin_minima for end in sequence.phase_ends if end.margin_minima is not None
+        phase_end.margin_minima
+        for phase_end in phase_sequence.phase_ends
+        if phase_end.margin_minima is not None
     ]
-    phase_minima = [PhaseMargins.from_values(tuple(rows), s.n) for rows in margin_rows]
+    phase_minima = [
+        PhaseMargins.from_values(tuple(phase_margins), s.n) for phase_margins in margin_rows
+    ]
 
     def lowest_margin(margin_name: str, *phase_indices: int) -> Array:
         """Return the minimum of a margin over those phases that happened; 0 if none did."""

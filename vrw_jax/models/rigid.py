@@ -105,8 +105,10 @@ class RigidWheel(AbstractWheel):
         s = params.symbols()
         rate_ratio = self._rate_ratio(s)
         rate_squared_gain = 4.0 * _gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
-        rate = jnp.sqrt(jnp.maximum(rate_squared_gain, 0.1) / (1.0 - rate_ratio * rate_ratio))
-        return jnp.stack([0.5 * s.alpha + 0.0 * rate, rate, 0.0 * rate])
+        rolling_rate = jnp.sqrt(
+            jnp.maximum(rate_squared_gain, 0.1) / (1.0 - rate_ratio * rate_ratio)
+        )
+        return jnp.stack([0.5 * s.alpha + 0.0 * rolling_rate, rolling_rate, 0.0 * rolling_rate])
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
         result = self.take_step(params, x, options)
@@ -261,7 +263,8 @@ class RigidWheel(AbstractWheel):
         angles = jnp.stack([start_angles, start_angles, rolling_angles])
 
         state, forces, energy = (
-            jnp.moveaxis(rows, 0, -1) for rows in rolling_motion.evaluate_states(angles)
+            jnp.moveaxis(sample_rows, 0, -1)
+            for sample_rows in rolling_motion.evaluate_states(angles)
         )
         end_state = result.section_state, result.durations, result.outcome
         return Trajectory(rolling_motion.time_at_angle(angles), state, forces, energy, *end_state)
@@ -327,9 +330,9 @@ class RollingMotion(eqx.Module):
         zero = 0.0 * theta
         speed_squared = self.rate_squared_at_angle(theta)
         is_moving = speed_squared > 0.0
-        rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, speed_squared, 1.0)), 0.0)
+        angular_rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, speed_squared, 1.0)), 0.0)
         leg_length = self.s.L0 + zero
-        return Motion.from_angle(theta, leg_length, leg_length, rate, zero, zero)
+        return Motion.from_angle(theta, leg_length, leg_length, angular_rate, zero, zero)
 
     def acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
         """Return the angular acceleration under gravity, rad/s^2; the legs do not move."""
@@ -486,8 +489,10 @@ def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
         )
 
     x, y, z = lax.fori_loop(0, 12, duplicate, (x, y, z))
-    mean = (x + y + z) / 3.0
-    dx, dy = 1.0 - x / mean, 1.0 - y / mean
+    mean_argument = (x + y + z) / 3.0
+    dx, dy = 1.0 - x / mean_argument, 1.0 - y / mean_argument
     dz = -dx - dy
     e2, e3 = dx * dy - dz * dz, dx * dy * dz
-    return (1.0 - e2 / 10.0 + e3 / 14.0 + e2 * e2 / 24.0 - 3.0 * e2 * e3 / 44.0) / jnp.sqrt(mean)
+    return (1.0 - e2 / 10.0 + e3 / 14.0 + e2 * e2 / 24.0 - 3.0 * e2 * e3 / 44.0) / jnp.sqrt(
+        mean_argument
+    )

@@ -53,7 +53,9 @@ def replace_invalid(
     The replacement prevents that a NaN is computed.
     """
     return jax.tree.map(
-        lambda value, default: jnp.where(is_valid, value, jnp.asarray(default, value.dtype)),
+        lambda given_value, safe_value: jnp.where(
+            is_valid, given_value, jnp.asarray(safe_value, given_value.dtype)
+        ),
         (params, x),
         (type(params)(n_legs=params.n_legs), fallback_x),
     )

@@ -138,7 +138,7 @@ class Margins(AbstractMeasures):
 
 
 class AbstractStep(AbstractPrintable):
-    """Results of one step that all models have. Batched under vmap."""
+    """Results of one step that every model reports. Batched under vmap."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -165,7 +165,7 @@ class AbstractStep(AbstractPrintable):
 
     @property
     def speed(self) -> Array:
-        """Step length over duration, m/s; 0 for a step of zero duration."""
+        """Return the step length over the duration, m/s; 0 for a step of zero duration."""
         period = self.period
         return jnp.where(period > 0.0, self.step_length / jnp.where(period > 0.0, period, 1.0), 0.0)
 
@@ -191,22 +191,22 @@ class AbstractStep(AbstractPrintable):
 
     def summary_rows(self) -> list[TextRow]:
         """Return labels and texts: measures, then margins with whether their assumptions hold."""
-        outcome, values = np.asarray(self.outcome), self.measures()
+        outcome, measure_values = np.asarray(self.outcome), self.measures()
         if outcome.ndim:
             return [("steps", format_outcome_counts(outcome, Outcome))]
-        code = Outcome(int(outcome))
-        rows = [("outcome", f"{code.name}: {code.meaning}")]
-        for name, value in values.items():
+        outcome_code = Outcome(int(outcome))
+        text_rows = [("outcome", f"{outcome_code.name}: {outcome_code.meaning}")]
+        for name, value in measure_values.items():
             if name == "outcome":
                 continue
             measure, lowest_value = MEASURES[name], float(np.min(np.asarray(value)))
             verdict_text = ", holds" if lowest_value >= 0.0 else ", broken"
-            text = measure.format_with_unit(lowest_value)
+            value_text = measure.format_with_unit(lowest_value)
             if name in MARGIN_MEASURES:
-                rows.append((f"margin: {measure.label}", text + verdict_text))
+                text_rows.append((f"margin: {measure.label}", value_text + verdict_text))
             else:
-                rows.append((measure.label, text))
-        return rows
+                text_rows.append((measure.label, value_text))
+        return text_rows
 
     def model_selection(self) -> dict[str, Array]:
         """Return the code of the model that took the step and that of the reason, by names of

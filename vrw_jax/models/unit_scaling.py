@@ -69,9 +69,11 @@ def complete_by_scaling(
     - `scaled_outputs`: outputs times their powers, by the index of the parameter.
     """
     known_columns = dict(known_columns)
-    for index, scaling in SCALING_BY_PARAMETER.items():
-        remainder = scaling.subtract_columns(scaled_outputs[index], inputs, known_columns)
-        known_columns[index] = remainder / (scaling.input_powers[index] * inputs[index])
+    for parameter_index, scaling in SCALING_BY_PARAMETER.items():
+        remainder = scaling.subtract_columns(scaled_outputs[parameter_index], inputs, known_columns)
+        known_columns[parameter_index] = remainder / (
+            scaling.input_powers[parameter_index] * inputs[parameter_index]
+        )
     return known_columns
 
 

@@ -132,33 +132,38 @@ class ViscoelasticWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
         """Return the results of a step by the compiled function."""
-        leaves, structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compile_step(self, structure, is_detailed)(*leaves))
+        leaves, argument_structure = jax.tree.flatten((params, x, options))
+        return eqx.combine(*_compile_step(self, argument_structure, is_detailed)(*leaves))
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        leaves, structure = jax.tree.flatten((params, x, options))
+        leaves, argument_structure = jax.tree.flatten((params, x, options))
         if can_use_lanes(options):
-            sampler = build_step_sampler(structure, self.stop_at_lift_off, n_samples)
+            sampler = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
         else:
-            sampler = functools.partial(self._sample_with_diffrax, structure, n_samples)
+            sampler = functools.partial(self._sample_with_diffrax, argument_structure, n_samples)
         return sampler(*leaves)
 
-    def _sample_with_diffrax(self, structure: Any, n_samples: int, *leaves: Array) -> Trajectory:
+    def _sample_with_diffrax(
+        self, argument_structure: Any, n_samples: int, *leaves: Array
+    ) -> Trajectory:
         """Return the samples of a step, integrated by diffrax."""
-        params, x, options = jax.tree.unflatten(structure, leaves)
-        sequence, samples = self._run_phases(params, x, options, records_margins=False), []
-        for phase, start, end in zip(
-            sequence.phases, sequence.phase_starts, sequence.phase_ends, strict=True
+        params, x, options = jax.tree.unflatten(argument_structure, leaves)
+        phase_sequence, samples = self._run_phases(params, x, options, records_margins=False), []
+        for phase, phase_start, phase_end in zip(
+            phase_sequence.phases,
+            phase_sequence.phase_starts,
+            phase_sequence.phase_ends,
+            strict=True,
         ):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
-            y = jnp.stack([*start[0], *start[1]])
+            y = jnp.stack([*phase_start[0], *phase_start[1]])
             units = jnp.stack(phase.coordinate_units), compute_wheel_units(phase.s).time
             samples.append(
-                sample_in_units(vector_field, y, end.duration, n_samples, options, *units)
+                sample_in_units(vector_field, y, phase_end.duration, n_samples, options, *units)
             )
-        return make_trajectory(sequence, samples)
+        return make_trajectory(phase_sequence, samples)
 
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
@@ -193,10 +198,14 @@ class ViscoelasticWheel(AbstractWheel):
 
 
 @functools.cache
-def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -> ForwardFunction:
+def _compile_step(
+    model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
+) -> ForwardFunction:
     """Return the step over the leaves of (params, x, options), differentiable in any mode."""
 
-    static_options = jax.tree.unflatten(structure, [0.0] * structure.num_leaves)[2]
+    static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
+        2
+    ]
     engine = "lanes" if can_use_lanes(static_options) else "diffrax"
 
     def compute_with_diffrax(tightens_tolerances: bool, *leaves: Array) -> tuple:
@@ -205,15 +214,15 @@ def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -
         If the batch kernel is the engine, this function computes only derivatives of derivatives,
         under the name of that engine.
         """
-        params, x, options = jax.tree.unflatten(structure, leaves)
+        params, x, options = jax.tree.unflatten(argument_structure, leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options
-        sequence = model._run_phases(params, x, options, records_margins=is_detailed)
-        result: AdvanceResult | StepResult = (
-            make_step_result(sequence, model.friction, engine)
+        phase_sequence = model._run_phases(params, x, options, records_margins=is_detailed)
+        step_result: AdvanceResult | StepResult = (
+            make_step_result(phase_sequence, model.friction, engine)
             if is_detailed
-            else make_advance_result(sequence, engine)
+            else make_advance_result(phase_sequence, engine)
         )
-        return eqx.partition(result, eqx.is_inexact_array)
+        return eqx.partition(step_result, eqx.is_inexact_array)
 
     step_fn, tight_step_fn = (
         functools.partial(compute_with_diffrax, tightens_tolerances)
@@ -221,7 +230,11 @@ def _compile_step(model: ViscoelasticWheel, structure: Any, is_detailed: bool) -
     )
     if engine == "diffrax":
         return enable_all_ad_modes(step_fn, tight_step_fn)
-    static_config = structure, model.stop_at_lift_off, model.friction if is_detailed else None
+    static_config = (
+        argument_structure,
+        model.stop_at_lift_off,
+        model.friction if is_detailed else None,
+    )
     return enable_all_ad_modes(
         build_step_function(*static_config),
         tight_step_fn,

@@ -57,9 +57,9 @@ def make_paper_model() -> ViscoelasticWheel:
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
-def replace_parameter(params: WheelParams, name: str, value: float) -> WheelParams:
+def replace_parameter(params: WheelParams, parameter_name: str, value: float) -> WheelParams:
     """Return the wheel with another value of one parameter."""
-    replaced_fields: dict[str, Any] = {name: value}
+    replaced_fields: dict[str, Any] = {parameter_name: value}
     return dataclasses.replace(params, **replaced_fields)
 
 
@@ -103,7 +103,7 @@ def walk_into_gait(
 
 
 def walk_along_parameter(
-    params: WheelParams, name: str, values: Sequence[float], x: SectionState
+    params: WheelParams, parameter_name: str, values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
     """Yield a dataset of the walk at each of `values` of the parameter `name`, see
     `walk_into_gait`.
@@ -114,8 +114,8 @@ def walk_along_parameter(
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
     for value in values:
-        start = _extrapolate_start(settled_values, settled_states, value, x)
-        gait_walk = walk_into_gait(replace_parameter(params, name, value), start)
+        start_state = _extrapolate_start(settled_values, settled_states, value, x)
+        gait_walk = walk_into_gait(replace_parameter(params, parameter_name, value), start_state)
         if gait_walk.settled:
             settled_values.append(value)
             settled_states.append(gait_walk.section_state.values[-1])
@@ -124,7 +124,7 @@ def walk_along_parameter(
 
 def measure_gaits_along(
     params: WheelParams,
-    name: str,
+    parameter_name: str,
     values: Sequence[float],
     x: SectionState,
     on_progress: Callable[[float], None] | None = None,
@@ -138,15 +138,22 @@ def measure_gaits_along(
     - `on_progress`: function of the completed fraction.
     """
     measures_by_value: list[dict[str, np.ndarray]] = []
-    for value, gait_walk in zip(values, walk_along_parameter(params, name, values, x), strict=True):
-        state = gait_walk.section_state.values[-1]
+    for value, gait_walk in zip(
+        values, walk_along_parameter(params, parameter_name, values, x), strict=True
+    ):
+        last_state = gait_walk.section_state.values[-1]
         step_result = step(
-            replace_parameter(params, name, value), jnp.asarray(state), model=make_paper_model()
+            replace_parameter(params, parameter_name, value),
+            jnp.asarray(last_state),
+            model=make_paper_model(),
         )
-        gait_measures = {key: np.asarray(values) for key, values in step_result.measures().items()}
+        gait_measures = {
+            measure_name: np.asarray(values)
+            for measure_name, values in step_result.measures().items()
+        }
         if gait_walk.outcome != Outcome.STEPPED.name:
             gait_measures["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
-        gait_measures["section_state"] = state
+        gait_measures["section_state"] = last_state
         gait_measures["change"] = np.asarray(gait_walk.attrs["last_change"])
         gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
         measures_by_value.append(gait_measures)
@@ -154,9 +161,12 @@ def measure_gaits_along(
             on_progress(len(measures_by_value) / len(values))
     return _make_dataset(
         params,
-        name,
+        parameter_name,
         values,
-        {key: np.stack([r[key] for r in measures_by_value]) for key in measures_by_value[0]},
+        {
+            measure_name: np.stack([r[measure_name] for r in measures_by_value])
+            for measure_name in measures_by_value[0]
+        },
     )
 
 
@@ -173,26 +183,36 @@ def _extrapolate_start(
 
 
 def _make_dataset(
-    params: WheelParams, name: str, values: Sequence[float], columns: dict[str, np.ndarray]
+    params: WheelParams,
+    parameter_name: str,
+    values: Sequence[float],
+    columns: dict[str, np.ndarray],
 ) -> xr.Dataset:
     """Return the labeled dataset of columns over the parameter `name`."""
-    variables = make_variables({key: columns[key] for key in STEP_MEASURES | MARGIN_MEASURES}, name)
+    variables = make_variables(
+        {measure_name: columns[measure_name] for measure_name in STEP_MEASURES | MARGIN_MEASURES},
+        parameter_name,
+    )
     change_attrs = {"units": "1", "long_name": "largest change of the last five steps"}
     variables |= {
         "section_state": xr.Variable(
-            (name, "component"), columns["section_state"], {"long_name": "section state"}
+            (parameter_name, "component"), columns["section_state"], {"long_name": "section state"}
         ),
-        "change": xr.Variable(name, columns["change"], change_attrs),
+        "change": xr.Variable(parameter_name, columns["change"], change_attrs),
         "settled": xr.Variable(
-            name, columns["settled"], {"long_name": "whether the walk settled into a period-1 gait"}
+            parameter_name,
+            columns["settled"],
+            {"long_name": "whether the walk settled into a period-1 gait"},
         ),
     }
     coordinates = {
-        name: xr.Variable(name, np.asarray(values, float), measure_attrs(name)),
+        parameter_name: xr.Variable(
+            parameter_name, np.asarray(values, float), measure_attrs(parameter_name)
+        ),
         "component": ["theta", "dtheta", "dL1"],
         "leg": locked_leg_coordinate(params.n_legs),
     }
     provenance_attrs = provenance(params, make_paper_model(), StepOptions())
-    provenance_attrs.pop(f"parameter_{name}")
-    attrs = {"title": f"Gaits walked to along {name}"} | provenance_attrs
-    return xr.Dataset(variables, coordinates, attrs).sortby(name)
+    provenance_attrs.pop(f"parameter_{parameter_name}")
+    attrs = {"title": f"Gaits walked to along {parameter_name}"} | provenance_attrs
+    return xr.Dataset(variables, coordinates, attrs).sortby(parameter_name)

@@ -42,8 +42,8 @@ def walk_into_table_1_gait() -> xr.Dataset:
 
 def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
     """Return the trajectory of the gait of Table 1 at slope 0.30 rad, for figures 6 and 7."""
-    state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    return simulate(WheelParams(), state, n_steps, model=make_paper_model())
+    section_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
+    return simulate(WheelParams(), section_state, n_steps, model=make_paper_model())
 
 
 def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
@@ -60,11 +60,11 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
         *_, gait_walk = walk_along_parameter(table_1_wheel, "damping", damping_path, start_state)
         if not gait_walk.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
-        state = jnp.asarray(gait_walk.section_state.values[-1])
+        section_state = jnp.asarray(gait_walk.section_state.values[-1])
         gaits.append(
             simulate(
                 replace_parameter(table_1_wheel, "damping", damping),
-                state,
+                section_state,
                 1,
                 model=make_paper_model(),
             )
@@ -141,7 +141,11 @@ def draw_figures(evidence: Evidence, folder: Path) -> list[Path]:
         "fig09_rear_force": plots.rear_force(evidence.gaits_by_damping),
         "fig10_indicators": plots.indicators(evidence.damping_branch),
     }
-    paths = [path for name, figure in figures.items() for path in plots.save(figure, folder, name)]
+    paths = [
+        path
+        for figure_name, figure in figures.items()
+        for path in plots.save(figure, folder, figure_name)
+    ]
     frames, milliseconds = plots.walk_frames(evidence.gaits_by_damping[-1])
     return [*paths, plots.save_animation(frames, milliseconds, folder / "walk.gif")]
 

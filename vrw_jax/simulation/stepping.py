@@ -378,11 +378,12 @@ def walk(
 
     On uneven ground `params.slope` is an array over steps. The ground then consists of straight
     lines of these slopes, which join the footholds. In the double support of step k both feet are
-    on line k. The step begins at the foothold where this line ends, and it ends when the next foot
-    meets line k + 1. Therefore n steps use n + 1 slopes; of n given slopes the last is used twice.
-    A section state is in the frame of the line that ends at its landing; that of the start is line
-    0. Forces are along and normal to line k. With unilateral contact the friction of the model may
-    be such an array too. Each foot then keeps the friction of its own landing.
+    on line k. The step begins at the foothold where this line ends. The step ends when the next
+    foot meets line k + 1. Therefore n steps use n + 1 slopes; if n slopes are given, the last one
+    is used twice. A section state is in the frame of the line that ends at its landing; the start
+    is in the frame of line 0. Forces are along and normal to line k. With unilateral contact the
+    friction of the model may also be an array over steps. Each foot then keeps the friction of the
+    step in which it landed.
 
     Args:
         params: the wheel.

@@ -102,8 +102,10 @@ def simulate(
     params_with_lines = params
     checked_model, params, ground_per_step = read_ground(params, model, n_steps)
     check_single_wheel(params, "simulate one at a time")
-    start = checked_model.default_start(params) if x is None else x
-    params, x, model, options = validate_arguments(params, start, checked_model, options, engine)
+    start_state = checked_model.default_start(params) if x is None else x
+    params, x, model, options = validate_arguments(
+        params, start_state, checked_model, options, engine
+    )
     make_spec = make_contact_spec if model.reports_contacts else make_phase_spec
     s, model_and_wheel_by_step, ground_lines = (
         jax.tree.map(float, params).symbols(),

@@ -110,9 +110,9 @@ class Symbols(NamedTuple):
     alpha: float
 
 
-def _parameter_field(name: str, default: float) -> Any:
+def _parameter_field(name: str, default_value: float) -> Any:
     """Return the dataclass field of a float parameter."""
-    return eqx.field(converter=functools.partial(check_reals, name), default=default)
+    return eqx.field(converter=functools.partial(check_reals, name), default=default_value)
 
 
 _convert_n_legs = functools.partial(
@@ -298,17 +298,18 @@ class WheelParams(AbstractPrintable):
         """
         factors = {"length": length, "time": time, "mass": mass}
         for name, value in factors.items():
-            factor = check_reals(name, value)
-            if not isinstance(factor, jax.core.Tracer) and not np.all(factor > 0.0):
+            checked_factor = check_reals(name, value)
+            if not isinstance(checked_factor, jax.core.Tracer) and not np.all(checked_factor > 0.0):
                 raise ValueError(
                     f"{name} is {format_value(value)}, but a factor of scale is positive: give 2, "
                     "say, for twice as much."
                 )
         scaled_values = {}
         for name, domain in PARAMETER_DOMAINS.items():
-            powers = UNIT_POWERS[domain.unit]
+            unit_powers = UNIT_POWERS[domain.unit]
             scale_factor = math.prod(
-                factor**power for factor, power in zip(factors.values(), powers, strict=True)
+                checked_factor**power
+                for checked_factor, power in zip(factors.values(), unit_powers, strict=True)
             )
             scaled_values[name] = getattr(self, name) * scale_factor
         return WheelParams(**scaled_values, n_legs=self.n_legs)

@@ -116,7 +116,9 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def end_guard(self, instant: "PhaseInstant") -> Elementwise:
-        """Return the guard of the phase's regular end."""
+        """Return the guard whose zero is the regular end of the phase: positive before it, m
+        or N.
+        """
 
     @abc.abstractmethod
     def specific_guards(self, instant: "PhaseInstant") -> Vector:

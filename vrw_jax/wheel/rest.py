@@ -60,10 +60,10 @@ def is_at_rest(
 
 
 def _are_bounded(
-    values: Iterable[Elementwise], units: Iterable[Elementwise], limit: Elementwise
+    values: Iterable[Elementwise], units: Iterable[Elementwise], max_value: Elementwise
 ) -> Bool[Array, "..."]:
     """Return whether every value is at most `limit` times its unit."""
-    bounds_hold = [jnp.abs(x) <= limit * unit for x, unit in zip(values, units, strict=True)]
+    bounds_hold = [jnp.abs(x) <= max_value * unit for x, unit in zip(values, units, strict=True)]
     return functools.reduce(operator.and_, bounds_hold)
 
 

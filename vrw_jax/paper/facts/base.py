@@ -94,15 +94,15 @@ class ClaimGroup:
 
     def make_facts(self, evidence: Evidence) -> list[Fact]:
         """Return the facts of the claims, computed from the evidence."""
-        numbers = self.compute_numbers(evidence)
-        namespace = SimpleNamespace(**numbers)
+        numbers_by_name = self.compute_numbers(evidence)
+        namespace = SimpleNamespace(**numbers_by_name)
         return [
             Fact(
                 group=self.title,
                 claim=c.claim,
                 source=c.source,
                 published_value=c.published_value,
-                computed=c.computed.format(**numbers),
+                computed=c.computed.format(**numbers_by_name),
                 holds=bool(c.holds(namespace)),
                 tolerance_reason=c.tolerance_reason,
             )
@@ -118,8 +118,8 @@ def agrees_within(
     - `published_numbers`: published value and tolerance of each number, by name.
     """
     return lambda n: all(
-        bool(np.all(np.abs(np.asarray(getattr(n, name)) - value) <= tolerance))
-        for name, (value, tolerance) in published_numbers.items()
+        bool(np.all(np.abs(np.asarray(getattr(n, number_name)) - value) <= tolerance))
+        for number_name, (value, tolerance) in published_numbers.items()
     )
 
 

@@ -242,28 +242,33 @@ INDICATOR_CLAIMS = ClaimGroup("DLS indicators over c, slope 0.30 rad", _compute_
 
 def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
     """Return the numbers that test assumptions of the model at Table 1."""
-    gait, step = e.table_1_gait, select_first_step(e.table_1_trajectory)
-    dls, *_ = split_by_phase(step)
+    gait, first_step = e.table_1_gait, select_first_step(e.table_1_trajectory)
+    dls, *_ = split_by_phase(first_step)
     natural_length, locked_length = float(e.params.natural_length), float(e.params.locked_length)
     impulses = gait.landing_stopper_impulse.values / float(e.params.leg_mass)
     separation_speeds = np.sort(impulses[impulses < 0.0])
     landing_impulse = printed.compute_landing(e.params, gait.section_state.values).impulse
     needed_friction = np.abs(dls.lambda_3.values[:-1] / dls.lambda_4.values[:-1])
-    phases = step.phase.values
+    phases = first_step.phase.values
     phase_order = [
         PHASE_NAMES[int(p)] for p in phases[np.r_[0, np.flatnonzero(np.diff(phases)) + 1]]
     ]
-    names = ("fore_foot_force", "rear_stopper_force", "energy_lost_landing", "hit_planted_impulse")
-    return {name: float(gait[name]) for name in names} | {
+    margin_names = (
+        "fore_foot_force",
+        "rear_stopper_force",
+        "energy_lost_landing",
+        "hit_planted_impulse",
+    )
+    return {margin_name: float(gait[margin_name]) for margin_name in margin_names} | {
         "rear_force": float(dls.lambda_4[:-1].min()),
         "last_rear_force": abs(float(dls.lambda_4[-1])),
         "clearance": min(float(gait.clearance_sls1), float(gait.clearance_sls2)),
         "locked_force": float(gait.locked_stopper_force.min()),
         "preload": float(e.params.stiffness) * (natural_length - locked_length),
-        "contraction": locked_length - float(step.L1[1:].max()),
+        "contraction": locked_length - float(first_step.L1[1:].max()),
         "order": " → ".join(phase_order),
         "back_in_time": phase_order == list(PHASE_NAMES) and float(dls.L2.max()) < locked_length,
-        "friction_fore": float(np.abs(step.lambda_1 / step.lambda_2).max()),
+        "friction_fore": float(np.abs(first_step.lambda_1 / first_step.lambda_2).max()),
         "friction_rear": needed_friction[0],
         "friction_last": needed_friction[-1],
         "last_tangential": float(dls.lambda_3[-1]),

@@ -37,13 +37,13 @@ def compute_double_support_jacobian(
     sin, cos = np.sin(theta), np.cos(theta)
     rear_sin, rear_cos = np.sin(theta + alpha), np.cos(theta + alpha)
     j43_sign = -1.0 if is_as_printed else 1.0
-    rows = (
+    jacobian_rows = (
         (ones, zeros, zeros, zeros, zeros),
         (zeros, ones, zeros, zeros, zeros),
         (ones, zeros, L1 * cos - L2 * rear_cos, sin, -rear_sin),
         (zeros, ones, -L1 * sin + j43_sign * L2 * rear_sin, cos, -rear_cos),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.stack([np.stack(jacobian_row, axis=-1) for jacobian_row in jacobian_rows], axis=-2)
 
 
 def compute_constraint_violation(gait: xr.Dataset, is_as_printed: bool) -> float:
@@ -75,14 +75,16 @@ class PaperLanding(NamedTuple):
 def compute_landing(params: WheelParams, section_state: np.ndarray) -> PaperLanding:
     """Return the result of collision I from (theta-, dtheta-, dL1-), in five coordinates."""
     theta, dtheta, dL1 = (float(v) for v in section_state)
-    s, length = jax.tree.map(float, _compute_touchdown(params, theta))
+    s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
     velocity_before = np.array([*foot_velocity, dtheta, 0.0, dL1])
     theta_after = np.asarray(theta - s.alpha)
-    coordinates_after = (theta_after, np.asarray(s.L0), np.asarray(length))
+    coordinates_after = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
     J = compute_double_support_jacobian(*coordinates_after, float(s.alpha), is_as_printed=False)
     M = np.asarray(
-        compute_five_coordinate_mass_matrix(s, jnp.asarray(theta_after), s.L0, jnp.asarray(length))
+        compute_five_coordinate_mass_matrix(
+            s, jnp.asarray(theta_after), s.L0, jnp.asarray(touchdown_length)
+        )
     )
     inverse_mass_matrix = np.linalg.inv(M)
     X = J @ inverse_mass_matrix @ J.T
@@ -125,10 +127,14 @@ def compute_landing_foot_velocity(
     - `leg_1_rate`: rate of L1 in these equations, m/s.
     """
     theta, dtheta, _ = (float(v) for v in section_state)
-    s, length = jax.tree.map(float, _compute_touchdown(params, theta))
+    s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
     L0, alpha = float(s.L0), float(s.alpha)
-    x = (length * np.cos(theta) - L0 * np.cos(alpha - theta)) * dtheta + leg_1_rate * np.sin(theta)
-    z = -(length * np.sin(theta) + L0 * np.sin(alpha - theta)) * dtheta + leg_1_rate * np.cos(theta)
+    x = (
+        touchdown_length * np.cos(theta) - L0 * np.cos(alpha - theta)
+    ) * dtheta + leg_1_rate * np.sin(theta)
+    z = -(
+        touchdown_length * np.sin(theta) + L0 * np.sin(alpha - theta)
+    ) * dtheta + leg_1_rate * np.cos(theta)
     return np.array([x, z])
 
 
@@ -144,9 +150,9 @@ def differentiate_landing_foot_position(
 
     def compute_position(t: float) -> np.ndarray:
         """Return the position (x, z) of the landing foot at the time t (s), m."""
-        angle, length = theta + dtheta * t, touchdown_length + dL1 * t
-        hub = length * np.array([np.sin(angle), np.cos(angle)])
+        angle, leg_length = theta + dtheta * t, touchdown_length + dL1 * t
+        hub_position = leg_length * np.array([np.sin(angle), np.cos(angle)])
         landing_angle = angle - float(s.alpha)
-        return hub - float(s.L0) * np.array([np.sin(landing_angle), np.cos(landing_angle)])
+        return hub_position - float(s.L0) * np.array([np.sin(landing_angle), np.cos(landing_angle)])
 
     return (compute_position(h) - compute_position(-h)) / (2.0 * h)

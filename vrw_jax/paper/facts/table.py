@@ -49,7 +49,7 @@ def summarize_facts(facts: Sequence[Fact]) -> str:
 def format_facts_page(facts: Sequence[Fact]) -> str:
     """Return the table of facts as a page of Markdown."""
     failed_facts = [fact for fact in facts if not fact.holds]
-    lines = [
+    page_lines = [
         "# The paper's facts",
         "",
         "This page compares every number that the paper publishes with the computed number. "
@@ -69,7 +69,7 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
         "foot would slip in the landing. In this model, as in the paper, it does not slip.",
     ]
     for title, group in itertools.groupby(facts, lambda fact: fact.group):
-        rows = []
+        table_rows = []
         for fact in group:
             verdict = fact.verdict if fact.holds else f"**{fact.verdict}**"
             cells = (
@@ -81,10 +81,10 @@ def format_facts_page(facts: Sequence[Fact]) -> str:
                 fact.tolerance_reason,
             )
             # Minus signs replace the hyphens before numbers.
-            rows.append([re.sub(r"(?<![\w.])-(?=\d)", "−", text) for text in cells])
+            table_rows.append([re.sub(r"(?<![\w.])-(?=\d)", "−", cell_text) for cell_text in cells])
         header = ("fact", "where", "published", "found", "", "tolerance")
-        lines += ["", f"## {title}", "", *format_markdown_table(header, rows)]
-    return "\n".join(lines) + "\n"
+        page_lines += ["", f"## {title}", "", *format_markdown_table(header, table_rows)]
+    return "\n".join(page_lines) + "\n"
 
 
 def write_facts(facts: Sequence[Fact], folder: Path) -> list[Path]:
@@ -92,9 +92,9 @@ def write_facts(facts: Sequence[Fact], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "facts.md", folder / "facts.csv"]
     paths[0].write_text(format_facts_page(facts), encoding="utf-8")
-    with paths[1].open("w", newline="", encoding="utf-8") as file:
-        rows = [asdict(fact) | {"holds": fact.verdict} for fact in facts]
-        writer = csv.DictWriter(file, rows[0].keys())
+    with paths[1].open("w", newline="", encoding="utf-8") as csv_file:
+        fact_rows = [asdict(fact) | {"holds": fact.verdict} for fact in facts]
+        writer = csv.DictWriter(csv_file, fact_rows[0].keys())
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(fact_rows)
     return paths
