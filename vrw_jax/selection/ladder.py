@@ -158,12 +158,12 @@ class ModelChoice(AbstractPrintable):
 def describe_reason(reason_code: int) -> str:
     """Return a reason code of `ModelChoice` as a sentence."""
     if reason_code == 0:
-        return "The paper's wheel serves: all its margins hold over this step."
+        return "The paper's model is valid: all its margins are positive in this step."
     if reason_code < 0:
-        return f"The paper's wheel can't step: {Outcome(-reason_code).meaning}"
+        return f"The step of the paper's model fails: {Outcome(-reason_code).meaning}"
     if reason_code == REASON_START_NOT_EMBEDDABLE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    return f"The paper's margins break: {list(SELECTION_MARGINS.values())[reason_code - 1]}."
+    return f"The paper's model is not valid: {list(SELECTION_MARGINS.values())[reason_code - 1]}."
 
 
 def find_selection_reason(
@@ -238,7 +238,7 @@ class LadderWheel(AbstractWheel):
         >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
         >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
         >>> step.choice.why
-        "The paper's wheel serves: all its margins hold over this step."
+        "The paper's model is valid: all its margins are positive in this step."
     """
 
     model_name: ClassVar[str] = "ladder"
