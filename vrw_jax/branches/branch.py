@@ -17,15 +17,15 @@ from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
 MAX_PRINTED_POINTS = 20
-"""Largest number of printed special points, chosen so that a branch fits on a screen."""
+"""Largest number of special points that are printed, chosen so that a branch fits on a screen."""
 
 
 class FixedPoint(NamedTuple):
     """Fixed point of a return map at one value of the parameter.
 
-    - `section_state`: coordinates of the point;
+    - `section_state`: coordinates of the point, shape (n,);
     - `parameter`: value of the parameter;
-    - `jacobian`: Jacobian of the map.
+    - `jacobian`: Jacobian of the map, shape (n, n).
     """
 
     section_state: np.ndarray
@@ -34,7 +34,7 @@ class FixedPoint(NamedTuple):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the eigenvalues of the Jacobian, the one of largest modulus first."""
+        """Return the eigenvalues of the Jacobian, largest modulus first."""
         return np.asarray(floquet.floquet_multipliers(jnp.asarray(self.jacobian)))
 
     @property
@@ -79,11 +79,11 @@ class SpecialPoint:
 
     def __str__(self) -> str:
         name = "" if self.name == self.kind else f" {self.name}"
-        ends = ", ends the branch" if self.ends_branch else ""
-        usual = 2 if self.kind == "neimark_sacker" else 1
-        if self.n_multipliers > usual:
+        end_text = ", ends the branch" if self.ends_branch else ""
+        is_named_by_kind = 2 if self.kind == "neimark_sacker" else 1
+        if self.n_multipliers > is_named_by_kind:
             name += f" of {self.n_multipliers} multipliers at once"
-        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{ends}"
+        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{end_text}"
 
     def __repr__(self) -> str:
         return f"SpecialPoint at {self}"
@@ -115,12 +115,12 @@ class Branch:
 
     @property
     def values(self) -> np.ndarray:
-        """Return the parameter at each point."""
+        """Return the value of the parameter at each point."""
         return self.dataset[self.parameter].values
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Return the complex multipliers, shape (point, n), the one of largest modulus first."""
+        """Return the complex multipliers, shape (point, n), largest modulus first."""
         return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
 
     @property
@@ -130,7 +130,7 @@ class Branch:
 
     @property
     def ending(self) -> str:
-        """Return why the branch ends at its first and its last point, in one text."""
+        """Return why the branch ends at its first and at its last point, as one text."""
         if not self.values.size:
             return self.outcome.meaning
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
@@ -139,11 +139,11 @@ class Branch:
         if not self.values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
         has_unit = self.parameter in MEASURES
-        unit = f" {MEASURES[self.parameter].display_unit}".rstrip() if has_unit else ""
+        parameter_unit = f" {MEASURES[self.parameter].display_unit}".rstrip() if has_unit else ""
         is_stable = self.stable
         lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
-            f"{self.values[-1]:.6g}{unit}, {int(is_stable.sum())} stable, "
+            f"{self.values[-1]:.6g}{parameter_unit}, {int(is_stable.sum())} stable, "
             f"{int((~is_stable).sum())} not.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
@@ -162,8 +162,8 @@ class Branch:
         ends = ("", "ends the branch")
         return format_html_table(
             str(self).split("\n  ")[0],
-            ((f"{b.value:.9g}", b.kind.replace("_", " "), b.name, ends[b.ends_branch])
-             for b in self.special_points),
+            ((f"{p.value:.9g}", p.kind.replace("_", " "), p.name, ends[p.ends_branch])
+             for p in self.special_points),
             (self.parameter, "kind", "name", ""),
         )  # fmt: skip
 
@@ -172,9 +172,9 @@ class Branch:
 class Codim2Point:
     """Point of codimension two, at which a curve of special points meets another special point."""
 
-    name: str  # of the other special point
-    values: tuple[float, float]  # of the two parameters
-    ends_curve: bool  # whether the gaits end there
+    name: str  # name of the other special point
+    values: tuple[float, float]  # values of the two parameters
+    ends_curve: bool  # whether the curve ends at this point
 
     def __str__(self) -> str:
         ends = ", ends the curve" if self.ends_curve else ""
@@ -206,19 +206,23 @@ class SpecialPointCurve:
 
     @property
     def values(self) -> np.ndarray:
-        """Return the two parameters at each point, (point, 2)."""
+        """Return the values of the two parameters at each point, shape (point, 2)."""
         return np.stack([self.dataset[name].values for name in self.parameters], -1)
 
     @property
     def ending(self) -> str:
-        """Return why the curve ends at its first and its last point, in one text."""
+        """Return why the curve ends at its first and at its last point, as one text."""
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
-        first, second = self.parameters
-        lines = [f"Curve of {self.name} over {first} and {second}: {len(self.values)} points."]
-        for end, text in zip((0, -1), self.ends, strict=True):
-            lines.append(f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {text}")
+        first_name, second_name = self.parameters
+        lines = [
+            f"Curve of {self.name} over {first_name} and {second_name}: {len(self.values)} points."
+        ]
+        for end, point_text in zip((0, -1), self.ends, strict=True):
+            lines.append(
+                f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {point_text}"
+            )
         return "\n".join([*lines, *(f"    {point}" for point in self.codim2_points)])
 
     __repr__ = __str__

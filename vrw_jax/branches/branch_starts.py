@@ -1,4 +1,6 @@
-"""Starts of branches by model: gaits to continue, and their wheels."""
+"""Starts of branches for each model: the gaits from which branches are continued, and their
+wheels.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,25 +31,26 @@ from vrw_jax.wheel import WheelParams
 class BranchRequest(NamedTuple):
     """Request for branches of a batch of wheels."""
 
-    params: WheelParams  # one leading axis
+    params: WheelParams  # parameters with one leading axis over wheels
     model: AbstractWheel
-    parameter_name: str  # of the parameter
-    parameter_values: Array  # at the starts of the branches
+    parameter_name: str  # name of the continued parameter
+    parameter_values: Array  # values of this parameter at the starts of the branches
     period_n: int
     cycle_options: CycleOptions | None
     step_options: StepOptions
 
 
 class BranchStart(NamedTuple):
-    """Data that a continuation needs to start."""
+    """Data from which a continuation starts."""
 
     problem: AbstractGaitProblem
     wheels: BranchWheel
     unknowns: Any
-    outcomes: np.ndarray  # of the first gaits
+    outcomes: np.ndarray  # outcomes of the first gaits
     make_cycle: CycleFactory
-    cycle: Any = None  # the gaits themselves
-    finer_options: CycleOptions | None = None  # options with a finer mesh, None without a mesh
+    cycle: Any = None  # the first gaits
+    # options with a finer mesh; None for a problem without a mesh
+    finer_options: CycleOptions | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +60,7 @@ class FindLimitCycle:
     - `finder`, `model`: finder and model of the branch;
     - `name`: name of the continued parameter;
     - `wheel`, `guess`: the wheel, and its gait at the start of the branch;
-    - `z`, `p`: the point beside the special point.
+    - `z`, `p`: solution and value of the parameter beside the special point.
     """
 
     finder: Any
@@ -83,7 +86,7 @@ class FindLimitCycle:
 
 
 def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
-    """Return starts from limit cycles by collocation, given or found."""
+    """Return the starts of branches from limit cycles by collocation, given or found."""
     params, name, period_n = request.params, request.parameter_name, request.period_n
     options = CycleOptions.tight() if request.cycle_options is None else request.cycle_options
     # The start does not need the mesh or the accuracy of the branch.
@@ -118,7 +121,9 @@ def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
 
 
 def start_from_walks(request: BranchRequest, cycle: Any) -> BranchStart:
-    """Return starts from fixed points of the model's step, given or at the ends of walks."""
+    """Return the starts of branches from fixed points of the model's step, given or at the ends
+    of walks.
+    """
     params, model, options = request.params, request.model, request.step_options
 
     def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
@@ -148,11 +153,13 @@ def start_from_walks(request: BranchRequest, cycle: Any) -> BranchStart:
 
 
 def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchStart:
-    """Return starts from gaits with unilateral contact, given or the slowest attracting one."""
+    """Return the starts of branches from gaits with unilateral contact, given or the slowest
+    attracting gait.
+    """
     params, options = request.params, request.step_options
     model: Any = request.model
     finder: Any = make_finder(model, params.n_legs, step_options=options, period_n=request.period_n)
-    if not finder.is_multistable:  # There is no batched engine for this model.
+    if not finder.is_multistable:  # This model has no batched engine.
         return start_from_walks(request, cycle)
     wheels = BranchWheel(
         params, jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
@@ -181,4 +188,4 @@ START_FUNCTIONS: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] =
     GaitMethod.RETURN_MAP: start_from_walks,
     GaitMethod.SELECTION: start_from_walks,
 }
-"""Start functions by gait method."""
+"""Functions that return the starts of branches, by gait method."""

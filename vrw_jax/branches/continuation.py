@@ -1,8 +1,9 @@
-"""Branches of gaits along one parameter, stable or not, with all special points on them located.
+"""Branches of gaits along one parameter, stable or unstable, with all special points on them
+located.
 
 A special point is a bifurcation, or a border collision, at which an indicator or a margin is zero.
-Each is solved for on the branch itself, with a new gait at every trial, so that it is as accurate
-as the gaits.
+Each is computed on the branch itself, with a new gait at every trial, so that it is as accurate as
+the gaits.
 """
 
 from __future__ import annotations
@@ -74,15 +75,15 @@ BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "
 """Quantities at whose zeros the order of events changes and the branch ends."""
 
 DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
-"""Advice for a caller who differentiates."""
+"""Advice in the error for a caller who differentiates a branch."""
 
 COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
-"""Name of an end where the mesh is too coarse: the gaits do not repeat in a walk."""
+"""Name of an end at which the mesh is too coarse, so that the gaits do not repeat in a walk."""
 
 
 @dataclass(frozen=True)
 class GaitBranchOptions:
-    """Numbers of the continuation of gaits.
+    """Options of the continuation of gaits.
 
     - `max_jump_change`: largest relative change of period and step length at a jump of the section
       state within a branch, chosen because a change of the order of two impacts changes both by
@@ -102,7 +103,7 @@ GAIT_BRANCH_OPTIONS = GaitBranchOptions()
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits, which are admissible if their event-driven steps repeat."""
+    """Continuation of gaits; a gait is admissible if its event-driven step repeats."""
 
     model: AbstractWheel
     step_options: StepOptions
@@ -115,19 +116,24 @@ class GaitContinuation(AbstractContinuation):
     )
     margin_names: ClassVar[tuple[str, ...]] = (*INDICATOR_NAMES, *MARGIN_MEASURES)
     linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
-    """Margins that vanish as a cube, with the quantity that vanishes linearly at the same point. A
-    foot that takes off less steeply dips less deeply, until it rises at once. A solver cannot
-    resolve the shallowest dips, but the linear quantity changes its sign."""
+    """Names of margins that vanish as a cube, with the quantity that vanishes linearly at the
+    same point. A foot that takes off less steeply descends less deeply, until it rises immediately.
+    A solver cannot resolve the shallowest descents, but the linear quantity changes its sign.
+    """
 
     def evaluate_points(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantityTable:
-        """Return the table of measures, with a column for each leg of a margin of several legs."""
+        """Return the table of measures, with a column for each leg if a margin has one value per
+        leg.
+        """
         problem: Any = self.problem
         measure_gaits = functools.partial(problem.measure_points, self.model, self.step_options)
         table = self.map_batched(measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points)
         for name, margin in MARGIN_MEASURES.items():
             if margin.dimension and name in table:
                 legs = enumerate(range(3, self.n_legs + 1))
-                table |= {f"{name}[{leg}]": table[name][:, i] for i, leg in legs}
+                table |= {
+                    f"{name}[{leg}]": table[name][:, leg_position] for leg_position, leg in legs
+                }
         return table
 
     def is_admissible(self, table: QuantityTable) -> np.ndarray:
@@ -136,7 +142,9 @@ class GaitContinuation(AbstractContinuation):
         )
 
     def is_same_gait(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
-        """Return for each row whether period and step length are about equal before and after."""
+        """Return whether period and step length are about equal before and after a jump, for
+        each row.
+        """
         is_same = super().is_same_gait(before, after)
         for name in ("period", "step_length"):
             max_change = self.gait_options.max_jump_change * np.abs(before[name])
@@ -223,9 +231,9 @@ def continue_branch(
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
     check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
-    batch, cycle = jax.device_put(take_rows((params, cycle), None))
+    params_batch, cycle = jax.device_put(take_rows((params, cycle), None))
     (branch,) = continue_branches(
-        batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
+        params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=check_model(resolve_model(params, model)),
         cycle_options=cycle_options, step_options=step_options,
     )  # fmt: skip
@@ -289,12 +297,12 @@ def continue_branches(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
     )
     finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
-    batch = np.broadcast_shapes(*(x.shape for x in jax.tree.leaves(params)))
-    if len(batch) != 1:
-        raise ValueError(f"the wheels' batch has shape {batch}, but it must have one axis.")
-    params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch), params)
+    batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
+    if len(batch_shape) != 1:
+        raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
+    params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch_shape), params)
     start_values = jnp.broadcast_to(
-        getattr(model if name == FRICTION_NAME else params, name), batch
+        getattr(model if name == FRICTION_NAME else params, name), batch_shape
     )
     parameter_values = jnp.clip(start_values, lower, upper)
     if name != FRICTION_NAME:
@@ -303,12 +311,17 @@ def continue_branches(
         params, model, name, parameter_values, period_n, cycle_options, step_options
     )
     outcomes, branch_data = _continue_from_starts(request, cycle, options, np.array([lower, upper]))
-    take_wheel = lambda wheel_index: jax.tree.map(lambda x: x[wheel_index], params)
+    take_wheel = lambda wheel_index: jax.tree.map(lambda leaf: leaf[wheel_index], params)
     return tuple(
         _label_branch(
-            data, take_wheel(wheel_index), name, model, step_options, int(outcomes[wheel_index])
+            single_branch_data,
+            take_wheel(wheel_index),
+            name,
+            model,
+            step_options,
+            int(outcomes[wheel_index]),
         )
-        for wheel_index, data in enumerate(branch_data)
+        for wheel_index, single_branch_data in enumerate(branch_data)
     )
 
 
@@ -321,7 +334,7 @@ def _continue_from_starts(
 ) -> tuple[np.ndarray, list[BranchData | None]]:
     """Return the outcomes of the starts, and the data of the branches from them.
 
-    The mesh is that of the cycle options. Without options it is as fine as the branches need.
+    The mesh is that of the cycle options. Without options the mesh is as fine as the branches need.
     """
     refines_mesh = request.cycle_options is None
     for refinement in range(1 + gait_options.max_refinements):
@@ -350,7 +363,10 @@ def _continue_from_starts(
             branch_start.make_cycle,
             is_finest,
         )
-        if is_finest or not any(data is not None and data.is_mesh_limited for data in branch_data):
+        if is_finest or not any(
+            single_branch_data is not None and single_branch_data.is_mesh_limited
+            for single_branch_data in branch_data
+        ):
             break
         request = request._replace(cycle_options=branch_start.finer_options)
         cycle = branch_start.cycle
@@ -358,7 +374,7 @@ def _continue_from_starts(
 
 
 OMITTED_MEASURES = ("outcome", "solver_steps")
-"""Measures of the checking step that a branch omits."""
+"""Measures of the checking step that are not in the dataset of a branch."""
 
 
 def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
@@ -377,28 +393,35 @@ def _label_branch(
     outcome: int,
 ) -> Branch:
     """Return the labeled branch of one wheel; `outcome` is that of its start."""
-    origin = provenance(params, model, options)
-    origin.pop(f"parameter_{name}", None)
-    attrs = {"title": f"Branch of limit cycles along {name}"} | origin
+    start_wheel = provenance(params, model, options)
+    start_wheel.pop(f"parameter_{name}", None)
+    attrs = {"title": f"Branch of limit cycles along {name}"} | start_wheel
     if branch_data is None:
-        code = Outcome(outcome)
-        code = Outcome.NO_CYCLE_FOUND if code == Outcome.STEPPED else code
-        empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
-        return Branch(name, empty, (), ("", ""), code)
+        branch_outcome = Outcome(outcome)
+        branch_outcome = (
+            Outcome.NO_CYCLE_FOUND if branch_outcome == Outcome.STEPPED else branch_outcome
+        )
+        empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
+        return Branch(name, empty_dataset, (), ("", ""), branch_outcome)
     measure_names = (
         name
         for name in STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
         if name not in OMITTED_MEASURES
     )
-    data = make_variables(
-        {key: branch_data.table[key] for key in measure_names if key in branch_data.table}, "point"
+    variables = make_variables(
+        {
+            variable_name: branch_data.table[variable_name]
+            for variable_name in measure_names
+            if variable_name in branch_data.table
+        },
+        "point",
     )
-    data["section_state"] = xr.Variable(
+    variables["section_state"] = xr.Variable(
         ("point", "component"),
         branch_data.table["section_state"],
         {"long_name": "section state just before touchdown"},
     )
-    data["closure"] = xr.Variable(
+    variables["closure"] = xr.Variable(
         "point",
         branch_data.table["closure"],
         {"units": "1", "long_name": "miss of the section state after one event-driven period"},
@@ -414,28 +437,30 @@ def _label_branch(
         "leg": locked_leg_coordinate(params.n_legs),
     }
     dataset = xr.Dataset(
-        data | _stability_variables(np.asarray(branch_data.points.jacobian)), labels, attrs
+        variables | _stability_variables(np.asarray(branch_data.points.jacobian)), labels, attrs
     )
     return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)
 
 
 def _stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
-    """Return multipliers and stability measures along the branch."""
+    """Return labeled variables of multipliers and stability measures along the branch."""
     values = np.asarray(floquet_multipliers(jnp.asarray(jacobians)))
-    radius = np.max(np.abs(values), -1)
+    spectral_radius = np.max(np.abs(values), -1)
     names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
     return {
         **{
-            key: xr.Variable(("point", "multiplier"), part, {"units": "1", "long_name": text})
-            for (key, part), text in zip(
+            variable_name: xr.Variable(
+                ("point", "multiplier"), part_values, {"units": "1", "long_name": long_name}
+            )
+            for (variable_name, part_values), long_name in zip(
                 names.items(), ("real part of a multiplier", "imaginary part"), strict=True
             )
         },
         "spectral_radius": xr.Variable(
-            "point", radius, LIMIT_CYCLE_MEASURES["spectral_radius"].attrs
+            "point", spectral_radius, LIMIT_CYCLE_MEASURES["spectral_radius"].attrs
         ),
         "spectral_margin": xr.Variable(
-            "point", 1.0 - radius, LIMIT_CYCLE_MEASURES["spectral_margin"].attrs
+            "point", 1.0 - spectral_radius, LIMIT_CYCLE_MEASURES["spectral_margin"].attrs
         ),
     }
 
@@ -509,11 +534,11 @@ def continue_map(
         add_batch_axis(x),
         add_batch_axis(p),
         np.array([True]),
-        lambda owner, point: None,
+        lambda map_continuation, point: None,
     )
     if branch_data is None:
-        empty = xr.Dataset(coords={name: ("point", np.zeros(0))})
-        return Branch(name, empty, (), ("", ""), Outcome.NO_CYCLE_FOUND)
+        empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
+        return Branch(name, empty_dataset, (), ("", ""), Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
         {"x": (("point", "component"), branch_data.table["x"])}
         | _stability_variables(np.asarray(branch_data.points.jacobian)),

@@ -1,9 +1,9 @@
-"""Continuation problems of the wheel's gaits, and the measures of their points.
+"""Continuation problems of the wheel's gaits, and the measures at points of their branches.
 
-`CollocationProblem` is the fast one: the collocation system of the paper's sequence of phases, with
-one linearized pass per Newton iteration. `GroundProblem` uses batched steps with unilateral
-contact. `ReturnMapProblem` works for every model: it iterates the model's step and differentiates
-it in forward mode.
+`CollocationProblem` is the fastest one: it solves the collocation system of the paper's sequence of
+phases, with one linearized pass per Newton iteration. `GroundProblem` uses batched steps with
+unilateral contact. `ReturnMapProblem` works for every model: it iterates the model's step and
+differentiates it in forward mode.
 """
 
 import abc
@@ -51,19 +51,21 @@ from vrw_jax.wheel import (
 )
 
 FRICTION_SURPLUS_COLUMN = "friction_above_slope"
-"""Name of the column of the friction coefficient less the smallest one with a gait, which is the
-tangent of the slope."""
+"""Name of the column of the friction coefficient minus the smallest one with a gait, which is
+the tangent of the slope.
+"""
 
 MIN_FRICTION_SURPLUS = 1e-9
-"""Smallest surplus of friction over the slope's tangent, as a fraction of it. It is chosen because
-at the tangent itself gaits of every speed repeat, but for the round-off of friction."""
+"""Smallest surplus of friction over the slope's tangent, as a fraction of it. It is chosen
+because at the tangent itself gaits of every speed repeat, up to the round-off of friction.
+"""
 
 
 class BranchWheel(NamedTuple):
     """Wheel whose gaits are continued, at any value of the continued parameter."""
 
     params: WheelParams
-    phase_active: Float[Array, "n n_phases"]  # 1 if a phase of the cycle takes place, else 0
+    phase_active: Float[Array, "n n_phases"]  # 1 if the phase takes place in the cycle, else 0
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
@@ -93,7 +95,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
-        """Return all measures of the gaits at many points, by event-driven steps."""
+        """Return all measures of the gaits at many points by name, from event-driven steps."""
 
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
             section_state, continued_quantities = self.read_state(wheel, z, p)
@@ -107,8 +109,8 @@ class AbstractGaitProblem(AbstractContinuationProblem):
 class CollocationProblem(AbstractGaitProblem):
     """Continuation problem of limit cycles by collocation; z is a `CollocationSolution`.
 
-    Beyond an indicator's zero the formal solution continues, but the event-driven step rejects it
-    as a gait. `additional_quantities` are functions of the first step's passages and of z.
+    Beyond the zero of an indicator the solution continues, but the event-driven step rejects it as
+    a gait. `additional_quantities` is a function of the phase points of the first step and of z.
     """
 
     system: CollocationSystem = eqx.field(static=True)
@@ -141,24 +143,28 @@ class CollocationProblem(AbstractGaitProblem):
         return unbatch(collocation_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether the durations are positive; the event-driven step checks the rest."""
+        """Return whether the durations are positive; the event-driven step checks all other
+        conditions.
+        """
         return jnp.all((z.durations > 0.0) | (wheel.phase_active < 0.5))
 
     def read_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state, and quantities that continue beyond a special point.
+        """Return the section state, and quantities that continue beyond a special point, by name.
 
-        These are the shortest durations over the steps, and `takeoff_acceleration`, the rear foot's
-        acceleration at take-off, m/s^2, least over the steps.
+        These are the shortest duration of each phase over the steps, s, and `takeoff_acceleration`,
+        the rear foot's acceleration at take-off, m/s^2, least over the steps.
         """
         parameters = self._parameters_at(wheel, p)
         s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
         _, steps = self.system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
-        end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
-        z_of_lane = jax.tree.map(lambda x: x[..., None], z)
-        mesh_error = estimate_mesh_error(self.system.sequence, self.system.meshes, z_of_lane)[0]
+        step_end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
+        solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
+        mesh_error = estimate_mesh_error(
+            self.system.sequence, self.system.meshes, solution_with_lane
+        )[0]
         continued_quantities = {
             "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
@@ -168,24 +174,27 @@ class CollocationProblem(AbstractGaitProblem):
         }
         if self.additional_quantities is not None:
             continued_quantities |= self.additional_quantities(s, steps[0], z)
-        return jnp.stack([end.q[0], *end.v]), continued_quantities
+        return jnp.stack([step_end.q[0], *step_end.v]), continued_quantities
 
 
 QuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
 """Function of the system, parameters, `phase_active` and solution that returns quantities of
-collocated gaits over lanes."""
+collocated gaits over lanes.
+"""
 
 
 def linearize_with_quantities(
     system: CollocationSystem,
     parameter_indices: tuple[int, ...],
-    quantities_of: QuantityFunction | None = None,
+    compute_quantities: QuantityFunction | None = None,
 ) -> Any:
-    """Return a function that linearizes one wheel's trial, and its quantities if they are given.
+    """Return a function that linearizes one wheel's trial solution, and its quantities if they are
+    given.
 
-    Its arguments are (parameters, phase_active, solution), over which `jax.vmap` maps it. It
-    returns the correction, the tangents of the parameters and the monodromy. With `quantities_of`
-    it also returns these quantities, and their derivatives along the correction and each tangent.
+    Its arguments are (parameters, phase_active, solution), and `jax.vmap` can map it over wheels.
+    It returns the correction, the tangents of the parameters and the monodromy matrix. With
+    `compute_quantities` it also returns these quantities, and their derivatives along the
+    correction and each tangent.
     """
 
     def linearize_trial(parameters: Array, phase_active: Array, z: CollocationSolution) -> tuple:
@@ -198,32 +207,34 @@ def linearize_with_quantities(
             linearized_pass.tangents,
             linearized_pass.monodromy,
         )
-        if quantities_of is None:
+        if compute_quantities is None:
             return newton_data
         identity_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(parameter_indices)]
         parameter_tangents = np.concatenate([np.zeros_like(identity_rows[:1]), identity_rows])[
             :, :, None
         ]
-        prepend = lambda a, b: jnp.concatenate([a[None], b])
-        tangents = jax.tree.map(prepend, linearized_pass.correction, linearized_pass.tangents)
+        with_correction_first = lambda a, b: jnp.concatenate([a[None], b])
+        tangents = jax.tree.map(
+            with_correction_first, linearized_pass.correction, linearized_pass.tangents
+        )
         directions = (
             jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
             tangents,
         )
-        evaluate = lambda parameters, z: quantities_of(system, parameters, phase_active, z)
+        evaluate = lambda parameters, z: compute_quantities(system, parameters, phase_active, z)
         tangent_along = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
         return *newton_data, evaluate(parameters, z), lax.map(tangent_along, directions)
 
     make_output_template = lambda parameters, phase_active, z: (
         z,
         z,
-        *(parameters,) * (1 if quantities_of is None else 3),
+        *(parameters,) * (1 if compute_quantities is None else 3),
     )
     cache_key = (
         "followed",
         system,
         parameter_indices,
-        quantities_of.__name__ if quantities_of else "",
+        compute_quantities.__name__ if compute_quantities else "",
     )
     return unbatch(compile_batched(linearize_trial, make_output_template, cache_key, batch_size=0))
 
@@ -232,7 +243,8 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` steps.
 
     z is the section state. Its last entries are codes (see `AbstractWheel.n_continuous`), which are
-    those of the image of the last iteration. Newton's method ends only if they are equal.
+    those of the image in the last iteration. Newton's method ends only if the codes of both are
+    equal.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -249,13 +261,15 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
         return interpolate_states(left, right, fraction, self.n_coordinates)
 
     def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
-        """Return whether the codes of both are the same."""
+        """Return whether the codes of both points are equal."""
         return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
 
     def read_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state. The step's measures contain all other quantities."""
+        """Return the section state without other quantities, all of which are measures of the
+        step.
+        """
         return z, {}
 
 
@@ -268,8 +282,8 @@ class ReturnMapProblem(AbstractReturnMapProblem):
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
 
-    def _image(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
-        """Return the section state after `period_n` steps, NaN if one fails."""
+    def _iterate_return_map(self, wheel: BranchWheel, z: Array, p: Scalar) -> Array:
+        """Return the section state after `period_n` steps; NaN if one of them fails."""
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         for _ in range(self.period_n):
             advance = model.advance(params, z, self.options)
@@ -277,12 +291,12 @@ class ReturnMapProblem(AbstractReturnMapProblem):
         return z
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
-        return_map = lambda z, p: self._image(wheel, z, p)
+        return_map = lambda z, p: self._iterate_return_map(wheel, z, p)
         return arclength.fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
 
 class GroundProblem(AbstractReturnMapProblem):
-    """Continuation problem with unilateral contact by batched steps."""
+    """Continuation problem with unilateral contact, by batches of steps."""
 
     model: UnilateralWheel
     options: StepOptions
@@ -295,16 +309,16 @@ class GroundProblem(AbstractReturnMapProblem):
     has_kinks: ClassVar[bool] = True
 
     def parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return the model's parameter values of many wheels with the continued parameter at p."""
+        """Return the model's parameter values of many wheels, with the continued parameter at p."""
 
-        def values_of_wheel(wheel: BranchWheel, p: Array) -> Array:
+        def select_values(wheel: BranchWheel, p: Array) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
             return model.parameter_values(params)
 
-        return jax.vmap(values_of_wheel)(wheels, p)
+        return jax.vmap(select_values)(wheels, p)
 
     def _period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
-        """Return the map of many wheels over a period."""
+        """Return the map of many wheels over one period."""
         values = np.asarray(self.parameter_values(wheels, p))
         return PeriodMap(self.model, self.n_legs, self.period_n, values)
 
@@ -344,10 +358,11 @@ class GroundProblem(AbstractReturnMapProblem):
         return _measure_periods(period.steps, points.z) | additional_columns
 
     def _friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
-        """Return the friction coefficient less the smallest one with a gait.
+        """Return the friction coefficient minus the smallest one with a gait.
 
         Over a period the ground's tangential impulse equals that of the weight along the slope.
-        Friction limits it to a multiple of the normal impulse, so no gait repeats without surplus.
+        Friction limits it to a multiple of the normal impulse, so no gait repeats without a
+        surplus.
         """
         model: Any
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -359,24 +374,29 @@ class GroundProblem(AbstractReturnMapProblem):
 
 
 def hash_contact_orders(steps: Any, n_legs: int) -> np.ndarray:
-    """Return for each of many periods a number that identifies its order of contacts.
+    """Return a number for each of many periods that identifies its order of contacts.
 
-    It is a checksum of the modes that occur, the counts of events and the final contact modes.
+    The number is a checksum of the modes that occur, the counts of events and the final contact
+    modes.
     """
-    occurring = np.asarray(steps.mode_durations) > 0.0
+    occurring_modes = np.asarray(steps.mode_durations) > 0.0
     codes = np.asarray(steps.section_state)[..., -n_legs:]
     counts = np.stack([np.asarray(steps.events), np.asarray(steps.impacts)], -1)
-    rows = [x.reshape(len(x), -1).astype(np.int64) for x in (occurring, codes, counts)]
-    orders = [zlib.crc32(row.tobytes()) for row in np.concatenate(rows, 1)]
-    return np.array(orders, float)
+    integer_arrays = [
+        x.reshape(len(x), -1).astype(np.int64) for x in (occurring_modes, codes, counts)
+    ]
+    order_numbers = [
+        zlib.crc32(period_row.tobytes()) for period_row in np.concatenate(integer_arrays, 1)
+    ]
+    return np.array(order_numbers, float)
 
 
 @jax.jit
 @jax.vmap
-def _measure_periods(steps: AbstractStep, x: AnySectionState) -> dict[str, Array]:
-    """Return the measures of many periods that begin at the section states x."""
+def _measure_periods(steps: AbstractStep, section_states: AnySectionState) -> dict[str, Array]:
+    """Return the measures of many periods that begin at these section states."""
     return combine_step_measures(
-        steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), x
+        steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), section_states
     )
 
 
@@ -393,11 +413,11 @@ def measure_gait(
     options: StepOptions,
     period_n: int,
 ) -> dict[str, Array]:
-    """Return all measures of one period of a gait from its section state, with `closure`.
+    """Return all measures of one period of a gait that starts at its section state, with `closure`.
 
-    Indicators and margins are minima over the steps; durations and energies are sums. Section and
-    post-impact state are those of the last and the first step. `outcome` is that of the first step
-    that fails. `closure` is the change of the section state over the period.
+    Indicators and margins are minima over the steps; durations and energies are sums. The section
+    state is that of the last step, the post-impact state that of the first. `outcome` is that of
+    the first step that fails. `closure` is the change of the section state over the period.
     """
 
     def measure_next_step(x: AnySectionState, _: None) -> tuple[AnySectionState, dict[str, Array]]:
@@ -411,7 +431,9 @@ def measure_gait(
 def combine_step_measures(
     end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
 ) -> dict[str, Array]:
-    """Return `measure_gait` from the measures of each step and the final section state."""
+    """Return the result of `measure_gait` from the measures of each step and the final section
+    state.
+    """
     measures = {}
     for name, values in step_measures.items():
         if name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or name.startswith("lambda_"):

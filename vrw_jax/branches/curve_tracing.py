@@ -1,7 +1,7 @@
 """Continuation of special points as curves in two parameters, in batches, each curve once.
 
-A special point is solved for together with its gait, so that a point of a curve is as accurate as
-the gait. If a curve meets another special point, a new curve starts there.
+A special point is computed together with its gait, so that a point of a curve is as accurate as the
+gait. If a curve meets another special point, a new curve starts there.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,9 +35,9 @@ from vrw_jax.branches.gait_test_functions import (
     LINEAR_SUBSTITUTES,
     GaitTestFunction,
     TestFunctionArgs,
+    find_quantity_group,
     locate_jump_onset,
-    quantity_group_of,
-    test_quantity_of,
+    select_test_quantity,
 )
 from vrw_jax.branches.multiplicity import BRANCH_POINT_KIND
 from vrw_jax.collocation import CollocationSolution
@@ -64,13 +64,13 @@ DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
 
 @dataclass(frozen=True)
 class TracingOptions:
-    """Numbers of the tracing of curves; lengths are as along a curve.
+    """Options of the tracing of curves; lengths are arc lengths of curves.
 
     - `same_curve_distance`: largest distance of a point from a curve that contains it;
     - `overrun_distance`: distance from a point of codimension two at which the continuation of the
       other curve starts;
-    - `codim2_tolerance`: Newton's last step to a point of codimension two, relative to the values
-      of the parameters;
+    - `codim2_tolerance`: tolerance of Newton's last step to a point of codimension two, relative to
+      the values of the parameters;
     - `max_zero_duration`: duration of double support that counts as zero, s. It is chosen above
       round-off because the duration is ill-conditioned there;
     - `duration_guess`: first guess of a nonzero duration of double support, s.
@@ -84,17 +84,19 @@ class TracingOptions:
 
 
 TRACING_OPTIONS = TracingOptions()
-"""Options of all curves."""
+"""Options of the tracing of all curves."""
 
 
 @dataclass(frozen=True)
 class CurveContinuation(AbstractContinuation):
-    """Continuation of special points, evaluated as gaits are except for the special point."""
+    """Continuation of special points, which are evaluated like gaits except for the quantity
+    that vanishes.
+    """
 
     problem: TestFunctionCurve
     second_parameter: str
-    special_point_names: tuple[str, ...]  # one for each wheel
-    gait_continuation: GaitContinuation  # along the first parameter
+    special_point_names: tuple[str, ...]  # name of the special point of each wheel
+    gait_continuation: GaitContinuation  # continuation of gaits along the first parameter
 
     ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
@@ -158,10 +160,10 @@ class CurveContinuation(AbstractContinuation):
 
 
 class CurveSeed(NamedTuple):
-    """Point on or near a curve of special points, from which it is continued."""
+    """Point on or near a curve of special points, from which the curve is continued."""
 
     name: str
-    parameter_values: tuple[float, float]  # the two parameters
+    parameter_values: tuple[float, float]  # values of the two parameters
     system: CollocationSystem
     gait: BranchWheel
     z: CollocationSolution
@@ -171,15 +173,16 @@ class TracedCurve(NamedTuple):
     """Traced curve, with seeds at the special points that it meets."""
 
     curve: SpecialPointCurve
-    path: np.ndarray  # section state and both parameters' fractions, (point, coordinate)
+    # section states and both parameters as fractions of their ranges, (point, coordinate)
+    vertices: np.ndarray
     new_seeds: tuple[CurveSeed, ...]
 
 
 class CurveTracer(NamedTuple):
-    """Tracer of curves of special points within two parameter ranges."""
+    """Tracer of curves of special points within the ranges of two parameters."""
 
     parameters: tuple[str, str]
-    parameter_ranges: np.ndarray  # (parameter, end)
+    parameter_ranges: np.ndarray  # bounds of each parameter, (parameter, 2)
     model: ViscoelasticWheel
     options: ArclengthOptions
     step_options: StepOptions
@@ -202,11 +205,13 @@ class CurveTracer(NamedTuple):
         return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(self, axis: int, params: WheelParams) -> list[CurveSeed]:
-        """Return seeds at special points on the branches of wheels along one of the parameters."""
+        """Return seeds at the special points on branches of the wheels along the parameter of
+        index `axis`.
+        """
         name, seeds = self.parameters[axis], []
-        lower, upper = self.parameter_ranges[axis]
+        lower_bound, upper_bound = self.parameter_ranges[axis]
         self.report_stage(f"following {len(params.damping)} branches along {name}")
-        for branch in continue_branches(params, name, (lower, upper), model=self.model):
+        for branch in continue_branches(params, name, (lower_bound, upper_bound), model=self.model):
             for special_point in branch.special_points:
                 if can_continue(special_point.name):
                     seeds.append(self._make_seed(special_point))
@@ -219,7 +224,7 @@ class CurveTracer(NamedTuple):
         first, second = (float(getattr(params, name)) for name in self.parameters)
         gait = BranchWheel(params, cycle.collocation_state.phase_active)
         z = cycle.collocation_state.solution
-        name = special_point_name(special_point.name, gait, z, self.tracing_options)
+        name = name_special_point(special_point.name, gait, z, self.tracing_options)
         return CurveSeed(name, (first, second), cycle.system, gait, z)
 
     def trace_curves(
@@ -232,33 +237,36 @@ class CurveTracer(NamedTuple):
             for seed in seeds
             if not any(self._is_on_curve(seed, curve) for curve in known_curves)
         ]
-        groups = {quantity_group_of(seed.name, seed.system.n_legs) for seed in new_seeds}
-        for group in sorted(groups):
-            remaining = [
-                s for s in new_seeds if quantity_group_of(s.name, s.system.n_legs) == group
+        quantity_groups = {find_quantity_group(seed.name, seed.system.n_legs) for seed in new_seeds}
+        for quantity_group in sorted(quantity_groups):
+            remaining_seeds = [
+                s
+                for s in new_seeds
+                if find_quantity_group(s.name, s.system.n_legs) == quantity_group
             ]
-            while remaining:
+            while remaining_seeds:
                 batch_seeds: list[CurveSeed] = []
-                # A batch has each name once, because other seeds of the name may be on its curve.
-                for seed in remaining:
+                # A batch contains each name once, because other seeds of the name may be on its
+                # curve.
+                for seed in remaining_seeds:
                     if (
                         seed.name not in {s.name for s in batch_seeds}
                         and len(batch_seeds) < batch_sizes.CURVE_BATCH_SIZE
                     ):
                         batch_seeds.append(seed)
-                accepted: list[TracedCurve] = []
-                for curve in self._trace_batch(group, batch_seeds):
+                accepted_curves: list[TracedCurve] = []
+                for curve in self._trace_batch(quantity_group, batch_seeds):
                     if not any(
                         self.is_same_curve(curve, other_curve)
-                        for other_curve in (*known_curves, *new_curves, *accepted)
+                        for other_curve in (*known_curves, *new_curves, *accepted_curves)
                     ):
-                        accepted.append(curve)
-                new_curves += accepted
-                remaining = [
+                        accepted_curves.append(curve)
+                new_curves += accepted_curves
+                remaining_seeds = [
                     seed
-                    for seed in remaining
-                    if not any(seed is other for other in batch_seeds)
-                    and not any(self._is_on_curve(seed, curve) for curve in accepted)
+                    for seed in remaining_seeds
+                    if not any(seed is batch_seed for batch_seed in batch_seeds)
+                    and not any(self._is_on_curve(seed, curve) for curve in accepted_curves)
                 ]
         return new_curves
 
@@ -270,18 +278,22 @@ class CurveTracer(NamedTuple):
         has_same_name = seed.name == curve.curve.name
         max_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
-            distance_to_path(seed_point[None], curve.path)[0] < max_distance
+            distance_to_polyline(seed_point[None], curve.vertices)[0] < max_distance
         )
 
     def is_same_curve(self, curve: TracedCurve, other_curve: TracedCurve) -> bool:
-        """Return whether each point of a curve is on the other curve of the same special point."""
+        """Return whether each point of a curve is on the other curve, and both have the same
+        name.
+        """
         has_same_name = curve.curve.name == other_curve.curve.name
         max_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
-            np.max(distance_to_path(curve.path, other_curve.path)) < max_distance
+            np.max(distance_to_polyline(curve.vertices, other_curve.vertices)) < max_distance
         )
 
-    def _trace_batch(self, group: tuple[str, ...], seeds: list[CurveSeed]) -> list[TracedCurve]:
+    def _trace_batch(
+        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed]
+    ) -> list[TracedCurve]:
         """Return a curve through each seed that has one, on a sufficiently fine mesh."""
         curves: list[TracedCurve] = []
         names = ", ".join(sorted({seed.name for seed in seeds}))
@@ -289,44 +301,48 @@ class CurveTracer(NamedTuple):
         max_refinements = GAIT_BRANCH_OPTIONS.max_refinements
         for refinement in range(1 + max_refinements):
             is_finest = refinement == max_refinements
-            branches = self._continue_batch(group, seeds, is_finest)
-            mesh_limited = []
+            branches = self._continue_batch(quantity_group, seeds, is_finest)
+            mesh_limited_seeds = []
             for seed, (branch, system) in zip(seeds, branches, strict=True):
                 if branch is not None and branch.is_mesh_limited and not is_finest:
                     options = system.options.refine_mesh()
-                    mesh_limited.append(self._transfer_seed(seed, system._replace(options=options)))
+                    mesh_limited_seeds.append(
+                        self._transfer_seed(seed, system._replace(options=options))
+                    )
                 elif branch is not None:
                     curves.append(self._label_traced(seed._replace(system=system), branch))
-            if not mesh_limited:
+            if not mesh_limited_seeds:
                 break
-            seeds = mesh_limited
+            seeds = mesh_limited_seeds
         return curves
 
     @staticmethod
     def _transfer_seed(seed: CurveSeed, system: CollocationSystem) -> CurveSeed:
-        """Return a seed on the mesh of `system`."""
+        """Return the seed transferred to the mesh of `system`."""
         if seed.system == system:
             return seed
         return seed._replace(system=system, z=transfer_to_mesh(seed.system, system, seed.z))
 
     def _continue_batch(
-        self, group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
+        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
     ) -> list[tuple[BranchData | None, CollocationSystem]]:
-        """Return the data of a curve through each seed, with the finest system of the seeds."""
+        """Return the data of a curve through each seed, with the system of the finest mesh among
+        the seeds.
+        """
         system = max(
             (seed.system for seed in seeds), key=lambda system: system.options.mesh_intervals
         )
         seeds = [self._transfer_seed(seed, system) for seed in seeds]
         padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % batch_sizes.CURVE_BATCH_SIZE)]
         test_function = GaitTestFunction(
-            system, self.parameters, group, self.model, self.step_options
+            system, self.parameters, quantity_group, self.model, self.step_options
         )
         stack_trees = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
         quantity_names = [
-            test_quantity_of(seed.name, bool(seed.gait.phase_active[0, 0] > 0.5))
+            select_test_quantity(seed.name, bool(seed.gait.phase_active[0, 0] > 0.5))
             for seed in padded_seeds
         ]
-        quantity_indices = [jnp.asarray(group.index(name)) for name in quantity_names]
+        quantity_indices = [jnp.asarray(quantity_group.index(name)) for name in quantity_names]
         wheels = stack_trees(
             *(
                 TestFunctionArgs(seed.gait, quantity_index)
@@ -334,8 +350,12 @@ class CurveTracer(NamedTuple):
             )
         )
         lower, upper = map(float, self.parameter_ranges[1])
-        fraction_of = lambda seed: jnp.asarray((seed.parameter_values[1] - lower) / (upper - lower))
-        z = stack_trees(*(TestFunctionPoint(seed.z, fraction_of(seed)) for seed in padded_seeds))
+        second_fraction = lambda seed: jnp.asarray(
+            (seed.parameter_values[1] - lower) / (upper - lower)
+        )
+        z = stack_trees(
+            *(TestFunctionPoint(seed.z, second_fraction(seed)) for seed in padded_seeds)
+        )
         gait_continuation = GaitContinuation(
             test_function.gait_problem,
             self.options,
@@ -367,10 +387,14 @@ class CurveTracer(NamedTuple):
         return [(branch, system) for branch in branches[: len(seeds)]]
 
     def _label_traced(self, seed: CurveSeed, branch: BranchData) -> TracedCurve:
-        """Return the labeled curve from its data, with seeds at the special points on it."""
+        """Return the labeled curve from its data, with seeds at the special points that it
+        meets.
+        """
         values = np.stack([branch.points.p, branch.table["second"]], -1)
-        path = np.column_stack([branch.points.z.z.section_state, self.parameter_fractions(values)])
-        codim2_points, new_seeds, ends = [], [], branch.ends
+        vertices = np.column_stack(
+            [branch.points.z.z.section_state, self.parameter_fractions(values)]
+        )
+        codim2_points, new_seeds, end_reasons = [], [], branch.ends
         for special_point in branch.special_points:
             if special_point.name == EDGE_COLUMN:
                 continue
@@ -382,26 +406,29 @@ class CurveTracer(NamedTuple):
                     + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
                 ),
             )
-            name = special_point_name(
+            name = name_special_point(
                 special_point.name, seed.gait, point_beside.z.z, self.tracing_options
             )
             if {name, seed.name} == {"lambda_4_plus", DLS_VANISHES}:
                 meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
                 new_seeds.append(
                     self._seed_beyond_meeting(
-                        name, seed, path, values, branch.points.z.z, meeting_values
+                        name, seed, vertices, values, branch.points.z.z, meeting_values
                     )
                 )
-                replaced_text = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
-                ends = ends[0].replace(*replaced_text), ends[1].replace(*replaced_text)
+                text_replacement = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
+                end_reasons = (
+                    end_reasons[0].replace(*text_replacement),
+                    end_reasons[1].replace(*text_replacement),
+                )
             elif can_continue(name):
                 seed_values = float(point_beside.p), meeting_values[1]
                 new_seeds.append(
                     CurveSeed(name, seed_values, seed.system, seed.gait, point_beside.z.z)
                 )
             codim2_points.append(Codim2Point(name, meeting_values, special_point.ends_branch))
-        curve = self._label_curve(seed, branch._replace(ends=ends), tuple(codim2_points))
-        return TracedCurve(curve, path, tuple(new_seeds))
+        curve = self._label_curve(seed, branch._replace(ends=end_reasons), tuple(codim2_points))
+        return TracedCurve(curve, vertices, tuple(new_seeds))
 
     def _locate_jump_onset(
         self, seed: CurveSeed, z: CollocationSolution, start_values: Any
@@ -410,18 +437,18 @@ class CurveTracer(NamedTuple):
         test_function = GaitTestFunction(
             seed.system, self.parameters, CONTINUED_QUANTITIES, self.model, self.step_options
         )
-        onset, last_change = locate_jump_onset(
+        onset_values, last_change = locate_jump_onset(
             test_function, seed.gait, jax.device_put(z), jnp.asarray(start_values)
         )
         is_found = last_change < self.tracing_options.codim2_tolerance
-        first, second = onset if is_found else start_values
-        return float(first), float(second)
+        first_value, second_value = onset_values if is_found else start_values
+        return float(first_value), float(second_value)
 
     def _seed_beyond_meeting(
         self,
         name: str,
         seed: CurveSeed,
-        path: np.ndarray,
+        vertices: np.ndarray,
         values: np.ndarray,
         z: CollocationSolution,
         meeting_values: Any,
@@ -429,25 +456,25 @@ class CurveTracer(NamedTuple):
         """Return a seed beyond the point at which the rear foot's force starts to rise or fall.
 
         The force is zero along the curve. Both curves cross there and continue in the same
-        direction.
+        direction. `meeting_values` are both parameters at the crossing.
         """
         starts_at_meeting = (
             abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
         )
         direction = 1 if starts_at_meeting else -1
-        path, values = path[::direction], values[::direction]
+        vertices, values = vertices[::direction], values[::direction]
         z = jax.tree.map(lambda x: x[::direction], z)
         overrun_distance = self.tracing_options.overrun_distance
-        distances = np.linalg.norm(path - path[0], axis=1)
+        distances = np.linalg.norm(vertices - vertices[0], axis=1)
         point_index = int(np.argmax(distances >= min(overrun_distance, distances[-1])))
         extrapolate = lambda x: (
             x[0] + overrun_distance / distances[point_index] * (x[0] - x[point_index])
         )
         z = jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z)
-        first, second = extrapolate(values)
+        first_value, second_value = extrapolate(values)
         dls_duration = 0.0 if name == DLS_VANISHES else self.tracing_options.duration_guess
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
-        return CurveSeed(name, (first, second), seed.system, seed.gait, z)
+        return CurveSeed(name, (first_value, second_value), seed.system, seed.gait, z)
 
     def _label_curve(
         self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
@@ -456,38 +483,43 @@ class CurveTracer(NamedTuple):
         radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
         table = branch.table | {"spectral_radius": radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-        data: dict[str, Any] = {n: ("point", table[n], measure_attrs(n)) for n in column_names}
-        data["mesh_error"] = ("point", table["mesh_error"])
-        data["section_state"] = (("point", "component"), table["section_state"])
+        variables: dict[str, Any] = {
+            column_name: ("point", table[column_name], measure_attrs(column_name))
+            for column_name in column_names
+        }
+        variables["mesh_error"] = ("point", table["mesh_error"])
+        variables["section_state"] = (("point", "component"), table["section_state"])
         values = np.asarray(branch.points.p), table["second"]
         labels = {
             parameter: ("point", value, measure_attrs(parameter))
             for parameter, value in zip(self.parameters, values, strict=True)
         }
-        origin = provenance(seed.gait.params, self.model, self.step_options)
+        start_wheel = provenance(seed.gait.params, self.model, self.step_options)
         title = {"title": f"Curve of {seed.name} over {' and '.join(self.parameters)}"}
-        dataset = xr.Dataset(data, labels, title | origin)
+        dataset = xr.Dataset(variables, labels, title | start_wheel)
         return SpecialPointCurve(seed.name, self.parameters, dataset, codim2_points, branch.ends)
 
 
-def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Return the distance of each point from a polyline, whose vertices are rows of `path`."""
-    segment_starts, chord = path[:-1], np.diff(path, axis=0)
-    squared = np.maximum(np.sum(chord**2, 1), 1e-300)
+def distance_to_polyline(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return the distance of each point from a polyline, whose vertices are rows of `vertices`,
+    shape (points,).
+    """
+    segment_starts, segment_vectors = vertices[:-1], np.diff(vertices, axis=0)
+    squared_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
     offsets = points[:, None] - segment_starts
-    fractions = np.clip(np.sum(offsets * chord, 2) / squared, 0.0, 1.0)
-    distances = np.linalg.norm(offsets - fractions[..., None] * chord, axis=2)
+    fractions = np.clip(np.sum(offsets * segment_vectors, 2) / squared_lengths, 0.0, 1.0)
+    distances = np.linalg.norm(offsets - fractions[..., None] * segment_vectors, axis=2)
     return np.min(distances, axis=1, initial=np.inf)
 
 
-def special_point_name(
+def name_special_point(
     name: str,
     gait: BranchWheel,
     z: CollocationSolution,
     options: TracingOptions = TRACING_OPTIONS,
 ) -> str:
     """Return the name of a special point of a curve or branch, given its gait."""
-    if name == BRANCH_POINT_KIND:  # A curve of folds need not turn back there.
+    if name == BRANCH_POINT_KIND:  # A curve of folds need not turn back at its special points.
         return "fold"
     if (
         name not in ("lambda_4_plus", DLS_VANISHES, FORCE_FALL_NAME)
@@ -499,7 +531,9 @@ def special_point_name(
 
 
 def can_continue(name: str) -> bool:
-    """Return whether a special point can be continued as a curve by `GaitTestFunction`."""
+    """Return whether the special point of this name can be continued as a curve by
+    `GaitTestFunction`.
+    """
     return (
         name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHES)
         or name.partition("[")[0] in MARGIN_MEASURES

@@ -1,7 +1,7 @@
 """Test functions of collocated gaits over two parameters, whose zeros are special points.
 
-Trial, tangents, quantities and their derivatives are computed by one call of machine code. Margins
-that need an event-driven step are computed by steps.
+Trial solution, tangents, quantities and their derivatives are computed by one call of machine code.
+Margins that need an event-driven step are computed by steps.
 """
 
 from collections.abc import Mapping
@@ -50,21 +50,28 @@ from vrw_jax.wheel import (
 )
 
 LINEAR_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_substitutes
-"""Margins that vanish as a cube, with the quantity that vanishes linearly at the same point."""
+"""Names of margins that vanish as a cube, with the quantity that vanishes linearly at the same
+point.
+"""
 
 DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
 
 DLS_VANISHES = "duration_dls"
-"""Name of the special point at which the duration of double support is zero. The rear foot's force
-is zero there and falls. At the zero of `lambda_4_plus` it is zero and rises, and the step jumps."""
+"""Name of the special point at which the duration of double support is zero. There the rear
+foot's force is zero and falls. At the zero of `lambda_4_plus` the force is zero and rises, and the
+step jumps.
+"""
 
 FORCE_FALL_NAME = "fall of the rear foot's force at first"
-"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHES`, which ends at its zero."""
+"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHES`; the curve ends at the
+rate's zero.
+"""
 
 MEAN_FORCE_FALL_NAME = "its mean fall in double support"
-"""Name of a rate in N/s that is zero on the curve of `lambda_4_plus`. It is not zero on that of
-`DLS_VANISHES`, which satisfies the same equations otherwise."""
+"""Name of a rate in N/s that is zero on the curve of `lambda_4_plus`. On the curve of
+`DLS_VANISHES`, which otherwise satisfies the same equations, it is not zero.
+"""
 
 CONTINUED_QUANTITIES = (
     *DISCONTINUOUS_QUANTITIES,
@@ -72,12 +79,12 @@ CONTINUED_QUANTITIES = (
     FORCE_FALL_NAME,
     MEAN_FORCE_FALL_NAME,
 )
-"""Quantities of the collocated gait itself, which continue beyond the special point."""
+"""Quantities of the collocated gait itself, which are also defined beyond the special point."""
 
 
 @dataclass(frozen=True)
 class TestFunctionOptions:
-    """Numbers of the test functions of gaits.
+    """Options of the test functions of gaits.
 
     - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
     - `duration_roundoff`: round-off of a duration that is zero along a whole curve, s;
@@ -90,31 +97,39 @@ class TestFunctionOptions:
     relative_difference: float = 1e-6
 
 
-def test_quantity_of(name: str, has_double_support: bool) -> str:
-    """Return the quantity whose zero is the special point, for gaits with double support or not."""
+def select_test_quantity(name: str, has_double_support: bool) -> str:
+    """Return the name of the quantity whose zero is the special point, for gaits with or without
+    double support.
+    """
     if name == "lambda_4_plus" and has_double_support:
         return MEAN_FORCE_FALL_NAME
     return "lambda_4_plus" if name == DLS_VANISHES else LINEAR_SUBSTITUTES.get(name, name)
 
 
-def quantity_group_of(name: str, n_legs: int) -> tuple[str, ...]:
-    """Return the quantities that are evaluated together with that of a special point."""
+def find_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
+    """Return the names of the quantities that are evaluated together with that of a special
+    point.
+    """
     leg_suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
     step_quantities = [
-        n + leg
-        for n, margin in MARGIN_MEASURES.items()
-        for leg in (leg_suffixes if margin.dimension else [""])
+        name + leg
+        for name, margin_name in MARGIN_MEASURES.items()
+        for leg in (leg_suffixes if margin_name.dimension else [""])
     ]
     quantity_groups = (
         BIFURCATION_NAMES,
         CONTINUED_QUANTITIES,
         tuple(name for name in step_quantities if name not in CONTINUED_QUANTITIES),
     )
-    return next(group for group in quantity_groups if test_quantity_of(name, True) in group)
+    return next(
+        quantity_group
+        for quantity_group in quantity_groups
+        if select_test_quantity(name, True) in quantity_group
+    )
 
 
 class TestFunctionArgs(NamedTuple):
-    """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
+    """Wheel on a curve of special points, and the index of the quantity that vanishes there."""
 
     gait: BranchWheel
     quantity_index: Array
@@ -125,7 +140,7 @@ class GaitTestFunction(AbstractTestFunction):
 
     system: CollocationSystem = eqx.field(static=True)
     parameter_names: tuple[str, str] = eqx.field(static=True)
-    quantities: tuple[str, ...] = eqx.field(static=True)  # of one quantity group
+    quantities: tuple[str, ...] = eqx.field(static=True)  # names of the quantities of one group
     model: ViscoelasticWheel
     step_options: StepOptions
     options: TestFunctionOptions = eqx.field(static=True, default=TestFunctionOptions())
@@ -173,16 +188,20 @@ class GaitTestFunction(AbstractTestFunction):
         correction: CollocationSolution,
         tangents: tuple,
     ) -> tuple[Array, Array]:
-        """Return the step's quantities of the corrected gait, and their parameter derivatives.
+        """Return the step's quantities of the corrected gait, and their derivatives with respect to
+        both parameters.
 
         Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
-        than derivatives of the step, and use the same machine code. Next to a fold the tangents
-        grow without bound and become parallel, and so do the corrections. The differences are
-        therefore taken along an orthonormal basis, from the point of the tangents' plane that is
-        nearest to the trial.
+        than derivatives of the step, and use the same machine code. Near a fold the tangents grow
+        without bound and become parallel, and so do the corrections. The differences are therefore
+        taken along an orthonormal basis, from the point of the tangents' plane that is nearest to
+        the trial.
         """
         scaled_tangents = jnp.stack(
-            [p[i] * self.section_state(column) for i, column in enumerate(tangents)]
+            [
+                p[parameter_index] * self.section_state(tangent)
+                for parameter_index, tangent in enumerate(tangents)
+            ]
         )
         basis, triangular_factor = jnp.linalg.qr(
             jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
@@ -192,18 +211,23 @@ class GaitTestFunction(AbstractTestFunction):
 
         def measure_at_offset(offset: Array) -> Array:
             parameter_change = basis_coefficients @ (offset - correction_coordinates)
-            displace = lambda x, dx, first_tangent, second_tangent: (
-                x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+            displace_entry = lambda x, correction_entry, first_tangent, second_tangent: (
+                x
+                + correction_entry
+                + parameter_change[0] * first_tangent
+                + parameter_change[1] * second_tangent
             )
             return self.measure_step(
-                gait, jax.tree.map(displace, z, correction, *tangents), p + parameter_change
+                gait, jax.tree.map(displace_entry, z, correction, *tangents), p + parameter_change
             )
 
         difference = self.options.relative_difference
-        values = jax.vmap(measure_at_offset)(difference * jnp.eye(3, 2, -1, p.dtype))
-        gradient = (values[1:] - values[0]) / difference
-        parameter_gradient = triangular_factor.T @ gradient / p[:, None]
-        return values[0] + correction_coordinates @ gradient, parameter_gradient
+        quantities_at_offsets = jax.vmap(measure_at_offset)(difference * jnp.eye(3, 2, -1, p.dtype))
+        quantity_gradients = (quantities_at_offsets[1:] - quantities_at_offsets[0]) / difference
+        parameter_gradient = triangular_factor.T @ quantity_gradients / p[:, None]
+        return quantities_at_offsets[
+            0
+        ] + correction_coordinates @ quantity_gradients, parameter_gradient
 
     def with_parameters(self, gait: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with both parameters at p."""
@@ -218,11 +242,13 @@ class GaitTestFunction(AbstractTestFunction):
         return CollocationProblem(
             system=self.system,
             parameter_name=self.parameter_names[0],
-            additional_quantities=_continued_by_name,
+            additional_quantities=_compute_continued_quantities,
         )
 
     def measure_step(self, gait: BranchWheel, z: CollocationSolution, p: Array) -> Array:
-        """Return the quantities of an event-driven step from the gait, in order."""
+        """Return the quantities of an event-driven step from the gait, in the order of
+        `quantities`.
+        """
         params = self.with_parameters(gait, p).params
         section_state = self.gait_problem.read_state(gait._replace(params=params), z, p[0])[0]
         measures = measure_gait(self.model, params, section_state, self.step_options, 1)
@@ -248,11 +274,12 @@ class GaitTestFunction(AbstractTestFunction):
 def locate_jump_onset(
     test_function: GaitTestFunction, gait: BranchWheel, z: CollocationSolution, p: Array
 ) -> tuple[Array, Array]:
-    """Return the parameters at which `DLS_VANISHES` meets `lambda_4_plus`, and their last change.
+    """Return the parameters at which `DLS_VANISHES` meets `lambda_4_plus`, and their last relative
+    change.
 
-    The start is a gait and parameters nearby, and the change is relative. The equations of both
-    curves are singular if double support has zero duration. The equations of the same gait without
-    double support are regular, and the rear foot's force and its rate are both zero there.
+    The search starts from a gait and parameters near that point. The equations of both curves are
+    singular if double support has zero duration. The equations of the same gait without double
+    support are regular, and the rear foot's force and its rate are both zero there.
     """
     gait = gait._replace(phase_active=gait.phase_active.at[0, 0].set(0.0))
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
@@ -260,7 +287,7 @@ def locate_jump_onset(
         jnp.asarray(CONTINUED_QUANTITIES.index(name)) for name in ("lambda_4_plus", FORCE_FALL_NAME)
     ]
 
-    def newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
+    def take_newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
         z, p = solution_and_parameters
         force, force_fall = (
             test_function.linearize(TestFunctionArgs(gait, index), z, p)
@@ -268,16 +295,19 @@ def locate_jump_onset(
         )
         gradients = jnp.stack([force.parameter_gradient, force_fall.parameter_gradient])
         parameter_change = -jnp.linalg.solve(gradients, jnp.stack([force.value, force_fall.value]))
-        displace = lambda x, dx, first_tangent, second_tangent: (
-            x + dx + parameter_change[0] * first_tangent + parameter_change[1] * second_tangent
+        displace_entry = lambda x, correction_entry, first_tangent, second_tangent: (
+            x
+            + correction_entry
+            + parameter_change[0] * first_tangent
+            + parameter_change[1] * second_tangent
         )
         return (
-            jax.tree.map(displace, z, force.correction, *force.tangents),
+            jax.tree.map(displace_entry, z, force.correction, *force.tangents),
             p + parameter_change,
         ), parameter_change / p
 
     (_, p), relative_changes = lax.scan(
-        newton_step, (z, p), None, length=test_function.options.n_codim2_iterations
+        take_newton_step, (z, p), None, length=test_function.options.n_codim2_iterations
     )
     return p, jnp.max(jnp.abs(relative_changes[-1]))
 
@@ -285,49 +315,51 @@ def locate_jump_onset(
 def _continued_quantities(
     system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
 ) -> Array:
-    """Return the `CONTINUED_QUANTITIES` of a collocated gait."""
+    """Return the `CONTINUED_QUANTITIES` of a collocated gait, in their order."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
-    (passages,) = system.evaluate_phase_points(parameters, z)[1]
-    return jnp.stack(list(_continued_by_name(s, passages, z).values()))
+    (phase_points,) = system.evaluate_phase_points(parameters, z)[1]
+    return jnp.stack(list(_compute_continued_quantities(s, phase_points, z).values()))
 
 
-def _continued_by_name(s: Symbols, passages: Any, z: CollocationSolution) -> dict[str, Array]:
-    """Return the `CONTINUED_QUANTITIES` of a step by name, from its passages through the phases."""
-    dls, sls1, sls2 = passages
+def _compute_continued_quantities(
+    s: Symbols, phase_points: Any, z: CollocationSolution
+) -> dict[str, Array]:
+    """Return the `CONTINUED_QUANTITIES` of a step by name, from the points of its phases."""
+    dls, sls1, sls2 = phase_points
     landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
-    fore, rear = transitions.landing_forces(s, landing)
+    fore_force, rear_force = transitions.landing_forces(s, landing)
     dls_duration, *other_durations = z.durations[0]
-    forces = landing.rear_impulse.normal, fore.normal, rear.normal
+    forces = landing.rear_impulse.normal, fore_force.normal, rear_force.normal
     values = (
         *forces,
         *other_durations,
         gait_takeoff_acceleration(s, sls1),
-        *_force_falls(s, dls, dls_duration),
+        *_force_decrease_rates(s, dls, dls_duration),
     )
     return dict(zip(CONTINUED_QUANTITIES, values, strict=True))
 
 
-def _force_falls(s: Symbols, dls: PhasePoints, dls_duration: Array) -> tuple[Array, Array]:
-    """Return the initial and the mean rate at which the rear foot's force falls in DLS, N/s."""
+def _force_decrease_rates(s: Symbols, dls: PhasePoints, dls_duration: Array) -> tuple[Array, Array]:
+    """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
     phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 
-    def instant_at(theta: Array, dtheta: Array) -> PhaseInstant:
+    def make_instant(theta: Array, dtheta: Array) -> PhaseInstant:
         return PhaseInstant(phase, phase.motion_at((theta,), (dtheta,)), None)
 
-    force_at = lambda *at: phase.end_guard(instant_at(*at))
+    rear_force = lambda *at: phase.end_guard(make_instant(*at))
     start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
-    rates = start_state[1], instant_at(*start_state).acceleration.ddtheta
-    first_force, force_rate = jax.jvp(force_at, start_state, rates)
-    mean_fall = (first_force - force_at(*end_state)) / jnp.where(
+    rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
+    first_force, force_rate = jax.jvp(rear_force, start_state, rates)
+    mean_decrease_rate = (first_force - rear_force(*end_state)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )
-    return -force_rate, mean_fall
+    return -force_rate, mean_decrease_rate
 
 
 def _trial_monodromy(
     system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
 ) -> Array:
-    """Return the monodromy matrix of a trial."""
+    """Return the monodromy matrix of a trial solution."""
     collocation_state = CollocationState(
         z, phase_active, *init_search_flags(system, z.section_state)
     )
@@ -338,4 +370,6 @@ QUANTITY_FUNCTIONS = {
     CONTINUED_QUANTITIES: _continued_quantities,
     BIFURCATION_NAMES: _trial_monodromy,
 }
-"""Functions for the quantities of a test function that need no event-driven step."""
+"""Functions that compute the quantities of a test function without an event-driven step, by
+group.
+"""

@@ -23,7 +23,7 @@ DEFAULT_BOUNDS: ParameterBounds = {
     "natural_length": (1.001, 1.06),
     "slope": (0.05, 0.5),
 }
-"""Default bounds of the parameters for the continuation, for a wheel with legs of 1 m."""
+"""Default bounds of the parameters of a curve, for a wheel with legs of 1 m."""
 
 
 def continue_special_point(
@@ -74,7 +74,9 @@ def continue_special_point(
 
 
 def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """Return the two parameters and their ranges; raise if they are invalid."""
+    """Return the names of the two parameters and their ranges, shape (2, 2); raise an error if
+    they are invalid.
+    """
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
     all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
     parameter_pair = check_names("parameters", parameters)
@@ -87,9 +89,12 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
             f"parameters are {parameter_pair}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
-    ranges = {name: check_range(f"bounds[{name!r}]", ends) for name, ends in all_bounds.items()}
+    parameter_ranges = {
+        name: check_range(f"bounds[{name!r}]", bound_pair)
+        for name, bound_pair in all_bounds.items()
+    }
     return (parameter_pair[0], parameter_pair[1]), np.array(
-        [ranges[name] for name in parameter_pair], float
+        [parameter_ranges[name] for name in parameter_pair], float
     )
 
 
@@ -122,8 +127,12 @@ def continue_special_points(
         if set(names) - set(seeds_by_name):
             seeds = tracer.find_seeds(axis, jax.tree.map(lambda x: x[None], params))
             start_value = float(getattr(params, parameter))
-            order = np.argsort([-abs(seed.parameter_values[axis] - start_value) for seed in seeds])
-            seeds_by_name = {seeds[i].name: seeds[i] for i in order} | seeds_by_name
+            tracing_order = np.argsort(
+                [-abs(seed.parameter_values[axis] - start_value) for seed in seeds]
+            )
+            seeds_by_name = {
+                seeds[seed_index].name: seeds[seed_index] for seed_index in tracing_order
+            } | seeds_by_name
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:
         raise ValueError(
@@ -134,8 +143,8 @@ def continue_special_points(
             "bounds."
         )
     curves_by_name = {
-        traced.curve.name: traced.curve
-        for traced in tracer.trace_curves([seeds_by_name[n] for n in names], ())
+        traced_curves.curve.name: traced_curves.curve
+        for traced_curves in tracer.trace_curves([seeds_by_name[name] for name in names], ())
     }
     lost_names = sorted(set(names) - set(curves_by_name))
     if lost_names:

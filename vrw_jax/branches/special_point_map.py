@@ -1,7 +1,7 @@
-"""Map of all special points of gaits over two parameters, with a check against a scan.
+"""Map of all special points of gaits over two parameters, checked against a scan.
 
-If a quantity has different signs at neighboring samples of a scan, there is a curve of special
-points between them. If it is not traced yet, it is found on branches through these samples.
+If a quantity has different signs at neighboring samples of a scan, a curve of special points runs
+between them. If that curve is not traced yet, it is found on branches through these samples.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vrw_jax.branches.curve_tracing import (
     CurveSeed,
     CurveTracer,
     TracedCurve,
-    distance_to_path,
+    distance_to_polyline,
 )
 from vrw_jax.branches.gait_test_functions import DLS_VANISHES, LINEAR_SUBSTITUTES
 from vrw_jax.continuation import BIFURCATION_NAMES
@@ -35,9 +35,9 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Numbers of the map; distances are in cells of the scan.
+    """Options of the map of special points; distances are in cells of the scan.
 
-    - `n_lines`: number of parallel branches along each parameter on which the map starts;
+    - `n_lines`: number of parallel branches along each parameter with which the map starts;
     - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
     - `max_search_rounds`: largest number of rounds in which changes of sign are examined;
     - `max_explained_distance`: largest distance of a change of sign from a curve that explains it;
@@ -52,16 +52,18 @@ class MapOptions:
 
 
 MAP_OPTIONS = MapOptions()
-"""Options of all maps."""
+"""Options of all maps of special points."""
 
 GAIT_CHANGE = "gait"
-"""Name of a change between a gait and none."""
+"""Name of a change between a sample with a gait and one without."""
 
 STABILITY_CHANGE = "spectral_radius"
 """Name of a change between a stable and an unstable gait."""
 
 SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE)
-"""Measures of a scan that indicate special points, in addition to the margins of every scan."""
+"""Measures of a scan whose zeros indicate special points, in addition to the margins of every
+scan.
+"""
 
 EXPLAINING_CURVES: Mapping[str, tuple[str, ...]] = {
     GAIT_CHANGE: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
@@ -69,16 +71,16 @@ EXPLAINING_CURVES: Mapping[str, tuple[str, ...]] = {
     "lambda_4_plus": ("lambda_4_plus", DLS_VANISHES),
     **{exact: (name,) for name, exact in LINEAR_SUBSTITUTES.items()},
 }
-"""Names of the curves that explain a change, if it is not the curve of the same name."""
+"""Names of the curves that explain a change, if they are not the curve of the same name."""
 
 
 class UnexplainedChange(NamedTuple):
-    """Change of sign between two neighboring samples of a scan."""
+    """Change of sign between two neighboring samples of a scan that no curve explains."""
 
     name: str
     axis: int
-    sample: tuple[int, int]  # first sample, with a gait
-    cell_position: tuple[float, float]  # in cells of the scan
+    sample: tuple[int, int]  # indices of the first sample, which has a gait
+    cell_position: tuple[float, float]  # position of the change in cells of the scan
 
 
 @with_default_settings
@@ -89,7 +91,8 @@ def trace_special_points(
     on_stage: Callable[[str], None] | None = None,
     options: MapOptions = MAP_OPTIONS,
 ) -> tuple[tuple[SpecialPointCurve, ...], tuple[UnexplainedChange, ...]]:
-    """Return all curves of special points over the parameters of a scan, and unexplained changes.
+    """Return all curves of special points over the parameters of a scan, and the unexplained
+    changes.
 
     The scan contains `SPECIAL_POINT_MEASURES` and margins. A change between its samples is
     unexplained if no curve is near it. `on_stage` is called with a description of each stage.
@@ -108,23 +111,25 @@ def trace_special_points(
     )
     seeds = find_seeds_on_middle_lines(tracer, params, options)
     curves = _trace_all(tracer, seeds, [], options)
-    changes = find_sign_change_cells(scan, tracer.parameters)
-    examined: list[UnexplainedChange] = []
+    changes = find_sign_changes(scan, tracer.parameters)
+    examined_changes: list[UnexplainedChange] = []
     remaining_changes = lambda: find_unexplained_changes(
         changes, [curve.curve for curve in curves], scan, options
     )
     for _ in range(options.max_search_rounds):
-        new_changes = _select_distant_changes(remaining_changes(), examined, options)
+        new_changes = _select_distant_changes(remaining_changes(), examined_changes, options)
         if not new_changes:
             break
-        examined += new_changes
+        examined_changes += new_changes
         seeds = []
         for axis in range(2):
             wheels = []
             for change in new_changes:
                 if change.axis == axis:
                     indices = zip(tracer.parameters, change.sample, strict=True)
-                    values = {name: float(scan[name][i]) for name, i in indices}
+                    values = {
+                        name: float(scan[name][change_index]) for name, change_index in indices
+                    }
                     wheels.append(tracer.with_parameters(params, values))
             seeds += _find_seeds_on_branches(tracer, axis, wheels, options.n_lines)
         curves = _trace_all(tracer, seeds, curves, options)
@@ -134,15 +139,15 @@ def trace_special_points(
 def _trace_all(
     tracer: CurveTracer, seeds: list[CurveSeed], curves: list[TracedCurve], options: MapOptions
 ) -> list[TracedCurve]:
-    """Return the known curves, and those through the seeds and through special points on these."""
+    """Return the curves, and those through the seeds and through special points on them."""
     for _ in range(options.n_meeting_rounds):
         new_curves = tracer.trace_curves(seeds, curves)
-        kept_curves = [
+        known_curves = [
             curve
             for curve in curves
             if not any(tracer.is_same_curve(curve, new_curve) for new_curve in new_curves)
         ]
-        curves = [*kept_curves, *new_curves]
+        curves = [*known_curves, *new_curves]
         seeds = [seed for curve in new_curves for seed in curve.new_seeds]
     return curves
 
@@ -157,8 +162,8 @@ def find_seeds_on_middle_lines(
         line_values = lower + (np.arange(n_lines) + 0.5) / n_lines * (upper - lower)
         other_parameter = tracer.parameters[1 - axis]
         wheels = [
-            tracer.with_parameters(params, {name: midpoints[axis], other_parameter: x})
-            for x in line_values
+            tracer.with_parameters(params, {name: midpoints[axis], other_parameter: coordinate})
+            for coordinate in line_values
         ]
         seeds += _find_seeds_on_branches(tracer, axis, wheels, n_lines)
     return seeds
@@ -167,17 +172,19 @@ def find_seeds_on_middle_lines(
 def _find_seeds_on_branches(
     tracer: CurveTracer, axis: int, wheels: list[WheelParams], batch_size: int
 ) -> list[CurveSeed]:
-    """Return seeds on branches, which are continued in batches of one size and compiled once."""
+    """Return seeds on branches, which are continued in batches of one size so that one program
+    is compiled.
+    """
     seeds = []
-    for start in range(0, len(wheels), batch_size):
-        group = wheels[start : start + batch_size]
-        padded_group = [*group, *group[-1:] * (batch_size - len(group))]
-        seeds += tracer.find_seeds(axis, jax.tree.map(lambda *x: jnp.stack(x), *padded_group))
+    for first_wheel in range(0, len(wheels), batch_size):
+        wheel_group = wheels[first_wheel : first_wheel + batch_size]
+        padded_wheels = [*wheel_group, *wheel_group[-1:] * (batch_size - len(wheel_group))]
+        seeds += tracer.find_seeds(axis, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels))
     return seeds
 
 
 def _select_signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
-    """Return the quantities whose signs may change, over the two parameters."""
+    """Return the quantities whose signs may change, as arrays over the two parameters."""
     quantities = {"lambda_4_plus": scan.lambda_4_plus.transpose(*dims).values}
     quantities[STABILITY_CHANGE] = 1.0 - scan[STABILITY_CHANGE].transpose(*dims).values
     for name in (name for name in MARGIN_MEASURES if name not in LINEAR_SUBSTITUTES):
@@ -189,7 +196,7 @@ def _select_signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[s
     return quantities
 
 
-def find_sign_change_cells(scan: xr.Dataset, dims: tuple[str, str]) -> list[UnexplainedChange]:
+def find_sign_changes(scan: xr.Dataset, dims: tuple[str, str]) -> list[UnexplainedChange]:
     """Return the changes of sign between all neighboring samples.
 
     Changes of measures count only if both samples, or none, have double support.
@@ -200,21 +207,28 @@ def find_sign_change_cells(scan: xr.Dataset, dims: tuple[str, str]) -> list[Unex
     quantities[GAIT_CHANGE] = np.where(is_found, 1.0, np.where(is_coarse, np.nan, -1.0))
     quantities[COARSE_MESH_NAME] = np.where(is_found, 1.0, np.where(is_coarse, -1.0, np.nan))
     for axis in range(2):
-        neighbors = lambda x, axis=axis: (np.moveaxis(x, axis, 0)[:-1], np.moveaxis(x, axis, 0)[1:])
-        in_axis_order = lambda a, b, axis=axis: (a, b) if axis == 0 else (b, a)
-        first_found, second_found = neighbors(is_found)
-        same_dls = np.equal(*neighbors(quantities["lambda_4_plus"] > 0.0))
+        neighbor_indices = lambda x, axis=axis: (
+            np.moveaxis(x, axis, 0)[:-1],
+            np.moveaxis(x, axis, 0)[1:],
+        )
+        move_axis_first = lambda a, b, axis=axis: (a, b) if axis == 0 else (b, a)
+        first_found, second_found = neighbor_indices(is_found)
+        has_same_double_support = np.equal(*neighbor_indices(quantities["lambda_4_plus"] > 0.0))
         for name, quantity_values in quantities.items():
-            first_values, second_values = neighbors(quantity_values)
+            first_values, second_values = neighbor_indices(quantity_values)
             changes_sign = first_values * second_values < 0.0
             if name not in (GAIT_CHANGE, COARSE_MESH_NAME):
-                changes_sign &= first_found & second_found & (same_dls | (name == "lambda_4_plus"))
+                changes_sign &= (
+                    first_found
+                    & second_found
+                    & (has_same_double_support | (name == "lambda_4_plus"))
+                )
             for i, j in np.argwhere(changes_sign):
                 fraction = first_values[i, j] / (first_values[i, j] - second_values[i, j])
-                sample = in_axis_order(int(i if first_found[i, j] else i + 1), int(j))
+                sample = move_axis_first(int(i if first_found[i, j] else i + 1), int(j))
                 changes.append(
                     UnexplainedChange(
-                        name, axis, sample, in_axis_order(float(i + fraction), float(j))
+                        name, axis, sample, move_axis_first(float(i + fraction), float(j))
                     )
                 )
     return changes
@@ -227,7 +241,7 @@ def find_unexplained_changes(
     options: MapOptions = MAP_OPTIONS,
 ) -> list[UnexplainedChange]:
     """Return the changes that are near no curve that can explain them."""
-    remaining = []
+    remaining_changes = []
     for name in sorted({change.name for change in changes}):
         changes_of_name = [change for change in changes if change.name == name]
         explaining_curves = [
@@ -237,16 +251,19 @@ def find_unexplained_changes(
         distances = np.full(len(changes_of_name), np.inf)
         for curve in explaining_curves:
             axes = zip(curve.values.T, curve.parameters, strict=True)
-            curve_cells = [np.interp(v, scan[n].values, np.arange(scan.sizes[n])) for v, n in axes]
+            curve_cells = [
+                np.interp(values_of_axis, scan[n_samples].values, np.arange(scan.sizes[n_samples]))
+                for values_of_axis, n_samples in axes
+            ]
             distances = np.minimum(
-                distances, distance_to_path(change_cells, np.stack(curve_cells, -1))
+                distances, distance_to_polyline(change_cells, np.stack(curve_cells, -1))
             )
-        remaining += [
+        remaining_changes += [
             change
             for change, distance_to_curve in zip(changes_of_name, distances, strict=True)
             if distance_to_curve > options.max_explained_distance
         ]
-    return remaining
+    return remaining_changes
 
 
 def _select_distant_changes(
@@ -255,17 +272,17 @@ def _select_distant_changes(
     options: MapOptions,
 ) -> list[UnexplainedChange]:
     """Return changes of each name that are distant from each other and from the examined ones."""
-    selected: list[UnexplainedChange] = []
+    selected_changes: list[UnexplainedChange] = []
     for change in remaining:
-        similar = [
+        changes_of_same_name = [
             other_change
-            for other_change in (*examined, *selected)
+            for other_change in (*examined, *selected_changes)
             if (other_change.name, other_change.axis) == (change.name, change.axis)
         ]
         if all(
             np.hypot(*np.subtract(other_change.cell_position, change.cell_position))
             > options.min_change_distance
-            for other_change in similar
+            for other_change in changes_of_same_name
         ):
-            selected.append(change)
-    return selected
+            selected_changes.append(change)
+    return selected_changes
