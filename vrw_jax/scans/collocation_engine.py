@@ -1,10 +1,9 @@
-"""Steady gaits of many wheels: one compiled function over a batch of fixed size.
+"""Steady gaits of many wheels by collocation: one compiled function over a batch of fixed size.
 
-The samples are divided into batches of one size, and the last batch is padded. The
-same compiled code evaluates every batch, so the result of a sample depends neither on its position
-nor on the other samples.
-
-Batches run in parallel: one thread per core, all with one compiled program, or one thread per GPU.
+The samples are divided into batches of one size, and the last batch is padded. The same compiled
+code evaluates every batch, so the result of a sample depends neither on its position nor on the
+other samples. Batches run in parallel with one compiled program: one thread per core, or one thread
+per GPU.
 """
 
 import os
@@ -38,11 +37,13 @@ class EvaluationRequest(NamedTuple):
     model: Any
     options: StepOptions
     cycle_options: CycleOptions
-    tol: float | None  # permitted error of the measures, in their units
+    # largest permitted error of each measure, in its unit; None for a scan without tolerance
+    tol: float | None
 
 
 class CollocationEngine:
-    """Engine for the paper's model and a fixed set of measures, compiled at the first call.
+    """Engine that evaluates samples with the paper's model and a fixed set of measures; the first
+    call compiles it.
 
     It finds the limit cycle with the requested derivatives by collocation. It then takes one
     event-driven step from the cycle, for the margins and as a check. Both functions are compiled in
@@ -50,38 +51,48 @@ class CollocationEngine:
     """
 
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        """Initialize; `threads` is the number of CPU threads, by default one per core."""
+        """Initialize the engine; `threads` is the number of CPU threads, by default one per
+        core.
+        """
         measures, base, model, options, cycle_options, _ = request
         self._threads = count_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
         requested_derivatives = tuple(
-            d for name in measures if (d := parse_derivative(name)) is not None
+            derivative for name in measures if (derivative := parse_derivative(name)) is not None
         )
         measure_names = tuple(name for name in measures if parse_derivative(name) is None)
-        parameters = tuple(dict.fromkeys(d.parameter for d in requested_derivatives))
-        indices = np.asarray([PARAMETER_NAMES.index(name) for name in parameters], int)
+        parameters = tuple(
+            dict.fromkeys(derivative.parameter for derivative in requested_derivatives)
+        )
+        swept_indices = np.asarray([PARAMETER_NAMES.index(name) for name in parameters], int)
 
         finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
 
         def find_cycle_with_derivatives(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
-            """Return the limit cycle of one wheel and the requested derivatives."""
+            """Return the limit cycle of one wheel and the requested derivatives by name."""
 
             def find_measures_and_cycle(
                 swept_values: Array,
             ) -> tuple[dict[str, Array], AbstractCycle]:
-                cycle = finder.find_cycle_from_values(values.at[indices].set(swept_values))
-                return cycle.measures(d.measure for d in requested_derivatives), cycle
+                cycle = finder.find_cycle_from_values(values.at[swept_indices].set(swept_values))
+                return cycle.measures(
+                    derivative.measure for derivative in requested_derivatives
+                ), cycle
 
             if not requested_derivatives:
-                return find_measures_and_cycle(values[indices])[1], {}
-            jacobian, cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(values[indices])
+                return find_measures_and_cycle(values[swept_indices])[1], {}
+            jacobian, cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
+                values[swept_indices]
+            )
             return cycle, {
-                d.name: jacobian[d.measure][parameters.index(d.parameter)]
-                for d in requested_derivatives
+                derivative.name: jacobian[derivative.measure][
+                    parameters.index(derivative.parameter)
+                ]
+                for derivative in requested_derivatives
             }
 
         def evaluate_cycle(values: Array) -> GaitOutputs:
-            """Return outcome, section state and measures that the limit cycle gives."""
+            """Return outcome, section state and measures that follow from the limit cycle."""
             cycle, derivative_values = find_cycle_with_derivatives(values)
             names = (
                 *(name for name in measure_names if name in DIFFERENTIABLE_MEASURES),
@@ -89,9 +100,11 @@ class CollocationEngine:
             )
             return cycle.outcome, cycle.section_state, cycle.measures(names) | derivative_values
 
-        def evaluate_step(values: Array, state: Array, options: StepOptions) -> GaitOutputs:
-            """Return outcome, section state and measures that a step from the cycle gives."""
-            result = model.take_step(wheel_from_parameters(values, base.n_legs), state, options)
+        def evaluate_step(values: Array, section_state: Array, options: StepOptions) -> GaitOutputs:
+            """Return outcome, section state and measures that follow from a step from the cycle."""
+            result = model.take_step(
+                wheel_from_parameters(values, base.n_legs), section_state, options
+            )
             measures = result.measures()
             names = (
                 *(name for name in measure_names if name not in DIFFERENTIABLE_MEASURES),
@@ -108,50 +121,65 @@ class CollocationEngine:
         self._n_workers, self._compilation_lock = 0, Lock()
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results by variable; `columns` has one value per sample of each parameter."""
-        rows = stack_parameters(columns, self._model, self._base)
+        """Return the results by variable; `columns` contains the values of each swept parameter,
+        one per sample.
+        """
+        parameter_rows = stack_parameters(columns, self._model, self._base)
         with self._compilation_lock:
             if not self._n_workers:
                 self._compile()
         batches = (
-            rows[begin : begin + batch_sizes.SCAN_BATCH_SIZE]
-            for begin in range(0, len(rows), batch_sizes.SCAN_BATCH_SIZE)
+            parameter_rows[first_sample : first_sample + batch_sizes.SCAN_BATCH_SIZE]
+            for first_sample in range(0, len(parameter_rows), batch_sizes.SCAN_BATCH_SIZE)
         )
-        with ThreadPoolExecutor(self._n_workers) as pool:
-            parts = list(pool.map(self._evaluate_batch, batches))
-        return {n: np.concatenate([part[n] for part in parts])[: len(rows)] for n in parts[0]}
+        with ThreadPoolExecutor(self._n_workers) as threads:
+            batch_results = list(threads.map(self._evaluate_batch, batches))
+        return {
+            name: np.concatenate([results[name] for results in batch_results])[
+                : len(parameter_rows)
+            ]
+            for name in batch_results[0]
+        }
 
-    @with_default_settings  # in a thread of its own
-    def _evaluate_batch(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+    @with_default_settings  # It runs in a thread of its own.
+    def _evaluate_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the results of a batch, which is padded with copies of its first wheel."""
-        padded_rows = np.concatenate(
-            [rows, np.repeat(rows[:1], batch_sizes.SCAN_BATCH_SIZE - len(rows), 0)]
+        padded_parameter_rows = np.concatenate(
+            [
+                parameter_rows,
+                np.repeat(parameter_rows[:1], batch_sizes.SCAN_BATCH_SIZE - len(parameter_rows), 0),
+            ]
         )
         programs = self._free_programs.get()
         try:
-            values = jax.device_put(padded_rows, programs.device)
-            outcome, state, cycle_measures = programs.evaluate_cycle(values)
+            values = jax.device_put(padded_parameter_rows, programs.device)
+            outcome, section_state, cycle_measures = programs.evaluate_cycle(values)
             options = jax.device_put(self._options, programs.device)
-            step_outcome, step_state, step_measures = programs.evaluate_step(values, state, options)
-            confirmed_outcome = confirm_outcome(outcome, state, step_outcome, step_state)
+            step_outcome, step_state, step_measures = programs.evaluate_step(
+                values, section_state, options
+            )
+            confirmed_outcome = confirm_outcome(outcome, section_state, step_outcome, step_state)
             measures = cycle_measures | step_measures
         finally:
             self._free_programs.put(programs)
         return mask_failures(confirmed_outcome, measures)
 
     def _compile(self) -> None:
-        """Compile both functions in parallel for each device; all cores of a CPU share them."""
+        """Compile both functions in parallel for each device; the cores of a CPU share the
+        programs.
+        """
         devices = jax.local_devices()
         values = jax.ShapeDtypeStruct(
             (batch_sizes.SCAN_BATCH_SIZE, len(PARAMETER_NAMES)), self._dtype
         )
-        state = jax.ShapeDtypeStruct((batch_sizes.SCAN_BATCH_SIZE, 3), self._dtype)
+        section_state = jax.ShapeDtypeStruct((batch_sizes.SCAN_BATCH_SIZE, 3), self._dtype)
         cache_key = self._cache_key
-        compile_with_defaults = with_default_settings(compile_exported)  # in threads
-        with ThreadPoolExecutor(2) as pool:
-            step_arguments = (values, state, self._options)
-            steps = [
-                pool.submit(
+        # Threads have separate settings.
+        compile_with_defaults = with_default_settings(compile_exported)
+        with ThreadPoolExecutor(2) as threads:
+            step_arguments = (values, section_state, self._options)
+            step_programs = [
+                threads.submit(
                     compile_with_defaults,
                     self._evaluate_step,
                     step_arguments,
@@ -160,8 +188,8 @@ class CollocationEngine:
                 )
                 for device in devices
             ]
-            cycles = [
-                pool.submit(
+            cycle_programs = [
+                threads.submit(
                     compile_with_defaults,
                     self._evaluate_cycle,
                     (values,),
@@ -170,11 +198,15 @@ class CollocationEngine:
                 )
                 for device in devices
             ]
-        for device, cycle, step in zip(devices, cycles, steps, strict=True):
-            n = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
-            for _ in range(n):
-                self._free_programs.put(_CompiledPrograms(device, cycle.result(), step.result()))
-            self._n_workers += n
+        for device, cycle_program, step_program in zip(
+            devices, cycle_programs, step_programs, strict=True
+        ):
+            n_programs = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
+            for _ in range(n_programs):
+                self._free_programs.put(
+                    _CompiledPrograms(device, cycle_program.result(), step_program.result())
+                )
+            self._n_workers += n_programs
 
     @property
     def _dtype(self) -> np.dtype:
@@ -191,7 +223,7 @@ class _CompiledPrograms(NamedTuple):
 
 
 def count_cores() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -213,7 +245,9 @@ def stack_parameters(
 
 
 def mask_failures(outcome: np.ndarray, values_by_name: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return outcome and measures; a sample without a gait gets NaN, or -1 in an integer."""
+    """Return outcome and measures by name; a sample without a gait has NaN, or -1 in an integer
+    variable.
+    """
     measures = {name: np.array(value) for name, value in values_by_name.items()}
     for value in measures.values():
         missing_value = np.nan if np.issubdtype(value.dtype, np.floating) else -1

@@ -1,8 +1,8 @@
-"""Scans on the workers of a dask cluster: each chunk of `run_scan` is computed by a free worker.
+"""Scans on the workers of a dask cluster: a free worker computes each chunk of `run_scan`.
 
 Workers only compute, and the calling process writes the store. If a worker dies, other workers
 compute its chunks. Workers return a description of their environment. A chunk from an environment
-other than that of the calling process is refused, because its last digits might differ.
+that differs from that of the calling process raises an error, because its last digits might differ.
 """
 
 import asyncio
@@ -36,14 +36,17 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 QUEUED_CHUNKS_PER_THREAD = 2
-"""Number of submitted chunks per thread, chosen to keep a thread busy with little memory."""
+"""Number of submitted chunks per thread, chosen so that a thread always has work and little
+memory is used.
+"""
 
 SCHEDULER_TIMEOUT = "10s"
-"""Longest time until a scheduler responds."""
+"""Longest time in which a scheduler must respond."""
 
 MAX_SILENT_SECONDS = 10.0
-"""Longest time without a result until the workers are counted, chosen because workers that were
-just started are connected by then."""
+"""Longest time without a result before the workers are counted, s. It is chosen because workers
+that have just started are connected by then.
+"""
 
 
 @contextlib.contextmanager
@@ -56,13 +59,13 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
             "a scan on a cluster needs dask.distributed, which is not installed: "
             "run pip install 'vrw-jax[dask]'."
         ) from error
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(_hide_cancelled_tasks())
+    with contextlib.ExitStack() as exit_stack:
+        exit_stack.enter_context(_hide_cancelled_tasks())
         if address == "local":
             cluster = LocalCluster(
                 n_workers=count_cores(), threads_per_worker=1, dashboard_address=None
             )
-            client = Client(stack.enter_context(cluster), set_as_default=False)
+            client = Client(exit_stack.enter_context(cluster), set_as_default=False)
         else:
             try:
                 _require_response(address)
@@ -72,60 +75,68 @@ def connect_workers(address: str) -> Iterator[ChunkExecutor]:
                     f"no dask scheduler answers at {address!r}: give the address that it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
                 ) from error
-        stack.enter_context(client)
+        exit_stack.enter_context(client)
         yield functools.partial(_compute_chunks, client, address)
 
 
 @contextlib.contextmanager
 def _hide_cancelled_tasks() -> Iterator[None]:
-    """Keep tasks that are cancelled with a lost scheduler out of the log of distributed."""
-    log = logging.getLogger("distributed.client")
+    """Return a context that removes tasks cancelled with a lost scheduler from the log of
+    distributed.
+    """
+    logger = logging.getLogger("distributed.client")
 
     def is_shown(record: logging.LogRecord) -> bool:
         error_type = record.exc_info[0] if record.exc_info else None
         return error_type is None or not issubclass(error_type, asyncio.CancelledError)
 
-    log.addFilter(is_shown)
+    logger.addFilter(is_shown)
     try:
         yield
     finally:
-        log.removeFilter(is_shown)
+        logger.removeFilter(is_shown)
 
 
 def _require_response(address: str) -> None:
-    """Raise unless a scheduler responds at `address`; a client would wait for ever."""
+    """Raise a ValueError unless a scheduler responds at `address`; a client would wait without
+    limit.
+    """
     from dask.utils import parse_timedelta
     from distributed.comm import connect
     from distributed.security import Security
 
     async def connect_once() -> None:
         arguments = Security().get_connection_args("client")
-        seconds = parse_timedelta(SCHEDULER_TIMEOUT)
-        comm = await asyncio.wait_for(connect(address, timeout=seconds, **arguments), 2 * seconds)
-        comm.abort()
+        timeout_seconds = parse_timedelta(SCHEDULER_TIMEOUT)
+        connection = await asyncio.wait_for(
+            connect(address, timeout=timeout_seconds, **arguments), 2 * timeout_seconds
+        )
+        connection.abort()
 
-    with ThreadPoolExecutor(1) as pool:  # The event loop of a notebook is busy.
-        pool.submit(asyncio.run, connect_once()).result()
+    with ThreadPoolExecutor(
+        1
+    ) as connection_pool:  # The event loop of a notebook is already running.
+        connection_pool.submit(asyncio.run, connect_once()).result()
 
 
 def _compute_chunks(
-    client: "Client", address: str, plan: ScanPlan, missing: Sequence[int]
+    client: "Client", address: str, plan: ScanPlan, missing_chunks: Sequence[int]
 ) -> Iterator[ChunkResult]:
     """Yield the results of the missing chunks in the order of completion."""
     pickled_request = pickle.dumps(plan.request)
-    local_environment, remaining_chunks = describe_environment(), iter(missing)
+    local_environment, remaining_chunks = describe_environment(), iter(missing_chunks)
     chunk_of_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
     def submit_chunks() -> None:
-        """Submit chunks until every thread of the cluster has enough."""
-        n_free = QUEUED_CHUNKS_PER_THREAD * max(1, sum(client.nthreads().values())) - len(
+        """Submit chunks until every thread of the cluster has enough of them."""
+        n_free_slots = QUEUED_CHUNKS_PER_THREAD * max(1, sum(client.nthreads().values())) - len(
             chunk_of_future
         )
-        for index in itertools.islice(remaining_chunks, max(n_free, 0)):
-            columns = plan.design.sample_block(plan.layout.chunk_region(index))
+        for chunk_index in itertools.islice(remaining_chunks, max(n_free_slots, 0)):
+            columns = plan.design.sample_block(plan.layout.chunk_region(chunk_index))
             future = client.submit(_compute_in_worker, pickled_request, columns, pure=False)
-            chunk_of_future[future] = index
+            chunk_of_future[future] = chunk_index
             future.add_done_callback(completed_futures.put)
 
     try:
@@ -144,7 +155,7 @@ def _compute_chunks(
                     "Start the workers from the same installation on machines of one kind."
                 )
             yield chunk_of_future.pop(future), results
-            del future  # lets the cluster release its result
+            del future  # The cluster can then release the result.
             with _explain_loss(address, OSError):
                 submit_chunks()
     finally:
@@ -156,27 +167,28 @@ def _wait_for_future(
     client: "Client", address: str, completed_futures: "SimpleQueue[Future]"
 ) -> "Future":
     """Return the next completed future; warn once if the cluster has no workers."""
-    is_warned = False
+    has_warned = False
     while True:
         try:
             return completed_futures.get(timeout=MAX_SILENT_SECONDS)
         except Empty:
             pass
-        if not is_warned and not client.nthreads():
+        if not has_warned and not client.nthreads():
             warnings.warn(
                 f"the dask cluster at {address} has no workers, so that nothing is computed: start "
                 f"some, as with `dask worker {address}`; the scan continues as soon as there is "
                 "one.",
                 stacklevel=1,
             )
-            is_warned = True
+            has_warned = True
 
 
 @contextlib.contextmanager
 def _explain_loss(address: str, *other_errors: type[Exception]) -> Iterator[None]:
-    """Replace the errors of lost workers or of a lost scheduler by one sentence with a remedy.
+    """Return a context that replaces errors of lost workers or of a lost scheduler by one sentence
+    with a remedy.
 
-    `other_errors` have the same cause where a chunk itself cannot raise them.
+    `other_errors` are further exceptions with the same cause, which the chunk itself cannot raise.
     """
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
@@ -199,7 +211,7 @@ def _explain_loss(address: str, *other_errors: type[Exception]) -> Iterator[None
 def _compute_in_worker(
     pickled_request: bytes, columns: SampleColumns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
-    """Return the environment of the worker and the results of a chunk."""
+    """Return the environment of the worker and the results of a chunk by variable."""
     start_jax()
     return describe_environment(), _make_engine_once(pickled_request)(columns)
 

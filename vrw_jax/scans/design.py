@@ -28,14 +28,16 @@ ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
 
 MAX_LISTED_SAMPLES = 10_000_000
-"""Largest number of values of an axis or samples of a list, chosen because memory holds them."""
+"""Largest number of values of an axis or of samples in a list, chosen because they fit into
+memory.
+"""
 
 SALTELLI_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
 
 
 class AbstractDesign(abc.ABC):
-    """Samples of the wheel's parameters, laid out on an array of shape `shape`."""
+    """Samples of the wheel's parameters, arranged in an array of shape `shape`."""
 
     kind: str
     values: Mapping[str, np.ndarray]
@@ -66,14 +68,16 @@ class AbstractDesign(abc.ABC):
 
     @abc.abstractmethod
     def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
-        """Return the samples of a rectangular region, flattened with the last axis fastest."""
+        """Return the samples of a rectangular region by parameter, flattened with the last axis
+        fastest.
+        """
 
     @abc.abstractmethod
     def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the coordinates of a labeled result: name -> (axis, values)."""
+        """Return the coordinates of a labeled result: for each name the axis and the values."""
 
     def describe_identity(self) -> dict[str, object]:
-        """Return the identity of the design: kind, names, shape and a digest of every number."""
+        """Return the identity of the design: kind, names, shape and a digest of all numbers."""
         return {
             "kind": self.kind,
             "swept": list(self.names),
@@ -106,12 +110,12 @@ class Grid(AbstractDesign):
         return tuple(len(column) for column in self.values.values())
 
     def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
-        pieces = [
+        axis_columns = [
             column[axis_region]
             for column, axis_region in zip(self.values.values(), region, strict=True)
         ]
-        mesh = np.meshgrid(*pieces, indexing="ij")
-        return {name: axis.ravel() for name, axis in zip(self.names, mesh, strict=True)}
+        mesh_columns = np.meshgrid(*axis_columns, indexing="ij")
+        return {name: axis.ravel() for name, axis in zip(self.names, mesh_columns, strict=True)}
 
     def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
         return {name: (name, column) for name, column in self.values.items()}
@@ -119,7 +123,7 @@ class Grid(AbstractDesign):
 
 @dataclass(frozen=True, repr=False)
 class Samples(AbstractDesign):
-    """Design of single samples along the axis `sample`; all parameters may vary at once."""
+    """Design of single samples along the axis `sample`; all parameters may vary together."""
 
     values: Mapping[str, np.ndarray]
     kind: str = "samples"
@@ -140,18 +144,18 @@ class Samples(AbstractDesign):
         return index | {name: ("sample", column) for name, column in self.values.items()}
 
 
-def _require_one_form(name: str, mapping: Mapping | None, keywords: Mapping) -> Mapping:
+def _require_one_form(name: str, mapping: Mapping | None, keyword_values: Mapping) -> Mapping:
     """Return the parameters of a design, given either as one mapping or as keywords."""
-    if mapping is not None and keywords:
+    if mapping is not None and keyword_values:
         raise TypeError(
-            f"{name} has a mapping and the keywords {', '.join(keywords)}: give either one mapping "
-            "or keywords."
+            f"{name} has a mapping and the keywords {', '.join(keyword_values)}: give either "
+            "one mapping or keywords."
         )
-    return keywords if mapping is None else mapping
+    return keyword_values if mapping is None else mapping
 
 
 def _require_count(name: str, n: int | None) -> int:
-    """Return the number of samples, which has no default."""
+    """Return the number of samples, which has no default; raise a TypeError if it is None."""
     if n is None:
         raise TypeError(f"n is None, but {name} needs a number of samples: give n=1024, say.")
     return n
@@ -214,10 +218,10 @@ def samples(
     """
     values = _require_one_form("samples", values, parameters)
     columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
-    lengths = {name: len(column) for name, column in columns.items()}
-    if len(set(lengths.values())) > 1:
+    column_lengths = {name: len(column) for name, column in columns.items()}
+    if len(set(column_lengths.values())) > 1:
         raise ValueError(
-            f"the columns have lengths {lengths}, but a sample takes one value from each: "
+            f"the columns have lengths {column_lengths}, but a sample takes one value from each: "
             "give columns of one length."
         )
     return Samples(columns)
@@ -254,8 +258,8 @@ def sobol(
     n, ranges = _require_count("sobol", n), _require_one_form("sobol", ranges, parameters)
     names, lower, upper, n = _parse_box(ranges, n)
     exponent = max(int(n - 1).bit_length(), 0)
-    points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
-    return _scale_to_box(names, lower, upper, points, "sobol")
+    unit_points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
+    return _scale_to_box(names, lower, upper, unit_points, "sobol")
 
 
 def uniform(
@@ -284,8 +288,8 @@ def uniform(
     """
     n, ranges = _require_count("uniform", n), _require_one_form("uniform", ranges, parameters)
     names, lower, upper, n = _parse_box(ranges, n)
-    points = _make_generator(seed).random((n, len(names)))
-    return _scale_to_box(names, lower, upper, points, "uniform")
+    unit_points = _make_generator(seed).random((n, len(names)))
+    return _scale_to_box(names, lower, upper, unit_points, "uniform")
 
 
 def saltelli(
@@ -324,10 +328,15 @@ def saltelli(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
             f"give n = {1 << n.bit_length()}, say."
         )
-    d = len(names)
-    points = qmc.Sobol(2 * d, rng=_make_generator(seed)).random_base2(n.bit_length() - 1)
-    first_points, second_points = points[:, :d], points[:, d:]
-    mixed_points = [np.where(np.arange(d) == i, second_points, first_points) for i in range(d)]
+    n_parameters = len(names)
+    unit_points = qmc.Sobol(2 * n_parameters, rng=_make_generator(seed)).random_base2(
+        n.bit_length() - 1
+    )
+    first_points, second_points = unit_points[:, :n_parameters], unit_points[:, n_parameters:]
+    mixed_points = [
+        np.where(np.arange(n_parameters) == parameter_index, second_points, first_points)
+        for parameter_index in range(n_parameters)
+    ]
     return _scale_to_box(
         names,
         lower,
@@ -338,15 +347,17 @@ def saltelli(
 
 
 def _scale_to_box(
-    names: list[str], lower: np.ndarray, upper: np.ndarray, points: np.ndarray, kind: str
+    names: list[str], lower: np.ndarray, upper: np.ndarray, unit_points: np.ndarray, kind: str
 ) -> Samples:
-    """Return the design of points of the unit cube, shape (n, d), scaled to the box."""
-    values = lower + (upper - lower) * points
+    """Return the design of points of the unit cube, shape (samples, parameters), scaled to the
+    box.
+    """
+    values = lower + (upper - lower) * unit_points
     return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
 
 
 def _make_generator(seed: int) -> np.random.Generator:
-    """Return a generator of random numbers; raise if the seed is not a whole number."""
+    """Return a generator of random numbers; raise an error if the seed is not a whole number."""
     return np.random.default_rng(check_int("seed", seed, 0))
 
 
@@ -360,16 +371,18 @@ def _parse_box(
             f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
             "a grid."
         )
-    pairs = [
-        check_range(f"the range of {name}", pair)
-        for name, pair in _require_sweepable(ranges).items()
+    bound_pairs = [
+        check_range(f"the range of {name}", bound_pair)
+        for name, bound_pair in _require_sweepable(ranges).items()
     ]
-    bounds = np.asarray(pairs)
+    bounds = np.asarray(bound_pairs)
     return list(ranges), bounds[:, 0], bounds[:, 1], n
 
 
 def _require_sweepable(values: Mapping[str, object]) -> Mapping:
-    """Return `values`; raise if a name is not a sweepable parameter or there is none."""
+    """Return `values`; raise a ValueError if a name is not a sweepable parameter or there is
+    none.
+    """
     check_type("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values:
         raise ValueError(
@@ -382,11 +395,12 @@ def _require_sweepable(values: Mapping[str, object]) -> Mapping:
 
 
 def _to_column(name: str, value: object) -> np.ndarray:
-    """Return the values of one parameter as a vector; raise if they are not numbers."""
+    """Return the values of one parameter as a vector; raise an error if they are not numbers."""
     check_not_traced("a design", "use jax.vmap", value)
     try:
         column = np.atleast_1d(np.asarray(value))
-    except Exception:  # Lists may have different lengths, and a foreign object may raise anything.
+    # Lists may have different lengths, and the conversion of a foreign object may raise any error.
+    except Exception:
         column = np.array([None])
     if column.dtype.kind not in "fiu" and column.size:
         raise TypeError(

@@ -1,8 +1,9 @@
-"""Steady gaits of many wheels with unilateral contact, and with the simplest valid model for each.
+"""Engines that compute steady gaits with unilateral contact, with the simplest valid model, or to a
+tolerance.
 
-With unilateral contact the result is the gait to which a slow start converges, or the slowest gait
-of all starts. For the simplest valid model, the paper's model evaluates all samples first. The
-samples that violate a margin are then evaluated with unilateral contact.
+With unilateral contact the result is the gait to which a walk from a slow start converges, or the
+slowest gait of all starts. For the simplest valid model, the paper's model evaluates all samples
+first. The samples that violate a margin are then evaluated with unilateral contact.
 """
 
 import dataclasses
@@ -45,53 +46,74 @@ ResultColumns = dict[str, np.ndarray]
 
 
 class UnilateralEngine:
-    """Engine for unilateral contact and a fixed set of measures."""
+    """Engine that evaluates samples with unilateral contact and a fixed set of measures."""
 
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
         measures, base, model, options, *_ = request
         self._base, self._model = base, model
         self._threads = count_cores() if threads is None else threads
-        derivatives = tuple(d for name in measures if (d := parse_derivative(name)) is not None)
-        measure_names = (*(n for n in measures if parse_derivative(n) is None), "spectral_radius")
+        derivatives = tuple(
+            derivative for name in measures if (derivative := parse_derivative(name)) is not None
+        )
+        measure_names = (
+            *(name for name in measures if parse_derivative(name) is None),
+            "spectral_radius",
+        )
 
         finder: Any = make_finder(model, base.n_legs, step_options=options)
         self._finder = dataclasses.replace(finder, batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,))
-        read = type(finder).read_measure
-        self._measure_reader, self._derivatives = MeasureReader(read, measure_names), derivatives
+        read_measure = type(finder).read_measure
+        self._measure_reader, self._derivatives = (
+            MeasureReader(read_measure, measure_names),
+            derivatives,
+        )
         self._derivative_reader = MeasureReader(
-            read, tuple(dict.fromkeys(d.measure for d in derivatives))
+            read_measure, tuple(dict.fromkeys(derivative.measure for derivative in derivatives))
         )
 
     def __call__(self, columns: SampleMapping) -> ResultColumns:
-        """Return the results by variable; `columns` has one value per sample of each parameter."""
+        """Return the results by variable; `columns` contains the values of each swept parameter,
+        one per sample.
+        """
         values = stack_parameters(columns, self._model, self._base)
-        parts = np.array_split(
+        value_parts = np.array_split(
             values, max(self._threads, -(-len(values) // batch_sizes.SCAN_TASK_SIZE))
         )
-        first_part, *other_parts = (part for part in parts if len(part))
+        first_part, *other_parts = (
+            results_of_part for results_of_part in value_parts if len(results_of_part)
+        )
         results = [self._evaluate_part(first_part)]  # The first call compiles for all threads.
-        with ThreadPoolExecutor(self._threads) as pool:
-            results += pool.map(self._evaluate_part, other_parts)
-        return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
+        with ThreadPoolExecutor(self._threads) as threads:
+            results += threads.map(self._evaluate_part, other_parts)
+        return {
+            name: np.concatenate([results_of_part[name] for results_of_part in results])
+            for name in results[0]
+        }
 
-    @with_default_settings  # in a thread of its own
+    @with_default_settings  # It runs in a thread of its own.
     def _evaluate_part(self, values: np.ndarray) -> ResultColumns:
-        """Return the results of the gait to which slow starts of each sample converge."""
-        # Friction balances the weight along the slope over a period; with less there is no gait.
+        """Return the results of the gait to which a walk from a slow start converges, for each
+        sample.
+        """
+        # Over a period friction balances the weight along the slope; with less friction there is no
+        # gait.
         friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
         has_enough_friction = friction >= np.tan(slope)
         results = self._evaluate_gaits(
             values[has_enough_friction] if has_enough_friction.any() else values[:1]
         )
-        row = np.maximum(np.cumsum(has_enough_friction) - 1, 0)  # Any row if there is no gait.
-        results_of_all = {name: leaf[row] for name, leaf in results.items()}
+        # Samples without a gait may have any index.
+        result_index = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
+        results_of_all = {name: leaf[result_index] for name, leaf in results.items()}
         outcome = np.where(
             has_enough_friction, results_of_all.pop("outcome"), Outcome.NO_CYCLE_FOUND
         )
         return mask_failures(outcome, results_of_all)
 
     def _evaluate_gaits(self, values: np.ndarray) -> ResultColumns:
-        """Return outcome, measures and derivatives of the gaits of wheels, shape (wheels,)."""
+        """Return outcome, measures and derivatives of the gaits of wheels by name, shape
+        (wheels,).
+        """
         cycle = find_slow_gaits(self._finder, values)
         results = map_in_batches(
             lambda cycles: _read_measures(self._measure_reader, cycles),
@@ -108,15 +130,17 @@ class UnilateralEngine:
                 differentiable_cycles,
             )
             names = self._model.parameter_names
-            for d in self._derivatives:
-                results[d.name] = jacobians[d.measure][:, names.index(d.parameter)]
+            for derivative in self._derivatives:
+                results[derivative.name] = jacobians[derivative.measure][
+                    :, names.index(derivative.parameter)
+                ]
         results["outcome"] = cycle.outcome
         return {name: np.asarray(leaf) for name, leaf in results.items()}
 
 
 @eqx.filter_jit
 def _read_measures(reader: MeasureReader, cycle: ReturnMapCycle) -> dict[str, Array]:
-    """Return the measures of a batch of gaits."""
+    """Return the measures of a batch of gaits by name."""
     first_step = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
     return eqx.filter_vmap(reader)(cycle, first_step)
 
@@ -137,11 +161,13 @@ class LadderEngine:
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
         self._measures, self._base, self._model, *_ = request
         self._paper_model = ViscoelasticWheel()
-        parts = (
-            part for name in request.measures for part in PAPER_MEASURE_SUMS.get(name, (name,))
+        paper_measures = (
+            measure
+            for name in request.measures
+            for measure in PAPER_MEASURE_SUMS.get(name, (name,))
         )
         paper_request = request._replace(
-            measures=tuple(dict.fromkeys(parts)), model=self._paper_model
+            measures=tuple(dict.fromkeys(paper_measures)), model=self._paper_model
         )
         self._paper_engine = CollocationEngine(paper_request, threads)
         self._unilateral_engine = UnilateralEngine(
@@ -149,18 +175,23 @@ class LadderEngine:
         )
 
     def __call__(self, columns: SampleMapping) -> ResultColumns:
-        """Return the results by variable, with `rung` and `reason` of each sample."""
-        n = len(next(iter(columns.values())))
-        friction = columns.get(FRICTION_NAME, np.full(n, float(self._model.friction)))
+        """Return the results by variable, with `rung` (the model's code) and `reason` of each
+        sample.
+        """
+        n_samples = len(next(iter(columns.values())))
+        friction = columns.get(FRICTION_NAME, np.full(n_samples, float(self._model.friction)))
         paper_results = self._paper_engine(
-            {"damping": np.full(n, float(self._base.damping))}
+            {"damping": np.full(n_samples, float(self._base.damping))}
             | {name: column for name, column in columns.items() if name != FRICTION_NAME}
         )
         reason = self.find_reasons(paper_results, friction)
         rung = np.where(reason == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL).astype(np.int8)
         names = (*self._measures, "outcome", "spectral_radius")
         results = {
-            name: sum((paper_results[part] for part in PAPER_MEASURE_SUMS[name]), start=np.zeros(n))
+            name: sum(
+                (paper_results[paper_measure] for paper_measure in PAPER_MEASURE_SUMS[name]),
+                start=np.zeros(n_samples),
+            )
             if name in PAPER_MEASURE_SUMS
             else paper_results[name]
             for name in names
@@ -175,13 +206,15 @@ class LadderEngine:
         return results | {"rung": rung, "reason": reason}
 
     def find_reasons(self, paper_results: ResultColumns, friction: np.ndarray) -> np.ndarray:
-        """Return `ModelChoice.reason_code` of each gait of the paper's model, over its step."""
+        """Return `ModelChoice.reason_code` of each gait of the paper's model, from the margins
+        over its step.
+        """
         reason, _ = find_selection_reason(paper_results, friction - self._paper_model.friction)
         return np.asarray(reason, np.int8)
 
 
 class ToleranceEngine:
-    """Engine of measures to a tolerance; see `vrw.measure_to_tolerance`."""
+    """Engine that computes measures to a tolerance; see `vrw.measure_to_tolerance`."""
 
     def __init__(self, request: EvaluationRequest) -> None:
         self._measures, self._base, self._model, *_, tol = request
@@ -189,26 +222,31 @@ class ToleranceEngine:
         self._tol = tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results by variable; `columns` has one value per sample of each parameter."""
+        """Return the results by variable; `columns` contains the values of each swept parameter,
+        one per sample.
+        """
         *wheel_columns, friction = stack_parameters(columns, self._model, self._base).T
         params = wheel_from_parameters(tuple(map(jnp.asarray, wheel_columns)), self._base.n_legs)
         stoppers = self._model.stoppers
-        measured = measure_to_tolerance(
+        measure_result = measure_to_tolerance(
             self._measures, params, self._tol, friction=friction, stoppers=stoppers
         )
-        results = {name: measured.values[:, i] for i, name in enumerate(self._measures)}
-        results |= {
-            error_variable_name(name): measured.errors[:, i]
-            for i, name in enumerate(self._measures)
+        results = {
+            name: measure_result.values[:, measure_index]
+            for measure_index, name in enumerate(self._measures)
         }
-        rung = np.maximum(measured.models - ModelIndex.RIGID, 0).astype(np.int8)
-        return mask_failures(measured.outcomes, results | {"rung": rung})
+        results |= {
+            error_variable_name(name): measure_result.errors[:, measure_index]
+            for measure_index, name in enumerate(self._measures)
+        }
+        rung = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
+        return mask_failures(measure_result.outcomes, results | {"rung": rung})
 
 
 def make_engine(
     request: EvaluationRequest, threads: int | None = None
 ) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine:
-    """Return the engine for the samples of a scan of this model, or to a tolerance."""
+    """Return the engine for a scan of this model, or for a scan to a tolerance."""
     if request.tol is not None:
         return ToleranceEngine(request)
     engine_class: Any = ENGINE_CLASSES[request.model.capabilities.gait_method]

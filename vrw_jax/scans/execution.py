@@ -1,4 +1,4 @@
-"""Scans: the steady gait of every sample of a design, as one labeled dataset.
+"""Execution of a scan: its chunks are computed, written and returned as one labeled dataset.
 
 A scan is divided into chunks, which the same compiled function computes. If a store is given, each
 chunk is written as soon as it is computed. An interrupted scan continues with the missing chunks.
@@ -48,7 +48,7 @@ ProgressCallback = Callable[["ScanProgress"], None]
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Progress of a scan, as numbers of samples."""
+    """Progress of a scan, in numbers of samples."""
 
     n_samples: int  # samples to compute in this run
     n_done: int  # samples computed in this run
@@ -173,22 +173,27 @@ def run_scan(
 def _compute_chunks(
     scan_plan: ScanPlan,
     storage: AbstractStore,
-    missing: list[int],
+    missing_chunks: list[int],
     on_progress: ProgressCallback | None,
     executor: ChunkExecutor,
 ) -> None:
     """Compute the missing chunks and write them, with a report after each."""
-    shapes = {index: scan_plan.layout.shape_of_chunk(index) for index in missing}
-    n_samples, n_done, n_failed = sum(map(math.prod, shapes.values())), 0, 0
+    chunk_shapes = {
+        chunk_index: scan_plan.layout.shape_of_chunk(chunk_index) for chunk_index in missing_chunks
+    }
+    n_samples, n_done, n_failed = sum(map(math.prod, chunk_shapes.values())), 0, 0
     if on_progress is not None:
         on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
     try:
-        for index, results in executor(scan_plan, missing):
-            shape = shapes[index]
-            block = {name: x.reshape(*shape, *x.shape[1:]) for name, x in results.items()}
+        for chunk_index, results in executor(scan_plan, missing_chunks):
+            chunk_shape = chunk_shapes[chunk_index]
+            block = {
+                name: values.reshape(*chunk_shape, *values.shape[1:])
+                for name, values in results.items()
+            }
             with _explain_full_disk(storage, scan_plan.layout.n_chunks):
-                storage.write_chunk(index, block)
-            n_done += math.prod(shape)
+                storage.write_chunk(chunk_index, block)
+            n_done += math.prod(chunk_shape)
             n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
             if on_progress is not None:
                 on_progress(
@@ -211,15 +216,22 @@ def _describe_interruption(storage: AbstractStore, n_chunks: int) -> str:
     )
 
 
-def _compute_in_process(scan_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
+def _compute_in_process(
+    scan_plan: ScanPlan, missing_chunks: Sequence[int]
+) -> Iterator[ChunkResult]:
     """Yield the missing chunks, computed one after another in this process."""
     engine = scan_plan.build_engine()
-    for index in missing:
-        yield index, engine(scan_plan.design.sample_block(scan_plan.layout.chunk_region(index)))
+    for chunk_index in missing_chunks:
+        yield (
+            chunk_index,
+            engine(scan_plan.design.sample_block(scan_plan.layout.chunk_region(chunk_index))),
+        )
 
 
 def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
-    """Return the store at `path`, created if there is none; raise if it holds another scan."""
+    """Return the store at `path`, created if there is none; raise a ValueError if it contains
+    another scan.
+    """
     storage = find_store(scan_plan, path)
     if storage is None:
         create_store(path, scan_plan.layout, scan_plan.store_attrs)
@@ -227,13 +239,13 @@ def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
         assert storage is not None
     manifest = read_stored_manifest(path) or {}
     setting_difference = describe_difference(manifest[PROVENANCE_ATTRIBUTE], describe_environment())
-    missing = len(storage.find_missing_chunks())
-    if setting_difference and missing:
+    n_missing = len(storage.find_missing_chunks())
+    if setting_difference and n_missing:
         damaged_text = (
             f" ({len(storage.damaged_chunks)} of them damaged)" if storage.damaged_chunks else ""
         )
         raise ValueError(
-            f"{path} lacks {missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
+            f"{path} lacks {n_missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
             "was begun by other means, so that its last digits might not fit: "
             f"{setting_difference}. "
             "Go on with what it was begun with, or begin anew in another place."
@@ -242,7 +254,9 @@ def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
 
 
 def find_store(scan_plan: ScanPlan, path: Path, verify: bool = True) -> ZarrStore | None:
-    """Return the store at `path`, or None if there is none; raise if it holds another scan."""
+    """Return the store at `path`, or None if there is none; raise a ValueError if it contains
+    another scan.
+    """
     manifest = read_stored_manifest(path)
     if manifest is None:
         return None
@@ -257,7 +271,9 @@ def find_store(scan_plan: ScanPlan, path: Path, verify: bool = True) -> ZarrStor
 
 @contextlib.contextmanager
 def _explain_full_disk(storage: AbstractStore, n_chunks: int) -> Iterator[None]:
-    """Replace the error of a full disk by one that names the number of complete chunks."""
+    """Return a context that replaces the error of a full disk by one with the number of complete
+    chunks.
+    """
     try:
         yield
     except OSError as error:

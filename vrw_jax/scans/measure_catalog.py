@@ -22,7 +22,7 @@ ALWAYS_INCLUDED = ("outcome", "spectral_radius", *MARGIN_MEASURES)
 """Variables of every scan, requested or not: outcome, stability and margins of the gait."""
 
 DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
-"""Measures that are computed from the limit cycle itself; these have derivatives."""
+"""Measures that are computed from the limit cycle itself; only these have derivatives."""
 
 REQUESTABLE_MEASURES = (
     *DIFFERENTIABLE_MEASURES,
@@ -47,11 +47,12 @@ class MeasureCatalog(NamedTuple):
     """Names of the variables that a scan of one model can compute."""
 
     requestable: tuple[str, ...]
-    always_included: tuple[str, ...]  # in every scan, requested or not
+    always_included: tuple[str, ...]  # measures in every scan, requested or not
     differentiable: tuple[str, ...]
-    differentiation_parameters: tuple[str, ...]  # of derivatives
+    # parameters by which measures can be differentiated
+    differentiation_parameters: tuple[str, ...]
     default_measures: tuple[str, ...]
-    forecast_samples_per_core: int  # samples per core that a forecast computes
+    forecast_samples_per_core: int  # number of samples per core that a forecast computes
 
 
 _CONTACT_DEFAULT_MEASURES = (
@@ -97,7 +98,7 @@ TOLERANCE_CATALOG = MeasureCatalog(
 )
 """Catalog of scans to a tolerance, in which each measure has an error."""
 ERROR_SUFFIX = "_error"
-"""Suffix of the variable that holds the error of a measure."""
+"""Suffix of the variable that contains the error of a measure."""
 
 
 def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCatalog:
@@ -106,7 +107,7 @@ def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCat
 
 
 def error_variable_name(measure: str) -> str:
-    """Return the name of the variable that holds the error of a measure."""
+    """Return the name of the variable that contains the error of a measure."""
     return measure + ERROR_SUFFIX
 
 
@@ -121,7 +122,7 @@ class MeasureDerivative(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the name of the variable that holds the derivative."""
+        """Return the name of the variable that contains the derivative."""
         return f"d_{self.measure}_d_{self.parameter}"
 
     @property
@@ -146,13 +147,16 @@ def parse_derivative(name: str) -> MeasureDerivative | None:
 
 
 def canonicalize_name(name: str) -> str:
-    """Return the name of the variable that holds `name`, as a name that a file system accepts."""
+    """Return the name of the variable that contains the requested measure, valid as a file name."""
     requested_derivative = parse_derivative(name)
     return name.strip() if requested_derivative is None else requested_derivative.name
 
 
 def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, ...]:
-    """Return the variables' names, each once and without those in every scan; raise if unknown."""
+    """Return the names of the requested variables, each once, without those that every scan has.
+
+    Raise a ValueError for an unknown name.
+    """
     checked_names: dict[str, None] = {}
     known_names = (*catalog.requestable, *catalog.always_included)
     for name in names:

@@ -42,7 +42,7 @@ from vrw_jax.validation import check_int, check_names, check_positive, check_typ
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 
 MAX_SCAN_SAMPLES = 1_000_000_000
-"""Largest number of samples, chosen because it takes over a day and some hundred GB."""
+"""Largest number of samples of a scan, chosen because it takes over a day and some hundred GB."""
 
 
 STORED_KINDS = {"StepOptions": "Options"}
@@ -78,7 +78,7 @@ EvaluateSamples = Callable[[SampleColumns], Mapping[str, np.ndarray]]
 """Function that returns the results of samples by variable, with the axis of samples first."""
 
 ChunkResult = tuple[int, Mapping[str, np.ndarray]]
-"""Index of a chunk and its results."""
+"""Index of a chunk, and its results by variable."""
 
 ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
 """Function that computes chunks of a plan, given by index, and yields them in any order."""
@@ -91,12 +91,12 @@ class ScanPlan:
     design: AbstractDesign
     request: EvaluationRequest
     layout: ResultLayout
-    requested_measures: tuple[str, ...]  # measures by the names that the caller gave
+    requested_measures: tuple[str, ...]  # names of the requested measures, as the caller gave them
     config_text: str
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return the settings that a store must share so that the scan can continue in it."""
+        """Return the settings that a store must have so that the scan can continue in it."""
         measures, base, model, options, cycle_options, tol = self.request
         fixed_names = (name for name in PARAMETER_NAMES if name not in self.design.names)
         return {
@@ -141,7 +141,7 @@ def plan_scan(
     config_text: str = "",
     tol: float | None = None,
 ) -> ScanPlan:
-    """Return the checked plan of a scan, with the layout of its result, without computing it."""
+    """Return the checked plan of a scan, with the layout of its result; nothing is computed."""
     if not isinstance(design, AbstractDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
@@ -178,7 +178,9 @@ def plan_scan(
     names = check_measures(requested_measures, catalog)
     canonical_names = (canonicalize_name(name) for name in requested_measures)
     variable_names = dict.fromkeys(
-        x for name in canonical_names for x in (name, error_variable_name(name))[: 1 + bool(tol)]
+        variable_name
+        for name in canonical_names
+        for variable_name in (name, error_variable_name(name))[: 1 + bool(tol)]
     )
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
     request = EvaluationRequest(names, base, model, options, cycle_options, tol)
@@ -189,7 +191,7 @@ def plan_scan(
 
 
 def _check_tolerance(model: AbstractWheel, tol: float) -> float:
-    """Return the tolerance; raise if no tolerance can refer to the model."""
+    """Return the tolerance; raise a ValueError if a tolerance cannot refer to the model."""
     fields: dict[str, Any] = type(model).__dataclass_fields__
     default_only_fields = model.capabilities.fixed_by_tolerance
     if default_only_fields is None or any(
@@ -204,10 +206,12 @@ def _check_tolerance(model: AbstractWheel, tol: float) -> float:
 
 
 def describe_environment() -> dict[str, object]:
-    """Return the code digest, the versions and the device of this process."""
+    """Return the digest of the source, the versions and the device of this process."""
     environment = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
-    supported = simd.describe_processor()[2].split(",")
-    instruction_sets = [name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in supported]
+    processor_features = simd.describe_processor()[2].split(",")
+    instruction_sets = [
+        name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in processor_features
+    ]
     processor = " ".join([platform.machine(), *instruction_sets])
     return {
         "code": source_digest(),
@@ -235,7 +239,9 @@ def describe_difference(stored: object, current: object) -> str:
 def _make_layout(
     design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
 ) -> ResultLayout:
-    """Return the layout of the variables `names` over a design, in chunks of at most `chunk`."""
+    """Return the layout of the variables `names` over a design, in chunks of at most `chunk`
+    samples.
+    """
     dtype = str(base.damping.dtype)
     legs = locked_leg_coordinate(base.n_legs)
 
@@ -269,10 +275,10 @@ def _make_layout(
 
 
 def _record_fields(settings: object) -> dict[str, object]:
-    """Return the class name and the fields of settings, as values of JSON."""
-    kind = type(settings).__name__
-    record: dict[str, object] = {"kind": STORED_KINDS.get(kind, kind)}
-    stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(kind, {})
+    """Return the class name and the fields of settings as values of JSON."""
+    class_name = type(settings).__name__
+    record: dict[str, object] = {"kind": STORED_KINDS.get(class_name, class_name)}
+    stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(class_name, {})
     for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
         value = getattr(settings, name)
         if isinstance(value, StepOptions | ModelCapabilities):

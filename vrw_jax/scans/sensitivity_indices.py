@@ -1,4 +1,5 @@
-"""Global sensitivity: the shares of a measure's variance by parameter, as Sobol' indices.
+"""Global sensitivity: the fraction of a measure's variance due to each parameter, as Sobol'
+indices.
 
 `design.saltelli` generates the samples and `scan` computes them like any others. `sobol_indices`
 computes the indices from the result with `scipy.stats.sobol_indices` (Saltelli et al. 2010).
@@ -21,14 +22,14 @@ from vrw_jax.wheel import Outcome
 
 @dataclass(frozen=True)
 class SobolOptions:
-    """Numbers of the estimate of Sobol' indices.
+    """Options of the estimate of Sobol' indices.
 
     - `min_rows`: smallest number of rows, chosen because indices of fewer rows are noise;
     - `n_resamples`: number of bootstrap resamples of the rows;
     - `interval_quantiles`: quantiles that bound the interval, chosen for a 95 % interval;
     - `max_roundoff_spread`: largest spread of a measure, as a fraction of its largest magnitude,
-      that counts as round-off. It is chosen because the spread of measures is 4e-14 of it, and that
-      of margins 5e-12, if parameters differ in their last digit alone.
+      that counts as round-off. It is chosen because that spread is 4e-14 for measures, and 5e-12
+      for margins, if parameters differ in their last digit alone.
     """
 
     min_rows: int = 64
@@ -87,42 +88,52 @@ def sobol_indices(
     n_blocks = 2 + len(parameters)
     has_gaits = (scan.outcome.values == Outcome.STEPPED).reshape(n_blocks, -1).all(axis=0)
     rows_with_gaits = np.flatnonzero(has_gaits)
-    n = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
-    if n < options.min_rows:
+    n_rows = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
+    if n_rows < options.min_rows:
         raise ValueError(
             f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices "
             f"need {options.min_rows}: narrow the ranges to where there are gaits, or take more "
             "rows."
         )
-    rows = rows_with_gaits[:n]
+    selected_rows = rows_with_gaits[:n_rows]
     measure_values = np.stack(
-        [scan[name].values.reshape(n_blocks, -1)[:, rows] for name in measure_names], axis=1
+        [scan[name].values.reshape(n_blocks, -1)[:, selected_rows] for name in measure_names],
+        axis=1,
     )
 
-    generator = np.random.default_rng(0)  # The same scan gives the same intervals.
+    random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
     compute_indices = _SobolIndices(measure_values, options.max_roundoff_spread)
-    estimates = compute_indices(np.arange(n))
+    estimates = compute_indices(np.arange(n_rows))
     resampled_estimates = [
-        compute_indices(generator.integers(0, n, n)) for _ in range(options.n_resamples)
+        compute_indices(random_generator.integers(0, n_rows, n_rows))
+        for _ in range(options.n_resamples)
     ]
     lower, upper = np.quantile(resampled_estimates, options.interval_quantiles, axis=0)
-    constant = compute_indices.is_constant(measure_values)
-    if constant.any():
+    has_no_variance = compute_indices.is_constant(measure_values)
+    if has_no_variance.any():
         warnings.warn(
-            f"{', '.join(np.array(measure_names)[constant])}: constant over these samples but for "
-            "round-off, so that there is no variance to share, and the indices are 0.",
+            f"{', '.join(np.array(measure_names)[has_no_variance])}: constant over these samples "
+            "but for round-off, so that there is no variance to share, and the indices are 0.",
             stacklevel=2,
         )
     data: dict[str, tuple] = {}
     for i, (name, label) in enumerate((("first_order", "first-order"), ("total", "total"))):
         attrs = {"units": "1", "long_name": f"{label} Sobol' index"}
-        for suffix, bounds in (("", estimates), ("_lower", lower), ("_upper", upper)):
-            data[name + suffix] = (("measure", "parameter"), bounds[i], attrs)
-    data["is_constant"] = ("measure", constant, {"long_name": "varies by round-off alone"})
+        for index_suffix, interval_bounds in (
+            ("", estimates),
+            ("_lower", lower),
+            ("_upper", upper),
+        ):
+            data[name + index_suffix] = (("measure", "parameter"), interval_bounds[i], attrs)
+    data["is_constant"] = (
+        "measure",
+        has_no_variance,
+        {"long_name": "varies by round-off alone"},
+    )
     return xr.Dataset(
         data,
         coords={"measure": measure_names, "parameter": parameters},
-        attrs={"rows": n, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits)},
+        attrs={"rows": n_rows, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits)},
     )
 
 
@@ -138,22 +149,28 @@ class _SobolIndices:
         self.roundoff = max_roundoff_spread * np.abs(values).max(axis=(0, 2))
 
     def is_constant(self, values: np.ndarray) -> np.ndarray:
-        """Return for each measure whether it varies by round-off alone between these samples."""
-        constant: np.ndarray = np.ptp(values[:2], axis=(0, 2)) <= self.roundoff
-        return constant
+        """Return whether each measure varies only by round-off between these samples."""
+        has_small_spread: np.ndarray = np.ptp(values[:2], axis=(0, 2)) <= self.roundoff
+        return has_small_spread
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return the indices from these rows, shape (2, measures, parameters); 0 of constants."""
+        """Return the indices from these rows, shape (2, measures, parameters); 0 for constant
+        measures.
+        """
         from scipy.stats import sobol_indices as compute_sobol_indices
 
         drawn_values = self.values[..., rows]
-        varying = np.flatnonzero(~self.is_constant(drawn_values))
+        is_varying = np.flatnonzero(~self.is_constant(drawn_values))
         n_blocks, n_measures, _ = drawn_values.shape
         indices = np.zeros((2, n_measures, n_blocks - 2))
-        if len(varying):
-            drawn_values = drawn_values[:, varying]
-            functions = {"f_A": drawn_values[0], "f_B": drawn_values[1], "f_AB": drawn_values[2:]}
-            estimate = compute_sobol_indices(func=functions, n=len(rows))
-            indices[0, varying] = np.reshape(estimate.first_order, (len(varying), -1))
-            indices[1, varying] = np.reshape(estimate.total_order, (len(varying), -1))
+        if len(is_varying):
+            drawn_values = drawn_values[:, is_varying]
+            measure_functions = {
+                "f_A": drawn_values[0],
+                "f_B": drawn_values[1],
+                "f_AB": drawn_values[2:],
+            }
+            estimate = compute_sobol_indices(func=measure_functions, n=len(rows))
+            indices[0, is_varying] = np.reshape(estimate.first_order, (len(is_varying), -1))
+            indices[1, is_varying] = np.reshape(estimate.total_order, (len(is_varying), -1))
         return indices

@@ -43,7 +43,7 @@ class SpecialPointMap(NamedTuple):
 
     @property
     def ending(self) -> str:
-        """Return how many changes between samples no curve explains, as a sentence."""
+        """Return the number of changes between samples that no curve explains, as a sentence."""
         n_changes = len(self.unexplained_changes)
         return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
 
@@ -51,8 +51,8 @@ class SpecialPointMap(NamedTuple):
         lines = [self.ending]
         for change in self.unexplained_changes:
             values = [
-                float(self.scan[name][i])
-                for name, i in zip(self.scan.outcome.dims, change.sample, strict=True)
+                float(self.scan[name][leg_index])
+                for name, leg_index in zip(self.scan.outcome.dims, change.sample, strict=True)
             ]
             lines.append(f"    {change.name} at ({values[0]:.6g}, {values[1]:.6g})")
         return "\n\n".join([*map(str, self.curves), "\n".join(lines)])
@@ -111,7 +111,7 @@ def map_special_points(
             f"model is {type(wheel_model).__name__}, but special points are mapped for "
             f"{describe_models('map')}: give that."
         )
-    samples = scan(
+    scanned_samples = scan(
         design,
         tuple(dict.fromkeys((*check_names("measures", measures), *SPECIAL_POINT_MEASURES))),
         base=base,
@@ -121,24 +121,26 @@ def map_special_points(
         on_progress=on_progress,
     )
     return follow_special_points(
-        samples, WheelParams() if base is None else base, wheel_model, on_stage
+        scanned_samples, WheelParams() if base is None else base, wheel_model, on_stage
     )
 
 
 def follow_special_points(
-    samples: xr.Dataset,
+    scanned_samples: xr.Dataset,
     base: WheelParams,
     model: Any,
     on_stage: Callable[[str], None] | None = None,
 ) -> SpecialPointMap:
     """Return the map of special points over the two parameters of a scan with their measures."""
-    if not np.any(samples.outcome.values == Outcome.STEPPED):
+    if not np.any(scanned_samples.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")
-    return SpecialPointMap(samples, *trace_special_points(samples, base, model, on_stage))
+    return SpecialPointMap(
+        scanned_samples, *trace_special_points(scanned_samples, base, model, on_stage)
+    )
 
 
 def require_map_grid(design: AbstractDesign) -> None:
-    """Raise unless the design is a grid over two parameters, each with ascending values."""
+    """Raise a ValueError unless the design is a grid over two parameters with ascending values."""
     if len(design.shape) != 2:
         raise ValueError(
             f"the design sweeps {', '.join(design.names)}, but a map is a grid over two "

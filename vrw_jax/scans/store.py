@@ -50,10 +50,10 @@ else:
     zarr = lazy_import("zarr")
 
 PROVENANCE_ATTRIBUTE = "provenance"
-"""Name of the attribute that holds the origin of the numbers."""
+"""Name of the attribute that describes the origin of the numbers."""
 
 REQUESTED_ATTRIBUTE = "asked"
-"""Name of the attribute that holds the requested measures."""
+"""Name of the attribute that contains the requested measures."""
 
 ChunkRegion = tuple[slice, ...]
 """Slices of a chunk along the axes of the samples."""
@@ -63,7 +63,7 @@ ChunkBlock = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class VariableLayout:
-    """Description of one variable; `dims` and `shape` leave out the axes of the samples."""
+    """Description of one variable; `dims` and `shape` do not include the axes of the samples."""
 
     name: str
     dtype: str
@@ -96,19 +96,29 @@ class ResultLayout:
     @property
     def _chunks_per_axis(self) -> tuple[int, ...]:
         """Return the number of chunks along each axis."""
-        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk_shape, strict=True))
-
-    def chunk_region(self, index: int) -> ChunkRegion:
-        """Return the slices of a chunk along the axes of the samples."""
-        chunk_indices = np.unravel_index(index, self._chunks_per_axis)
         return tuple(
-            slice(int(i) * c, min((int(i) + 1) * c, n))
-            for i, c, n in zip(chunk_indices, self.chunk_shape, self.shape, strict=True)
+            -(-axis_length // chunk_length)
+            for axis_length, chunk_length in zip(self.shape, self.chunk_shape, strict=True)
         )
 
-    def shape_of_chunk(self, index: int) -> tuple[int, ...]:
+    def chunk_region(self, chunk_index: int) -> ChunkRegion:
+        """Return the slices of a chunk along the axes of the samples."""
+        chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
+        return tuple(
+            slice(
+                int(axis_index) * chunk_length,
+                min((int(axis_index) + 1) * chunk_length, axis_length),
+            )
+            for axis_index, chunk_length, axis_length in zip(
+                chunk_indices, self.chunk_shape, self.shape, strict=True
+            )
+        )
+
+    def shape_of_chunk(self, chunk_index: int) -> tuple[int, ...]:
         """Return the shape of a chunk, which is smaller at the end of an axis."""
-        return tuple(part.stop - part.start for part in self.chunk_region(index))
+        return tuple(
+            axis_slice.stop - axis_slice.start for axis_slice in self.chunk_region(chunk_index)
+        )
 
     @property
     def bytes_per_sample(self) -> int:
@@ -118,13 +128,13 @@ class ResultLayout:
 
 def choose_chunk_shape(shape: tuple[int, ...], max_samples: int) -> tuple[int, ...]:
     """Return the shape of a slab of at most `max_samples` samples with whole last axes."""
-    chunk, samples_left = [1] * len(shape), max_samples
+    chunk_shape, samples_left = [1] * len(shape), max_samples
     for axis in range(len(shape) - 1, -1, -1):
-        chunk[axis] = min(shape[axis], max(samples_left, 1))
-        samples_left //= chunk[axis]
-        if chunk[axis] < shape[axis]:
+        chunk_shape[axis] = min(shape[axis], max(samples_left, 1))
+        samples_left //= chunk_shape[axis]
+        if chunk_shape[axis] < shape[axis]:
             break
-    return tuple(chunk)
+    return tuple(chunk_shape)
 
 
 class AbstractStore(abc.ABC):
@@ -132,15 +142,15 @@ class AbstractStore(abc.ABC):
 
     location: str = "memory"
     damage_description: str = ""
-    """Description of the damage; an empty string if there is none."""
+    """Description of the damage of the store; an empty string if there is none."""
 
     @abc.abstractmethod
     def find_missing_chunks(self) -> list[int]:
-        """Return the chunks that are still to be computed, in ascending order."""
+        """Return the indices of the chunks that are not computed yet, in ascending order."""
 
     @abc.abstractmethod
-    def write_chunk(self, index: int, block: ChunkBlock) -> None:
-        """Write the results of a chunk and mark it as done."""
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
+        """Write the results of a chunk and mark the chunk as written."""
 
     @abc.abstractmethod
     def load_dataset(self) -> xr.Dataset:
@@ -159,24 +169,27 @@ class MemoryStore(AbstractStore):
         self._is_chunk_done = np.zeros(layout.n_chunks, bool)
         try:
             self._arrays = {
-                v.name: np.full((*layout.shape, *v.shape), v.fill_value, v.dtype)
-                for v in layout.variables
+                variable.name: np.full(
+                    (*layout.shape, *variable.shape), variable.fill_value, variable.dtype
+                )
+                for variable in layout.variables
             }
         except MemoryError as error:
-            size = math.prod(layout.shape)
+            n_samples = math.prod(layout.shape)
             raise ValueError(
-                f"the result of {size:,} samples takes {size * layout.bytes_per_sample / 1e9:,.0f} "
-                "GB, more than this memory holds: give a store, whose chunks go to the disk."
+                f"the result of {n_samples:,} samples takes "
+                f"{n_samples * layout.bytes_per_sample / 1e9:,.0f} GB, more than this memory "
+                "holds: give a store, whose chunks go to the disk."
             ) from error
 
     def find_missing_chunks(self) -> list[int]:
-        return [int(i) for i in np.flatnonzero(~self._is_chunk_done)]
+        return [int(chunk_index) for chunk_index in np.flatnonzero(~self._is_chunk_done)]
 
-    def write_chunk(self, index: int, block: ChunkBlock) -> None:
-        region = self._layout.chunk_region(index)
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
+        region = self._layout.chunk_region(chunk_index)
         for name, array in self._arrays.items():
-            array[region] = block[name]
-        self._is_chunk_done[index] = True
+            array[region] = chunk_results[name]
+        self._is_chunk_done[chunk_index] = True
 
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
@@ -185,8 +198,12 @@ class MemoryStore(AbstractStore):
         layout = self._layout
         dataset = xr.Dataset(
             {
-                v.name: ((*layout.dims, *v.dims), self._arrays[v.name], dict(v.attrs))
-                for v in layout.variables
+                variable.name: (
+                    (*layout.dims, *variable.dims),
+                    self._arrays[variable.name],
+                    dict(variable.attrs),
+                )
+                for variable in layout.variables
             },
             coords={
                 name: (dim, values, dict(attrs))
@@ -198,7 +215,7 @@ class MemoryStore(AbstractStore):
 
 
 class ZarrStore(AbstractStore):
-    """Storage of a scan's results in a folder; `verify` finds damaged chunks."""
+    """Storage of a scan's results in a folder; `verify` selects the search for damaged chunks."""
 
     def __init__(self, path: Path, layout: ResultLayout, verify: bool = True) -> None:
         self._path, self._layout, self.location, self._verify = path, layout, str(path), verify
@@ -219,7 +236,7 @@ class ZarrStore(AbstractStore):
         except METADATA_ERRORS:
             if not self._damaged_metadata:
                 raise
-            return  # They are written again before anything else is.
+            return  # The metadata are written again before anything else is.
         if self._verify:
             self.damaged_chunks = self._checksums.find_damaged_chunks()
             self._damaged_coordinates = self._checksums.find_damaged_coordinates()
@@ -229,15 +246,15 @@ class ZarrStore(AbstractStore):
             return list(range(self._layout.n_chunks))
         is_done = self._checksums.is_chunk_marked()
         is_done[np.asarray(self.damaged_chunks, int)] = False
-        return [int(i) for i in np.flatnonzero(~is_done)]
+        return [int(chunk_index) for chunk_index in np.flatnonzero(~is_done)]
 
-    def write_chunk(self, index: int, block: ChunkBlock) -> None:
-        region = self._layout.chunk_region(index)
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
+        region = self._layout.chunk_region(chunk_index)
         for variable in self._layout.variables:
-            _get_array(self._group, variable.name)[region] = block[variable.name]
+            _get_array(self._group, variable.name)[region] = chunk_results[variable.name]
         assert self._checksums is not None
-        self._checksums.mark_chunk(index)
-        self.damaged_chunks = [chunk for chunk in self.damaged_chunks if chunk != index]
+        self._checksums.mark_chunk(chunk_index)
+        self.damaged_chunks = [chunk for chunk in self.damaged_chunks if chunk != chunk_index]
 
     def load_dataset(self) -> xr.Dataset:
         return open_scan(self._path, verify=False)
@@ -257,7 +274,7 @@ class ZarrStore(AbstractStore):
 
 
 def _get_array(group: zarr.Group, name: str) -> zarr.Array:
-    """Return the array `name` of a Zarr group."""
+    """Return the array `name` of a Zarr group; raise an error if it is no array."""
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array
@@ -317,7 +334,13 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
             f"{path} can't be opened ({reason}): run the scan again, which mends the arrays that "
             "it wrote, and delete others without dimension names."
         ) from error
-    dataset = dataset.assign_attrs({k: v for k, v in metadata.attrs.items() if k != "coordinates"})
+    dataset = dataset.assign_attrs(
+        {
+            attribute_name: attribute_value
+            for attribute_name, attribute_value in metadata.attributes.items()
+            if attribute_name != "coordinates"
+        }
+    )
     return _arrange_as_requested(dataset)
 
 
@@ -333,8 +356,8 @@ METADATA_ERRORS = (
 
 
 def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) -> zarr.Group:
-    """Open a store by the first copy of its metadata that can be read."""
-    variables = metadata.mark_attrs.get(VARIABLES_KEY, ())
+    """Return the group of a store, opened with the first copy of its metadata that can be read."""
+    variables = metadata.mark_attributes.get(VARIABLES_KEY, ())
     for consolidated in (None, False):
         try:
             group = zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=consolidated)
@@ -350,7 +373,8 @@ def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) 
 def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
     """Return the dataset with the requested variables first, in their order and by their names.
 
-    A file name cannot be "d speed / d damping", so in a store the array of it has another name.
+    A file name cannot be "d speed / d damping", so the array of that variable in a store has
+    another name.
     """
     requested = dataset.attrs.get(REQUESTED_ATTRIBUTE)
     names = (
@@ -364,22 +388,28 @@ def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
         if canonicalize_name(name) in dataset
     }
     names_in_order = list(dict.fromkeys(map(canonicalize_name, names)))
-    order = dict.fromkeys(
-        [*(n for n in names_in_order if n in requested_names), *map(str, dataset.data_vars)]
+    ordered_names = dict.fromkeys(
+        [
+            *(name for name in names_in_order if name in requested_names),
+            *map(str, dataset.data_vars),
+        ]
     )
-    return dataset[list(order)].rename(
-        {n: requested_names[n] for n in requested_names if n != requested_names[n]}
+    return dataset[list(ordered_names)].rename(
+        {name: requested_names[name] for name in requested_names if name != requested_names[name]}
     )
 
 
 def _read_scan_metadata(path: Path) -> StoredMetadata:
-    """Return the metadata of a store; raise if it is not a store of a scan."""
+    """Return the metadata of a store; raise a ValueError if the folder is not a store of a scan."""
     metadata = StoredMetadata(path)
-    if metadata.root.get("node_type") != "group" or metadata.root.get("zarr_format") != 3:
+    if (
+        metadata.root_metadata.get("node_type") != "group"
+        or metadata.root_metadata.get("zarr_format") != 3
+    ):
         raise ValueError(
             f"{path} is no scan's store: give the folder that `vrw scan` wrote, or a new place."
         )
-    if MANIFEST_ATTRIBUTE not in metadata.attrs:
+    if MANIFEST_ATTRIBUTE not in metadata.attributes:
         raise ValueError(
             f"{path} is a Zarr store, but not a scan's: give the folder that `vrw scan` wrote."
         )
@@ -390,7 +420,7 @@ def read_stored_manifest(path: Path) -> dict | None:
     """Return the settings and provenance of the store at `path`, or None if there is no store."""
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
-    attrs = _read_scan_metadata(path).attrs
+    attrs = _read_scan_metadata(path).attributes
     try:
         origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
         origin = json.loads(origin) if isinstance(origin, str) else origin
@@ -406,7 +436,10 @@ def find_first_difference(
 ) -> tuple[str, object, object]:
     """Return the name and both values of the first setting that differs, or ("", None, None)."""
     if isinstance(stored, dict) and isinstance(current, dict):
-        for key in [*stored, *(k for k in current if k not in stored)]:
+        for key in [
+            *stored,
+            *(setting_name for setting_name in current if setting_name not in stored),
+        ]:
             nested_difference = find_first_difference(
                 stored.get(key), current.get(key), f"{name}.{key}" if name else str(key)
             )
@@ -417,7 +450,9 @@ def find_first_difference(
 
 
 def create_store(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
-    """Create an empty store at `path` atomically; keep a store that appears in the meantime."""
+    """Create an empty store at `path` atomically; a store that another process creates first is
+    kept.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
@@ -467,7 +502,7 @@ def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]
             attributes=dict(variable.attrs),
         )
     chunks = (layout.n_chunks, DIGEST_SIZE_BYTES)
-    mark_attrs = seal_attributes(
+    mark_attributes = seal_attributes(
         {
             VARIABLES_KEY: [variable.name for variable in layout.variables],
             COORDINATES_KEY: {
@@ -477,28 +512,35 @@ def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]
             ATTRIBUTES_KEY: dict(group_attrs),
         }
     )
-    group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attrs).create_array(
+    group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attributes).create_array(
         "digest", shape=chunks, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
     )
-    # Write all metadata into one file in this order; zarr's function for it sorts and warns.
+    # All metadata are written into one file in this order, because zarr's function sorts them and
+    # warns.
     names = [*layout.coordinates, *(variable.name for variable in layout.variables)]
-    parts = {
+    metadata_by_name = {
         name: json.loads((path / name / METADATA_FILE_NAME).read_text())
         for name in (*names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
     }
     root_path = path / METADATA_FILE_NAME
     root = json.loads(root_path.read_text())
-    root["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": parts}
+    root["consolidated_metadata"] = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": metadata_by_name,
+    }
     root_path.write_text(json.dumps(root, indent=2))
 
 
 def _rewrite_metadata(path: Path, layout: ResultLayout) -> None:
-    """Write the metadata of the scan's arrays as in a new store, which is made temporarily."""
-    stored = StoredMetadata(path)
+    """Write the metadata of the scan's arrays as they are in a new store, which is made
+    temporarily.
+    """
+    stored_metadata = StoredMetadata(path)
     temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
     try:
         temporary_path.mkdir()
-        _create_arrays(temporary_path, layout, stored.attrs)
-        stored.rewrite(StoredMetadata(temporary_path))
+        _create_arrays(temporary_path, layout, stored_metadata.attributes)
+        stored_metadata.restore_metadata(StoredMetadata(temporary_path))
     finally:
         shutil.rmtree(temporary_path, ignore_errors=True)
