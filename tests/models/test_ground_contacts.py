@@ -130,7 +130,7 @@ def select_contacts(q, v, at_stopper, locked, friction, moving):
     small = SignTolerances(jnp.asarray(1e-12), jnp.asarray(1e-12))  # no case is near a border
     choice = choose_combination(s, hub, free, allowed, friction, small, True)
     measured = solve_combination(s, hub, free, choice.slot_modes, choice.is_held, friction)
-    rates = jnp.stack([*measured.hub, *measured.length_motion])
+    rates = jnp.stack([*measured.hub_vector, *measured.length_motion])
     return choice.slot_modes, choice.is_held, rates, choice.n_solutions
 
 

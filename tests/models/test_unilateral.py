@@ -269,7 +269,9 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
     solution = compute_forces(flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))).solution
     g, slope = 9.81, 0.30
     tangential_part = g * (math.sin(slope) - friction * math.cos(slope))
-    np.testing.assert_allclose(jnp.stack(solution.hub), [tangential_part, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        jnp.stack(solution.hub_vector), [tangential_part, 0.0, 0.0], atol=1e-12
+    )
     assert abs(float(sum(solution.normal)) - 18.0 * g * math.cos(slope)) < 1e-10
 
 
@@ -284,7 +286,7 @@ def test_a_wheel_in_the_air_falls_freely():
     motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
     current_value = compute_forces(flow, motion)
     expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
-    np.testing.assert_allclose(jnp.stack(current_value.solution.hub), expected, atol=1e-12)
+    np.testing.assert_allclose(jnp.stack(current_value.solution.hub_vector), expected, atol=1e-12)
     # Preload and spin press each leg on its stopper: 500 * 0.02 + 0.7 * 3^2 N.
     np.testing.assert_allclose(airborne_stopper_force(flow, current_value), 10.0 + 6.3, atol=1e-12)
 

@@ -281,7 +281,7 @@ def _solve_step(
         for value in GAUSS_EIGENVALUES
     ]
 
-    def apply_correction(
+    def correct_accelerations(
         node_accelerations: NodeAccelerations, h: Array, projections: list
     ) -> tuple[NodeAccelerations, Array]:
         corrections = []
@@ -308,7 +308,7 @@ def _solve_step(
         projections = [
             _project_residuals(weights, tuple(residuals)) for weights in EIGENVECTOR_PROJECTION
         ]
-        node_accelerations, largest_correction = apply_correction(
+        node_accelerations, largest_correction = correct_accelerations(
             sweep_state.node_accelerations, sweep_state.h, projections
         )
         return _SweepState(
@@ -344,7 +344,7 @@ def _solve_step(
         )
         return (sweep_state, shift_to_event(sweep_state)), None
 
-    linear_accelerations, largest_correction = apply_correction(
+    linear_accelerations, largest_correction = correct_accelerations(
         (start_acceleration,) * N_GAUSS_NODES,
         h,
         _project_linear_residuals(residual, residual_by_q, residual_by_v, v, start_acceleration, h),
@@ -444,12 +444,15 @@ def _subtract(x: ComplexPair, y: ComplexPair) -> ComplexPair:
     return x[0] - y[0], x[1] - y[1]
 
 
-def _add_terms(terms: Sequence[ComplexPair]) -> ComplexPair:
+def _add_terms(complex_numbers: Sequence[ComplexPair]) -> ComplexPair:
     """Return the sum of complex numbers."""
-    first_term, *other_terms = terms
-    real_part, imaginary_part = first_term
-    for term in other_terms:
-        real_part, imaginary_part = real_part + term[0], imaginary_part + term[1]
+    first_number, *other_numbers = complex_numbers
+    real_part, imaginary_part = first_number
+    for complex_number in other_numbers:
+        real_part, imaginary_part = (
+            real_part + complex_number[0],
+            imaginary_part + complex_number[1],
+        )
     return real_part, imaginary_part
 
 

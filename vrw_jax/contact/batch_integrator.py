@@ -174,7 +174,7 @@ def evaluate_dynamics(dynamics: ModeDynamics, q: Array, v: Array) -> Array:
         optional_rows.append(jnp.stack(prevent_fusion(accumulator_rows, opaque_one(motion))))
     return jnp.concatenate(
         [
-            jnp.stack(forces.solution.hub),
+            jnp.stack(forces.solution.hub_vector),
             forces.solution.length_motion,
             jnp.stack(contact_rows),
             *optional_rows,
@@ -220,7 +220,7 @@ def compute_guard_rates(dynamics: ModeDynamics, point: IntervalPoint) -> Array:
 def find_initiating_guards(dynamics: ModeDynamics) -> Array:
     """Return whether each guard is the initiating guard of the contact state, (guards, lanes)."""
     contact_state = dynamics.contact_state
-    has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
+    has_just_slid = dynamics.contact_slots.gather_flags(contact_state.has_just_slid)
     no_slot_flags = jnp.zeros((2, contact_state.contact_modes.shape[-1]), bool)
     airborne_release_flags = [contact_state.locked & False] if dynamics.is_one_sided else []
     return jnp.concatenate(
@@ -390,9 +390,9 @@ def compute_stage_state(
         jnp.asarray(x)[i] for x in (tableau.matrix, tableau.matrix_squared, tableau.nodes)
     )
     n, n_previous = len(q), len(tableau.nodes) - 1
-    first_sum = sum(a[j] * stage_rows[j, :n] for j in range(n_previous))
-    second_sum = sum(b[j] * stage_rows[j, :n] for j in range(n_previous))
-    return q + h * (node * v + h * second_sum), v + h * first_sum
+    rate_increment = sum(a[j] * stage_rows[j, :n] for j in range(n_previous))
+    coordinate_increment = sum(b[j] * stage_rows[j, :n] for j in range(n_previous))
+    return q + h * (node * v + h * coordinate_increment), v + h * rate_increment
 
 
 def attempt_solver_step(
@@ -401,7 +401,7 @@ def attempt_solver_step(
     """Return one attempted step of every lane."""
     h, start_point, last_stage = state.h, state.point, len(tableau.nodes) - 1
 
-    def evaluate_stage(i: Array, stage_rows: Array) -> Array:
+    def evaluate_stage_dynamics(i: Array, stage_rows: Array) -> Array:
         stage_row = evaluate_dynamics(
             dynamics, *compute_stage_state(tableau, i, start_point.q, start_point.v, stage_rows, h)
         )
@@ -409,7 +409,7 @@ def attempt_solver_step(
 
     later_stage_rows = jnp.zeros((last_stage, *start_point.dynamics_rows.shape), h.dtype)
     stage_rows = jnp.concatenate([start_point.dynamics_rows[None], later_stage_rows])
-    stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage, stage_rows)
+    stage_rows = lax.fori_loop(1, last_stage + 1, evaluate_stage_dynamics, stage_rows)
     return complete_solver_step(dynamics, tableau, options, state, stage_rows)
 
 

@@ -61,7 +61,7 @@ class ContactSolution(NamedTuple):
     normal: SlotPair  # pushing positive
     stopper: SlotPair  # of the stopper of each slot's leg, pushing positive
     pull: SlotPair  # force of stopper and foot along u on the leg's mass
-    hub: HubVector
+    hub_vector: HubVector
     length_motion: SlotPair  # of the length of each slot's leg
     foot_motion_x: SlotPair  # of each slot's foot
     foot_motion_z: SlotPair
@@ -201,15 +201,15 @@ def _eliminate_stoppers(
     )
     outward_motion = _make_pair(
         lambda i: (
-            sin[i] * free_motion.hub[0]
-            + cos[i] * free_motion.hub[1]
+            sin[i] * free_motion.hub_vector[0]
+            + cos[i] * free_motion.hub_vector[1]
             + free_motion.slot_leg_motion[i]
         )
     )
     free_length_motion = _make_pair(
         lambda i: (
             outward_motion[i]
-            + jnp.where(foot_equations.is_sticking[i], free_motion.foot_radial[i], 0.0)
+            + jnp.where(foot_equations.is_sticking[i], free_motion.foot_radial_motion[i], 0.0)
         )
     )
     p = _make_pair(lambda i: jnp.where(is_held[i], free_length_motion[i], 0.0))
@@ -264,8 +264,8 @@ def _solve_feet(
     )
     right_hand_side = _make_pair(
         lambda i: (
-            -weight_transverse[i] * free_motion.foot_transverse[i]
-            - weight_radial[i] * s.m * free_motion.foot_radial[i]
+            -weight_transverse[i] * free_motion.foot_transverse_motion[i]
+            - weight_radial[i] * s.m * free_motion.foot_radial_motion[i]
         )
     )
     c = _solve_2x2(
@@ -285,7 +285,7 @@ def _solve_feet(
     )
     foot_force_transverse = _make_pair(lambda i: unit_force_transverse[i] * c[i])
     sticking_force_radial = _make_pair(
-        lambda i: -s.m * free_motion.foot_radial[i] - stopper_force[i]
+        lambda i: -s.m * free_motion.foot_radial_motion[i] - stopper_force[i]
     )
     foot_force_radial = _make_pair(
         lambda i: jnp.where(
@@ -324,7 +324,7 @@ def solve_combination(
     a held leg keeps its length. The stoppers are eliminated first.
     """
     sin, cos, inverse_leg_mass = inertia.sin, inertia.cos, 1.0 / s.m
-    unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub[2])
+    unit_divisor = 1.0 + 0.0 * lax.stop_gradient(free_motion.hub_vector[2])
     foot_equations = _make_foot_equations(s, inertia, slot_modes, friction)
     stopper_system = _eliminate_stoppers(
         s, inertia, free_motion, is_held, foot_equations, unit_divisor
@@ -335,17 +335,30 @@ def solve_combination(
     pull = _make_pair(lambda i: foot_force_radial[i] + stopper_force[i])
     z, y = inertia.response_transverse, inertia.response_radial
     hub_with_feet = [
-        free_motion.hub[k] + z[0][k] * foot_force_transverse[0] + z[1][k] * foot_force_transverse[1]
+        free_motion.hub_vector[k]
+        + z[0][k] * foot_force_transverse[0]
+        + z[1][k] * foot_force_transverse[1]
         for k in range(3)
     ]
     vx, vz, omega = (
         hub_with_feet[k] - y[0][k] * stopper_force[0] - y[1][k] * stopper_force[1] for k in range(3)
     )
-    dx, dz, domega = vx - free_motion.hub[0], vz - free_motion.hub[1], omega - free_motion.hub[2]
-    foot_transverse = _make_pair(
-        lambda i: cos[i] * dx - sin[i] * dz - inertia.L[i] * domega + free_motion.foot_transverse[i]
+    dx, dz, domega = (
+        vx - free_motion.hub_vector[0],
+        vz - free_motion.hub_vector[1],
+        omega - free_motion.hub_vector[2],
     )
-    foot_radial = _make_pair(lambda i: free_motion.foot_radial[i] + pull[i] * inverse_leg_mass)
+    foot_transverse = _make_pair(
+        lambda i: (
+            cos[i] * dx
+            - sin[i] * dz
+            - inertia.L[i] * domega
+            + free_motion.foot_transverse_motion[i]
+        )
+    )
+    foot_radial = _make_pair(
+        lambda i: free_motion.foot_radial_motion[i] + pull[i] * inverse_leg_mass
+    )
     free_length_motion = _make_pair(
         lambda i: (
             sin[i] * vx + cos[i] * vz + free_motion.slot_leg_motion[i] - pull[i] * inverse_leg_mass
@@ -360,7 +373,7 @@ def solve_combination(
         ),
         stopper=stopper_force,
         pull=pull,
-        hub=(vx, vz, omega),
+        hub_vector=(vx, vz, omega),
         length_motion=_make_pair(lambda i: jnp.where(is_held[i], 0.0, free_length_motion[i])),
         foot_motion_x=_make_pair(lambda i: foot_transverse[i] * cos[i] + foot_radial[i] * sin[i]),
         foot_motion_z=_make_pair(lambda i: foot_radial[i] * cos[i] - foot_transverse[i] * sin[i]),
@@ -544,7 +557,7 @@ def _evaluate_violation(
     )
     coefficient = finite_friction(friction)
     solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
-    max_violation, holds_along_slope = jnp.zeros_like(solution.hub[0]), []
+    max_violation, holds_along_slope = jnp.zeros_like(solution.hub_vector[0]), []
     for i in range(2):
         mode = slot_modes[i]
         holds_along_slope.append(
@@ -719,7 +732,7 @@ def choose_combination(
         )
 
     remaining_mask = allowed_modes.select_allowed(ordered_table)
-    infinite_violation = jnp.full_like(lax.stop_gradient(free_motion.hub[2]), jnp.inf)
+    infinite_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_vector[2]), jnp.inf)
     initial_state = _EnumerationState(
         remaining_mask,
         (0 * remaining_mask[0] + 1, 0 * remaining_mask[1]),
@@ -772,8 +785,8 @@ def is_release_consistent(
         slot_pair[1] - shift * slot_weights[1],
     )
     displaced_motion = free_motion._replace(
-        foot_transverse=shift_pair(free_motion.foot_transverse, e),
-        foot_radial=shift_pair(free_motion.foot_radial, u),
+        foot_transverse_motion=shift_pair(free_motion.foot_transverse_motion, e),
+        foot_radial_motion=shift_pair(free_motion.foot_radial_motion, u),
     )
     slot_friction = (
         jnp.where(is_second_slot, friction[1], friction[0])

@@ -20,11 +20,11 @@ from vrw_jax.contact.dynamics_jvp import (
     solve_contact_forces,
 )
 from vrw_jax.contact.mechanics import (
+    ContactSlots,
     FootVelocity,
     LegArray,
     LegDirections,
     SlotPair,
-    Slots,
     WheelMotion,
     find_slots,
     foot_heights,
@@ -83,7 +83,7 @@ class ModeDynamics(NamedTuple):
     friction: Friction  # friction coefficient of the slots' feet
     is_one_sided: bool  # whether legs in the air may leave their stoppers
     contact_state: ContactState
-    slots: Slots
+    contact_slots: ContactSlots
     slot_modes: Int[Array, "2"]  # `ContactMode` of each slot's foot
     is_held: Bool[Array, "2"]  # whether the leg of each slot is on its stopper
     is_airborne_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
@@ -92,8 +92,8 @@ class ModeDynamics(NamedTuple):
 
     def configure(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration at this motion, for the solution of its forces."""
-        slots = self.slots, self.slot_modes, self.is_held, self.is_airborne_locked
-        return ContactConfiguration(self.s, motion, self.friction, *slots)
+        contact_slots = self.contact_slots, self.slot_modes, self.is_held, self.is_airborne_locked
+        return ContactConfiguration(self.s, motion, self.friction, *contact_slots)
 
 
 def make_mode_dynamics(
@@ -109,17 +109,17 @@ def make_mode_dynamics(
     - `friction`: of all feet, or of the foot that landed last and of the others;
     - `tilt`: angle by which the next line is steeper, rad.
     """
-    slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
-    slot_modes = slots.gather_codes(contact_state.contact_modes)
-    is_held = slots.gather_flags(contact_state.locked)
-    is_airborne_locked = contact_state.locked & ~slots.is_filled
-    friction = slot_friction(friction, slots)
+    contact_slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
+    slot_modes = contact_slots.gather_codes(contact_state.contact_modes)
+    is_held = contact_slots.gather_flags(contact_state.locked)
+    is_airborne_locked = contact_state.locked & ~contact_slots.is_filled
+    friction = slot_friction(friction, contact_slots)
     return ModeDynamics(
         s,
         friction,
         is_one_sided,
         contact_state,
-        slots,
+        contact_slots,
         slot_modes,
         is_held,
         is_airborne_locked,
@@ -131,7 +131,7 @@ def make_mode_dynamics(
 class ContactForces(NamedTuple):
     """Contact forces, and the leg directions and foot velocities that they depend on."""
 
-    legs: LegDirections
+    leg_directions: LegDirections
     free_leg_acceleration: LegArray  # see `free_leg_motion`, m/s^2
     solution: ForceSolution
     foot_velocity: FootVelocity
@@ -139,20 +139,26 @@ class ContactForces(NamedTuple):
 
 def compute_forces(dynamics: ModeDynamics, motion: WheelMotion) -> ContactForces:
     """Return the forces of ground and stoppers (N), with the resulting accelerations."""
-    unit_divisor, posture = opaque_one(motion), make_posture(dynamics.s, motion, dynamics.slots)
-    leg_acceleration = prevent_fusion(
-        free_leg_motion(dynamics.s, motion, posture.legs), unit_divisor
+    unit_divisor, posture = (
+        opaque_one(motion),
+        make_posture(dynamics.s, motion, dynamics.contact_slots),
     )
-    velocity = prevent_fusion(foot_velocity(motion, dynamics.slots, posture), unit_divisor)
+    leg_acceleration = prevent_fusion(
+        free_leg_motion(dynamics.s, motion, posture.leg_directions), unit_divisor
+    )
+    velocity = prevent_fusion(foot_velocity(motion, dynamics.contact_slots, posture), unit_divisor)
     return ContactForces(
-        posture.legs, leg_acceleration, solve_contact_forces(dynamics.configure(motion)), velocity
+        posture.leg_directions,
+        leg_acceleration,
+        solve_contact_forces(dynamics.configure(motion)),
+        velocity,
     )
 
 
 def airborne_stopper_force(dynamics: ModeDynamics, forces: ContactForces) -> LegArray:
     """Return the stopper force of each locked leg in the air, N; 0 for the other legs."""
-    sin, cos = forces.legs
-    ax, az, _ = forces.solution.hub
+    sin, cos = forces.leg_directions
+    ax, az, _ = forces.solution.hub_vector
     # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.
     free_acceleration = forces.free_leg_acceleration + sin * ax + cos * az
     return jnp.where(dynamics.is_airborne_locked, dynamics.s.m * free_acceleration, 0.0)
@@ -194,7 +200,7 @@ def vector_field(dynamics: ModeDynamics, state: PackedState) -> PackedState:
         motion.vx,
         motion.vz,
         motion.dtheta,
-        *forces.solution.hub,
+        *forces.solution.hub_vector,
         jnp.where(dynamics.contact_state.locked, 0.0, motion.dL),
         forces.solution.length_motion,
     )
@@ -211,7 +217,7 @@ class GuardLayout(NamedTuple):
     liftoff: int  # normal force, one per slot
     slip_up: int  # friction margin before the foot slides uphill, one per slot
     slip_down: int  # friction margin before the foot slides downhill, one per slot
-    slip_stop: int  # speed of a sliding foot, one per slot
+    slip_end: int  # speed of a sliding foot, one per slot
     stopper_release: int  # stopper force of a loaded leg, one per slot
     rolling_rate: int  # rate of rolling, dtheta
     collapse: int  # length of the shortest leg minus a
@@ -242,7 +248,7 @@ def make_guard_layout(n: int, is_one_sided: bool) -> GuardLayout:
 class ContactQuantities(NamedTuple):
     """Forces and foot speeds that the guards depend on, besides the motion."""
 
-    legs: LegDirections
+    leg_directions: LegDirections
     normal: SlotPair
     tangential: SlotPair
     stopper: SlotPair
@@ -257,7 +263,7 @@ def collect_contact_quantities(dynamics: ModeDynamics, forces: ContactForces) ->
     airborne_stopper = airborne_stopper_force(dynamics, forces) if dynamics.is_one_sided else None
     force_pairs = solution.normal, solution.tangential, solution.stopper
     return ContactQuantities(
-        forces.legs,
+        forces.leg_directions,
         *force_pairs,
         forces.foot_velocity.x,
         solution.painleve_determinant,
@@ -290,7 +296,7 @@ def evaluate_guards(
         is_after_start | ~contact_state.has_just_lifted
     )
     is_free_leg = ~contact_state.locked & (is_after_start | ~contact_state.has_just_unlocked)
-    has_just_slid = dynamics.slots.gather_flags(contact_state.has_just_slid)
+    has_just_slid = dynamics.contact_slots.gather_flags(contact_state.has_just_slid)
     coefficient = stack_friction(finite_friction(dynamics.friction))
     normal, tangential = jnp.stack(quantities.normal), jnp.stack(quantities.tangential)
     # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
@@ -311,7 +317,9 @@ def evaluate_guards(
         else [jnp.where(dynamics.is_airborne_locked, quantities.airborne_stopper, ones)]
     )
     return [
-        jnp.where(is_airborne, foot_heights(motion, quantities.legs, dynamics.tilt), ones),
+        jnp.where(
+            is_airborne, foot_heights(motion, quantities.leg_directions, dynamics.tilt), ones
+        ),
         jnp.where(is_free_leg, s.L0 - motion.L, ones),
         if_evaluated(dynamics.slot_modes != ContactMode.OFF, supporting_force),
         if_evaluated(has_friction_cone, coefficient * normal - tangential),
@@ -358,7 +366,7 @@ def is_wheel_at_rest(
 
 
 def choose_stopping_guard(
-    layout: GuardLayout,
+    guard_layout: GuardLayout,
     dynamics: ModeDynamics,
     rates: Array,
     guard: Int[Array, "..."],
@@ -371,12 +379,12 @@ def choose_stopping_guard(
     first. The friction of the stopped foot then decides whether the wheel rests or falls back.
     """
     slip_signs = slip_sign(dynamics.slot_modes)
-    has_just_slid = dynamics.slots.gather_flags(dynamics.contact_state.has_just_slid)
-    is_stopping = guard == layout.rolling_rate
+    has_just_slid = dynamics.contact_slots.gather_flags(dynamics.contact_state.has_just_slid)
+    is_stopping = guard == guard_layout.rolling_rate
     is_stopping &= is_still(rates, compute_state_units(dynamics.s)[1], atol)
     for slot_index in reversed(range(2)):
         slide_ends = is_stopping & (slip_signs[slot_index] != 0.0) & ~has_just_slid[slot_index]
-        guard = jnp.where(slide_ends, layout.slip_stop + slot_index, guard)
+        guard = jnp.where(slide_ends, guard_layout.slip_end + slot_index, guard)
     return guard
 
 

@@ -16,11 +16,11 @@ from jaxtyping import Array
 from vrw_jax.contact.contact_modes import ContactMode, Friction, finite_friction, solve_combination
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
+    ContactSlots,
     FreeMotion,
     HubVector,
     LegArray,
     SlotPair,
-    Slots,
     WheelMotion,
     apply_inverse,
     free_acceleration,
@@ -40,7 +40,7 @@ class ContactConfiguration(NamedTuple):
     s: Symbols
     motion: WheelMotion
     friction: Friction  # friction coefficient of the slots' feet
-    slots: Slots
+    contact_slots: ContactSlots
     slot_modes: Array  # `ContactMode` of each slot's foot
     is_held: Array  # whether the leg of each slot is on its stopper
     is_airborne_locked: Array  # whether a leg is in the air on its stopper
@@ -48,7 +48,7 @@ class ContactConfiguration(NamedTuple):
     @property
     def has_fixed_length(self) -> Array:
         """Return whether the length of each leg is fixed by a stopper."""
-        return self.is_airborne_locked | (self.slots.scatter(self.is_held) > 0)
+        return self.is_airborne_locked | (self.contact_slots.scatter(self.is_held) > 0)
 
 
 class ForceSolution(NamedTuple):
@@ -60,7 +60,7 @@ class ForceSolution(NamedTuple):
     normal: SlotPair
     stopper: SlotPair
     pull: SlotPair
-    hub: HubVector
+    hub_vector: HubVector
     painleve_determinant: Array
     length_motion: LegArray  # accelerations of the legs' lengths, or rates after an impact
 
@@ -78,7 +78,7 @@ class _FrozenTerms(NamedTuple):
 
     radial: LegArray  # of leg masses relative to the hub, along the legs
     transverse: LegArray  # of leg masses relative to the hub, transverse to the legs
-    hub: SlotPair  # of the hub, without gravity
+    hub_vector: SlotPair  # of the hub, without gravity
 
 
 class _EquationTangents(NamedTuple):
@@ -86,10 +86,10 @@ class _EquationTangents(NamedTuple):
 
     radial: LegArray
     transverse: LegArray
-    hub: SlotPair
+    hub_vector: SlotPair
     spring_force: LegArray | float  # N
-    foot_transverse: SlotPair
-    foot_radial: SlotPair
+    foot_transverse_motion: SlotPair
+    foot_radial_motion: SlotPair
 
 
 _EquationTangentFn = Callable[
@@ -118,18 +118,22 @@ def solve_configuration(
     - `inertia`: inverse inertia at this posture;
     - `free_motion`: accelerations without contact forces, or velocities without impulses.
     """
-    s, _, friction, slots, slot_modes, is_held, _ = configuration
+    s, _, friction, contact_slots, slot_modes, is_held, _ = configuration
     solution = solve_combination(s, inertia, free_motion, slot_modes, is_held, friction)
     outward_motion = (
         free_motion.leg_motion
-        + inertia.legs.sin * solution.hub[0]
-        + inertia.legs.cos * solution.hub[1]
+        + inertia.leg_directions.sin * solution.hub_vector[0]
+        + inertia.leg_directions.cos * solution.hub_vector[1]
     )
     length_motion = jnp.where(
-        configuration.has_fixed_length, 0.0, outward_motion - slots.scatter(solution.pull) / s.m
+        configuration.has_fixed_length,
+        0.0,
+        outward_motion - contact_slots.scatter(solution.pull) / s.m,
     )
     force_pairs = solution.tangential, solution.normal, solution.stopper, solution.pull
-    return ForceSolution(*force_pairs, solution.hub, solution.painleve_determinant, length_motion)
+    return ForceSolution(
+        *force_pairs, solution.hub_vector, solution.painleve_determinant, length_motion
+    )
 
 
 def _solve_with_free_motion(
@@ -142,11 +146,13 @@ def _solve_with_free_motion(
         opaque_one(configuration.motion),
     )
     inertia = prevent_fusion(
-        make_inverse_inertia(s, motion, configuration.slots, configuration.is_airborne_locked),
+        make_inverse_inertia(
+            s, motion, configuration.contact_slots, configuration.is_airborne_locked
+        ),
         unit_divisor,
     )
     free_motion = prevent_fusion(
-        free_motion_fn(s, motion, configuration.slots, inertia), unit_divisor
+        free_motion_fn(s, motion, configuration.contact_slots, inertia), unit_divisor
     )
     return (
         inertia,
@@ -193,7 +199,7 @@ def _differentiable_solution(
             *equation_tangent_fn(configuration, tangent, inertia, solution),
         )
         free_tangent = free_motion_tangent(
-            inertia, residual.leg_lengths, sum_residual(configuration.slots, residual)
+            inertia, residual.leg_lengths, sum_residual(configuration.contact_slots, residual)
         )
         _, solution_tangent = jax.jvp(
             lambda free_motion: solve_configuration(configuration, inertia, free_motion),
@@ -218,8 +224,8 @@ class ResidualTangent(NamedTuple):
     leg_lengths: LegArray  # effect on each leg's length
     hub_by_leg: tuple[LegArray, LegArray, LegArray]  # effect of each leg on the hub's equations
     hub_without_legs: HubVector  # effect on the hub's equations without the legs
-    foot_transverse: SlotPair
-    foot_radial: SlotPair
+    foot_transverse_motion: SlotPair
+    foot_radial_motion: SlotPair
     friction_force: SlotPair  # tangent of the friction force by its coefficient
     pull: SlotPair  # tangent by friction and rotation of the slots' legs
 
@@ -237,11 +243,11 @@ def residual_jvp(
     - `frozen`: terms that are constant;
     - `equation_tangents`: tangents of the equations with these terms constant.
     """
-    s, ds, slots, (sin, cos), slot_indices = (
+    s, ds, contact_slots, (sin, cos), slot_indices = (
         configuration.s,
         tangent.s,
-        configuration.slots,
-        inertia.legs,
+        configuration.contact_slots,
+        inertia.leg_directions,
         range(2),
     )
     b, db, dtheta = configuration.motion.L - s.a, tangent.motion.L - ds.a, tangent.motion.theta
@@ -254,7 +260,12 @@ def residual_jvp(
         if isinstance(coefficient_tangent, tuple)
         else (coefficient_tangent, coefficient_tangent)
     )
-    t, n, L, dL = solution.tangential, solution.normal, inertia.L, slots.gather(tangent.motion.L)
+    t, n, L, dL = (
+        solution.tangential,
+        solution.normal,
+        inertia.L,
+        contact_slots.gather(tangent.motion.L),
+    )
     friction_tangent = [-slip_signs[i] * coefficient_tangent[i] * n[i] for i in slot_indices]
     transverse = [t[i] * inertia.cos[i] - n[i] * inertia.sin[i] for i in slot_indices]
     radial = [t[i] * inertia.sin[i] + n[i] * inertia.cos[i] for i in slot_indices]
@@ -264,7 +275,7 @@ def residual_jvp(
         for i in slot_indices
     ]
 
-    (ax, az), (dx, dz) = frozen.hub, equation_tangents.hub
+    (ax, az), (dx, dz) = frozen.hub_vector, equation_tangents.hub_vector
     radial_hub_motion, transverse_residual = (
         sin * ax + cos * az,
         frozen.transverse - cos * ax + sin * az,
@@ -274,7 +285,7 @@ def residual_jvp(
         length_tangent
         + (
             equation_tangents.spring_force
-            - slots.scatter(pull)
+            - contact_slots.scatter(pull)
             + (radial_hub_motion - frozen.radial) * ds.m
         )
         / s.m
@@ -293,15 +304,15 @@ def residual_jvp(
             + ds.m * x,
             s.m * (radial_tangent * cos - equation_tangents.transverse * sin - x * dtheta)
             + ds.m * z,
-            -s.m * torque - ds.m * (b * transverse_residual) - slots.scatter(moment),
+            -s.m * torque - ds.m * (b * transverse_residual) - contact_slots.scatter(moment),
         ),
         hub_without_legs=(
             friction_tangent[0] + friction_tangent[1] - ds.Mt * ax - s.Mt * dx,
             -ds.Mt * az - s.Mt * dz,
             0.0,
         ),
-        foot_transverse=equation_tangents.foot_transverse,
-        foot_radial=equation_tangents.foot_radial,
+        foot_transverse_motion=equation_tangents.foot_transverse_motion,
+        foot_radial_motion=equation_tangents.foot_radial_motion,
         friction_force=(friction_tangent[0], friction_tangent[1]),
         pull=(pull[0], pull[1]),
     )
@@ -310,14 +321,14 @@ def residual_jvp(
 class TotalTangent(NamedTuple):
     """Tangent of the residual, summed over all legs and gathered for the slots."""
 
-    hub: HubVector
+    hub_vector: HubVector
     slot_lengths: SlotPair
-    foot_transverse: SlotPair
-    foot_radial: SlotPair
+    foot_transverse_motion: SlotPair
+    foot_radial_motion: SlotPair
     friction_force: SlotPair
 
 
-def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
+def sum_residual(contact_slots: ContactSlots, residual: ResidualTangent) -> TotalTangent:
     """Return the tangent of the residual, summed over all legs and gathered for the slots."""
     x, z, rotation = (
         sum_over_legs(leg_forces) + other_force
@@ -327,9 +338,9 @@ def sum_residual(slots: Slots, residual: ResidualTangent) -> TotalTangent:
     )
     return TotalTangent(
         (x, z, rotation),
-        slots.gather(residual.leg_lengths),
-        residual.foot_transverse,
-        residual.foot_radial,
+        contact_slots.gather(residual.leg_lengths),
+        residual.foot_transverse_motion,
+        residual.foot_radial_motion,
         residual.friction_force,
     )
 
@@ -344,9 +355,9 @@ def free_motion_tangent(
     - `total_tangent`: tangent of the residual, summed over all legs.
     """
     hub_tangent, slot_lengths, (u, v) = (
-        apply_inverse(inertia.inverse_inertia, total_tangent.hub),
+        apply_inverse(inertia.inverse_inertia, total_tangent.hub_vector),
         total_tangent.slot_lengths,
-        total_tangent.foot_radial,
+        total_tangent.foot_radial_motion,
     )
     e = [
         inertia.cos[i] * hub_tangent[0]
@@ -354,7 +365,7 @@ def free_motion_tangent(
         - inertia.L[i] * hub_tangent[2]
         for i in range(2)
     ]
-    e = [e[i] + total_tangent.foot_transverse[i] for i in range(2)]
+    e = [e[i] + total_tangent.foot_transverse_motion[i] for i in range(2)]
     return FreeMotion(
         hub_tangent,
         leg_motion,
@@ -373,9 +384,9 @@ def motion_equation_tangents(
     """Return the accelerations that are held constant, and the tangents of the equations of
     motion.
     """
-    s, motion, slots = configuration.s, configuration.motion, configuration.slots
+    s, motion, contact_slots = configuration.s, configuration.motion, configuration.contact_slots
     ds, motion_tangent, dtheta = tangent.s, tangent.motion, tangent.motion.theta
-    b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub[2]
+    b, db, ddtheta = motion.L - s.a, motion_tangent.L - ds.a, solution.hub_vector[2]
     squared_rate, twice_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
     squared_rate_tangent = twice_rate * motion_tangent.dtheta
     twice_rate_tangent = 2.0 * motion_tangent.dtheta
@@ -386,13 +397,16 @@ def motion_equation_tangents(
     frozen = _FrozenTerms(
         radial=solution.length_motion - b * squared_rate,
         transverse=twice_rate * motion.dL + b * ddtheta,
-        hub=(solution.hub[0] - s.g * s.sin_phi, solution.hub[1] + s.g * s.cos_phi),
+        hub_vector=(
+            solution.hub_vector[0] - s.g * s.sin_phi,
+            solution.hub_vector[1] + s.g * s.cos_phi,
+        ),
     )
     L, dL, slot_rates, slot_rate_tangents = (
         inertia.L,
-        *map(slots.gather, (motion_tangent.L, motion.dL, motion_tangent.dL)),
+        *map(contact_slots.gather, (motion_tangent.L, motion.dL, motion_tangent.dL)),
     )
-    slot_accelerations = slots.gather(solution.length_motion)
+    slot_accelerations = contact_slots.gather(solution.length_motion)
     foot_transverse = [
         (L[i] * squared_rate - slot_accelerations[i]) * dtheta
         - twice_rate * slot_rate_tangents[i]
@@ -409,10 +423,10 @@ def motion_equation_tangents(
     return frozen, _EquationTangents(
         radial=-(db * squared_rate + b * squared_rate_tangent),
         transverse=twice_rate * motion_tangent.dL + motion.dL * twice_rate_tangent + ddtheta * db,
-        hub=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
+        hub_vector=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
         spring_force=spring_force_tangent,
-        foot_transverse=(foot_transverse[0], foot_transverse[1]),
-        foot_radial=(foot_radial[0], foot_radial[1]),
+        foot_transverse_motion=(foot_transverse[0], foot_transverse[1]),
+        foot_radial_motion=(foot_radial[0], foot_radial[1]),
     )
 
 
@@ -428,25 +442,28 @@ def _impact_equation_tangents(
     s = configuration.s
     motion = configuration.motion
     motion_tangent = tangent.motion
-    slots = configuration.slots
-    dtheta_after = solution.hub[2]
+    contact_slots = configuration.contact_slots
+    dtheta_after = solution.hub_vector[2]
     rate_jump, b = dtheta_after - motion.dtheta, motion.L - s.a
     frozen = _FrozenTerms(
         radial=solution.length_motion - motion.dL,
         transverse=b * rate_jump,
-        hub=(solution.hub[0] - motion.vx, solution.hub[1] - motion.vz),
+        hub_vector=(solution.hub_vector[0] - motion.vx, solution.hub_vector[1] - motion.vz),
     )
-    slot_rates, dL = slots.gather(solution.length_motion), slots.gather(motion_tangent.L)
+    slot_rates, dL = (
+        contact_slots.gather(solution.length_motion),
+        contact_slots.gather(motion_tangent.L),
+    )
     foot_transverse = [
         -dtheta_after * dL[i] - slot_rates[i] * motion_tangent.theta for i in range(2)
     ]
     return frozen, _EquationTangents(
         radial=-motion_tangent.dL,
         transverse=(motion_tangent.L - tangent.s.a) * rate_jump - b * motion_tangent.dtheta,
-        hub=(-motion_tangent.vx, -motion_tangent.vz),
+        hub_vector=(-motion_tangent.vx, -motion_tangent.vz),
         spring_force=0.0,
-        foot_transverse=(foot_transverse[0], foot_transverse[1]),
-        foot_radial=(
+        foot_transverse_motion=(foot_transverse[0], foot_transverse[1]),
+        foot_radial_motion=(
             inertia.L[0] * dtheta_after * motion_tangent.theta,
             inertia.L[1] * dtheta_after * motion_tangent.theta,
         ),

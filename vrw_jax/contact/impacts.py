@@ -36,10 +36,10 @@ from vrw_jax.contact.dynamics_jvp import (
 )
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
+    ContactSlots,
     FreeMotion,
     LegArray,
     SlotPair,
-    Slots,
     WheelMotion,
     find_slots,
     foot_heights,
@@ -80,26 +80,26 @@ def _leg_indices(n: int, reference: Array) -> np.ndarray:
     return np.arange(n, dtype=np.int32).reshape(-1, *(1,) * jnp.ndim(reference))
 
 
-def classify_event(layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
+def classify_event(guard_layout: GuardLayout, guard: Int[Array, "..."]) -> Event:
     """Return the event of a guard, from the guard's index in `layout`."""
-    n = layout.n_legs
+    n = guard_layout.n_legs
     select_flags = lambda first_index, n_guards: (
         guard == first_index + _leg_indices(n_guards, guard)
     )
     leaves_stopper = (
-        select_flags(layout.airborne_release, n)
-        if layout.n_guards > layout.airborne_release
-        else select_flags(layout.landing, n) & False
+        select_flags(guard_layout.airborne_release, n)
+        if guard_layout.n_guards > guard_layout.airborne_release
+        else select_flags(guard_layout.landing, n) & False
     )
     return Event(
-        lands=select_flags(layout.landing, n),
-        meets_stopper=select_flags(layout.stopper, n),
+        lands=select_flags(guard_layout.landing, n),
+        meets_stopper=select_flags(guard_layout.stopper, n),
         leaves_stopper=leaves_stopper,
-        lifts_off=select_flags(layout.liftoff, 2),
-        slides_up=select_flags(layout.slip_up, 2),
-        slides_down=select_flags(layout.slip_down, 2),
-        stops_sliding=select_flags(layout.slip_stop, 2),
-        releases_stopper=select_flags(layout.stopper_release, 2),
+        lifts_off=select_flags(guard_layout.liftoff, 2),
+        slides_up=select_flags(guard_layout.slip_up, 2),
+        slides_down=select_flags(guard_layout.slip_down, 2),
+        stops_sliding=select_flags(guard_layout.slip_end, 2),
+        releases_stopper=select_flags(guard_layout.stopper_release, 2),
     )
 
 
@@ -116,7 +116,7 @@ class ContactLaw(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PivotOptions:
+class StopperPivotOptions:
     """Options of the search for the stoppers that hold their legs.
 
     Few pivots suffice unless friction couples legs.
@@ -130,7 +130,7 @@ class PivotOptions:
     """Largest number of legs whose combinations are enumerated if pivoting fails."""
 
 
-PIVOT_OPTIONS = PivotOptions()
+STOPPER_PIVOT_OPTIONS = StopperPivotOptions()
 
 
 class _LevelSolution(NamedTuple):
@@ -149,12 +149,12 @@ _LevelSolver = Callable[[ContactLaw, WheelMotion, Array, ChosenCombination | Non
 
 def _solve_stopper_lcp(
     solve: _LevelSolver,
-    law: ContactLaw,
+    contact_law: ContactLaw,
     motion: WheelMotion,
     is_at_stopper: Array,
     is_tested: Array,
     tolerances: SignTolerances,
-    pivot_options: PivotOptions = PIVOT_OPTIONS,
+    pivot_options: StopperPivotOptions = STOPPER_PIVOT_OPTIONS,
 ) -> tuple[_LevelSolution, Array]:
     """Return the solution for the legs in the air that are held, and whether each leg is held.
 
@@ -165,7 +165,7 @@ def _solve_stopper_lcp(
     enumerated. The least violating solution is returned. That solution is admissible if its
     violation is at most `MAX_VIOLATION`.
     """
-    constant_inputs = stop_gradients((law, motion))
+    constant_inputs = stop_gradients((contact_law, motion))
     tested_rank = jnp.cumsum(is_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
         jnp.sum(is_tested, axis=0, dtype=jnp.int32), pivot_options.max_enumerated_legs
@@ -236,7 +236,7 @@ def _solve_stopper_lcp(
     chosen_combination = chosen_combination._replace(
         n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
     )
-    return solve(law, motion, is_held, chosen_combination), is_held
+    return solve(contact_law, motion, is_held, chosen_combination), is_held
 
 
 class EventResult(NamedTuple):
@@ -256,39 +256,41 @@ class EventResult(NamedTuple):
 
 def _motion_after_impact(motion: WheelMotion, solution: ForceSolution) -> WheelMotion:
     """Return the motion with the velocities of an impact's solution."""
-    vx, vz, dtheta = solution.hub
+    vx, vz, dtheta = solution.hub_vector
     return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=solution.length_motion)
 
 
 def _apply_restitution(
-    law: ContactLaw,
+    contact_law: ContactLaw,
     motion: WheelMotion,
-    slots: Slots,
+    contact_slots: ContactSlots,
     inertia: ContactInverseInertia,
     free_motion: FreeMotion,
 ) -> FreeMotion:
     """Return the velocities without impulses, changed by the rebound of striking feet by Newton's
     law.
     """
-    if law.restitution is None:
+    if contact_law.restitution is None:
         return free_motion
-    rebound_speeds = [law.restitution * z for z in foot_velocity(motion, slots, inertia).z]
+    rebound_speeds = [
+        contact_law.restitution * z for z in foot_velocity(motion, contact_slots, inertia).z
+    ]
     # A foot whose rebound is slower than the rest speed is at rest.
-    rebound_speeds = [jnp.where(z < -law.rest_speed, z, 0.0) for z in rebound_speeds]
+    rebound_speeds = [jnp.where(z < -contact_law.rest_speed, z, 0.0) for z in rebound_speeds]
     return free_motion._replace(
-        foot_transverse=(
-            free_motion.foot_transverse[0] - inertia.sin[0] * rebound_speeds[0],
-            free_motion.foot_transverse[1] - inertia.sin[1] * rebound_speeds[1],
+        foot_transverse_motion=(
+            free_motion.foot_transverse_motion[0] - inertia.sin[0] * rebound_speeds[0],
+            free_motion.foot_transverse_motion[1] - inertia.sin[1] * rebound_speeds[1],
         ),
-        foot_radial=(
-            free_motion.foot_radial[0] + inertia.cos[0] * rebound_speeds[0],
-            free_motion.foot_radial[1] + inertia.cos[1] * rebound_speeds[1],
+        foot_radial_motion=(
+            free_motion.foot_radial_motion[0] + inertia.cos[0] * rebound_speeds[0],
+            free_motion.foot_radial_motion[1] + inertia.cos[1] * rebound_speeds[1],
         ),
     )
 
 
 def _limit_energy_gain(
-    law: ContactLaw,
+    contact_law: ContactLaw,
     motion: WheelMotion,
     newton_solution: _LevelSolution,
     inelastic_solution: _LevelSolution,
@@ -300,7 +302,7 @@ def _limit_energy_gain(
     energy. The result is the largest part of the rebound without an energy gain. Impulses stay in
     the cone of friction, because the cone is convex.
     """
-    compute_energy = lambda motion_state: kinetic_energy(law.s, motion_state)
+    compute_energy = lambda motion_state: kinetic_energy(contact_law.s, motion_state)
     energy_inelastic, energy_newton = (
         compute_energy(inelastic_solution.motion),
         compute_energy(newton_solution.motion),
@@ -332,20 +334,25 @@ def _limit_energy_gain(
 
 
 def _solve_velocity_level(
-    law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
-) -> tuple[_LevelSolution, Slots, Bool[Array, "n ..."]]:
+    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
+) -> tuple[_LevelSolution, ContactSlots, Bool[Array, "n ..."]]:
     """Return the solution of a simultaneous inelastic impact, with Coulomb's law for impulses.
 
     The result is (solution, slots, held legs in the air). With one-sided stoppers, held legs are
     those whose stoppers need not pull. The paper's rule keeps resting feet planted when a leg meets
     its stopper.
     """
-    s, slots = law.s, find_slots((contact_state.contact_modes != ContactMode.OFF) | event.lands)
-    friction = slot_friction(law.friction, slots)
+    s, contact_slots = (
+        contact_law.s,
+        find_slots((contact_state.contact_modes != ContactMode.OFF) | event.lands),
+    )
+    friction = slot_friction(contact_law.friction, contact_slots)
     is_at_stopper = contact_state.locked | event.meets_stopper
-    is_loaded = jnp.stack([jnp.any(slots.first_mask, axis=0), jnp.any(slots.second_mask, axis=0)])
-    slot_locked = slots.gather_flags(is_at_stopper)
-    slot_modes = slots.gather_codes(contact_state.contact_modes)
+    is_loaded = jnp.stack(
+        [jnp.any(contact_slots.first_mask, axis=0), jnp.any(contact_slots.second_mask, axis=0)]
+    )
+    slot_locked = contact_slots.gather_flags(is_at_stopper)
+    slot_modes = contact_slots.gather_codes(contact_state.contact_modes)
     is_landing = jnp.any(event.lands, axis=0)
     is_planted = (
         (slot_modes == ContactMode.STICK)
@@ -366,36 +373,44 @@ def _solve_velocity_level(
         is_open_untested=~slot_locked,
     )
     tolerances = SignTolerances(
-        s.m * law.rest_speed / MAX_VIOLATION, law.rest_speed / MAX_VIOLATION
+        s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
     )
 
     def solve(
-        law: ContactLaw,
+        contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
         chosen_combination: ChosenCombination | None,
     ) -> _LevelSolution:
-        s, friction = law.s, slot_friction(law.friction, slots)
+        s, friction = contact_law.s, slot_friction(contact_law.friction, contact_slots)
         directions = leg_directions(s, motion.theta)
-        inertia = make_inverse_inertia(s, motion, slots, is_airborne_locked)
-        free_motion = free_velocity(s, motion, slots, inertia)
-        rebound_motion = _apply_restitution(law, motion, slots, inertia, free_motion)
+        inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        free_motion = free_velocity(s, motion, contact_slots, inertia)
+        rebound_motion = _apply_restitution(
+            contact_law, motion, contact_slots, inertia, free_motion
+        )
         if chosen_combination is None:
             chosen_combination = choose_combination(
-                s, inertia, rebound_motion, allowed, friction, tolerances, law.counts_solutions
+                s,
+                inertia,
+                rebound_motion,
+                allowed,
+                friction,
+                tolerances,
+                contact_law.counts_solutions,
             )
         configuration = ContactConfiguration(
             s,
             motion,
             friction,
-            slots,
+            contact_slots,
             chosen_combination.slot_modes,
             chosen_combination.is_held,
             is_airborne_locked,
         )
         solution = (
             solve_impact(configuration)
-            if law.restitution is None
+            if contact_law.restitution is None
             else solve_configuration(configuration, inertia, rebound_motion)
         )
         motion_after = _motion_after_impact(motion, solution)
@@ -403,14 +418,18 @@ def _solve_velocity_level(
         impulse = s.m * (directions.sin * jump_x + directions.cos * jump_z + motion.dL)
         return _LevelSolution(chosen_combination, solution, impulse, motion_after.dL, motion_after)
 
-    is_airborne_locked = is_at_stopper & ~slots.is_filled
-    if not law.is_one_sided:
-        return solve(law, motion, is_airborne_locked, None), slots, is_airborne_locked
+    is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
+    if not contact_law.is_one_sided:
+        return (
+            solve(contact_law, motion, is_airborne_locked, None),
+            contact_slots,
+            is_airborne_locked,
+        )
     is_tested = is_airborne_locked & event.is_impact
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve, law, motion, is_airborne_locked, is_tested, tolerances
+        solve, contact_law, motion, is_airborne_locked, is_tested, tolerances
     )
-    return level_solution, slots, is_held_airborne
+    return level_solution, contact_slots, is_held_airborne
 
 
 def _following_modes(
@@ -459,12 +478,12 @@ accurate to round-off."""
 
 
 def _solve_acceleration_level(
-    law: ContactLaw,
+    contact_law: ContactLaw,
     motion: WheelMotion,
     contact_modes: Int[Array, "n ..."],
     is_at_stopper: Array,
     event: Event,
-) -> tuple[ChosenCombination, Slots, Array, Bool[Array, "n ..."]]:
+) -> tuple[ChosenCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
     """Return the contact modes and stoppers of the following motion, at the acceleration level.
 
     The result is (combination, slots, feet that were at rest, held legs in the air). The contact
@@ -472,10 +491,13 @@ def _solve_acceleration_level(
     is followed by the mode of its release, if that is consistent (see `is_release_consistent`). The
     result has no derivatives.
     """
-    law, motion = stop_gradients((law, motion))
-    s, slots = law.s, find_slots(contact_modes != ContactMode.OFF)
-    friction = slot_friction(law.friction, slots)
-    slot_modes, slot_locked = slots.gather_codes(contact_modes), slots.gather_flags(is_at_stopper)
+    contact_law, motion = stop_gradients((contact_law, motion))
+    s, contact_slots = contact_law.s, find_slots(contact_modes != ContactMode.OFF)
+    friction = slot_friction(contact_law.friction, contact_slots)
+    slot_modes, slot_locked = (
+        contact_slots.gather_codes(contact_modes),
+        contact_slots.gather_flags(is_at_stopper),
+    )
     was_resting = (slot_modes == ContactMode.STICK) | event.stops_sliding
     # When such a foot is released, its tangential force jumps to zero.
     follows_paper_rule = (slot_modes == ContactMode.STICK) & (
@@ -489,13 +511,13 @@ def _solve_acceleration_level(
     tolerances = SignTolerances(FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g)
 
     def solve(
-        law: ContactLaw,
+        contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
         chosen_combination: ChosenCombination | None,
     ) -> _LevelSolution:
-        inertia = make_inverse_inertia(s, motion, slots, is_airborne_locked)
-        free_motion = free_acceleration(s, motion, slots, inertia)
+        inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_locked)
+        free_motion = free_acceleration(s, motion, contact_slots, inertia)
         if chosen_combination is None:
             is_consistent = is_release_consistent(
                 s,
@@ -513,40 +535,44 @@ def _solve_acceleration_level(
                 possible_modes, ~may_leave_stopper, was_resting & False, untested, may_leave_stopper
             )
             chosen_combination = choose_combination(
-                s, inertia, free_motion, allowed, friction, tolerances, law.counts_solutions
+                s, inertia, free_motion, allowed, friction, tolerances, contact_law.counts_solutions
             )
         configuration = ContactConfiguration(
             s,
             motion,
             friction,
-            slots,
+            contact_slots,
             chosen_combination.slot_modes,
             chosen_combination.is_held,
             is_airborne_locked,
         )
         solution = solve_configuration(configuration, inertia, free_motion)
-        ax, az, _ = solution.hub
-        outward = free_motion.leg_motion + inertia.legs.sin * ax + inertia.legs.cos * az
+        ax, az, _ = solution.hub_vector
+        outward = (
+            free_motion.leg_motion
+            + inertia.leg_directions.sin * ax
+            + inertia.leg_directions.cos * az
+        )
         return _LevelSolution(chosen_combination, solution, s.m * outward, outward, motion)
 
-    is_airborne_locked = is_at_stopper & ~slots.is_filled
-    if not law.is_one_sided:
+    is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
+    if not contact_law.is_one_sided:
         return (
-            solve(law, motion, is_airborne_locked, None).chosen_combination,
-            slots,
+            solve(contact_law, motion, is_airborne_locked, None).chosen_combination,
+            contact_slots,
             was_resting,
             is_airborne_locked,
         )
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve, law, motion, is_airborne_locked, is_airborne_locked, tolerances
+        solve, contact_law, motion, is_airborne_locked, is_airborne_locked, tolerances
     )
-    return level_solution.chosen_combination, slots, was_resting, is_held_airborne
+    return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
 
 
 def _bring_to_rest(
-    law: ContactLaw,
+    contact_law: ContactLaw,
     motion: WheelMotion,
-    slots: Slots,
+    contact_slots: ContactSlots,
     contact_modes: Array,
     is_at_stopper: Array,
     was_locked: Array,
@@ -560,19 +586,21 @@ def _bring_to_rest(
 
     - `was_locked`: legs that were at their stoppers.
     """
-    directions = leg_directions(law.s, motion.theta)
+    directions = leg_directions(contact_law.s, motion.theta)
     tangential_speed, normal_speed = foot_speeds(motion, directions)
-    stays_loaded = slots.is_filled & (normal_speed < law.rest_speed)
+    stays_loaded = contact_slots.is_filled & (normal_speed < contact_law.rest_speed)
     slip_mode = jnp.where(tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
-    rest_modes = jnp.where(jnp.abs(tangential_speed) < law.rest_speed, ContactMode.STICK, slip_mode)
+    rest_modes = jnp.where(
+        jnp.abs(tangential_speed) < contact_law.rest_speed, ContactMode.STICK, slip_mode
+    )
     rest_modes = jnp.where(
         stays_loaded,
         jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, rest_modes),
         ContactMode.OFF,
     )
-    is_locked = is_at_stopper | (was_locked & (jnp.abs(motion.dL) < law.rest_speed))
+    is_locked = is_at_stopper | (was_locked & (jnp.abs(motion.dL) < contact_law.rest_speed))
     has_changed = jnp.any((rest_modes != contact_modes) | (is_locked != is_at_stopper), axis=0)
-    s, frozen_motion, friction = stop_gradients((law.s, motion, law.friction))
+    s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
 
     def find_reversed_slip(_: Array) -> Array:
         """Return the feet whose slip would be reversed by the projection. These feet also come to
@@ -591,7 +619,9 @@ def _bring_to_rest(
     rest_modes = jnp.where(is_slip_reversed, ContactMode.STICK, rest_modes)
     return (
         tree_where(
-            has_changed, project_motion(law.s, motion, rest_modes, is_locked, law.friction), motion
+            has_changed,
+            project_motion(contact_law.s, motion, rest_modes, is_locked, contact_law.friction),
+            motion,
         ),
         rest_modes,
         is_locked,
@@ -599,18 +629,18 @@ def _bring_to_rest(
 
 
 def _merge_touching(
-    law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
+    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> Event:
     """Return the event extended to all contacts that touch, whether or not their guards are zero.
 
     A contact touches if its distance is below the smallest resolved bounce and it does not
     separate. If such contacts were resolved one by one, they would push each other off forever.
     """
-    s, directions = law.s, leg_directions(law.s, motion.theta)
-    bounce_height = law.rest_speed**2 / (2.0 * s.g)
-    heights = foot_heights(motion, directions, law.tilt)
+    s, directions = contact_law.s, leg_directions(contact_law.s, motion.theta)
+    bounce_height = contact_law.rest_speed**2 / (2.0 * s.g)
+    heights = foot_heights(motion, directions, contact_law.tilt)
     is_touching = (heights <= bounce_height) & (
-        foot_speeds(motion, directions)[1] <= law.rest_speed
+        foot_speeds(motion, directions)[1] <= contact_law.rest_speed
     )
     lands = event.lands | (
         is_touching & (contact_state.contact_modes == ContactMode.OFF) & event.is_impact
@@ -619,7 +649,7 @@ def _merge_touching(
         jnp.sum(lands | (contact_state.contact_modes != ContactMode.OFF), axis=0, dtype=jnp.int32)
         <= 2
     )
-    is_extended = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -law.rest_speed)
+    is_extended = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
     meets_stopper = event.meets_stopper | (is_extended & ~contact_state.locked & event.is_impact)
     return event._replace(
         lands=jnp.where(fits_slots, lands, event.lands), meets_stopper=meets_stopper
@@ -627,30 +657,32 @@ def _merge_touching(
 
 
 def _liftoff_to_slip(
-    law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
+    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> Event:
     """Return the event with lift-off replaced by slip, in the limit of large friction.
 
     A resting foot whose normal force vanishes begins to slide against the direction of its
     tangential force.
     """
-    law, motion = stop_gradients((law, motion))
-    slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
+    contact_law, motion = stop_gradients((contact_law, motion))
+    contact_slots = find_slots(contact_state.contact_modes != ContactMode.OFF)
     friction, slot_modes = (
-        slot_friction(law.friction, slots),
-        slots.gather_codes(contact_state.contact_modes),
+        slot_friction(contact_law.friction, contact_slots),
+        contact_slots.gather_codes(contact_state.contact_modes),
     )
     begins_slip = (
         event.lifts_off & (slot_modes == ContactMode.STICK) & (stack_friction(friction) == jnp.inf)
     )
     slot_state = (
-        slots,
+        contact_slots,
         slot_modes,
-        slots.gather_flags(contact_state.locked),
-        contact_state.locked & ~slots.is_filled,
+        contact_slots.gather_flags(contact_state.locked),
+        contact_state.locked & ~contact_slots.is_filled,
     )
     tangential_forces = lambda _: (
-        solve_contact_forces(ContactConfiguration(law.s, motion, friction, *slot_state)).tangential
+        solve_contact_forces(
+            ContactConfiguration(contact_law.s, motion, friction, *slot_state)
+        ).tangential
     )
     zeros = jnp.zeros_like(motion.theta), jnp.zeros_like(motion.theta)
     is_uphill = jnp.stack(run_if_any(jnp.any(begins_slip), tangential_forces, zeros)) > 0.0
@@ -662,46 +694,59 @@ def _liftoff_to_slip(
 
 
 def resolve_event(
-    law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
+    contact_law: ContactLaw, motion: WheelMotion, contact_state: ContactState, event: Event
 ) -> EventResult:
     """Return motion, contact state, impulses and lost energy after an event."""
     event = _merge_touching(
-        law, motion, contact_state, _liftoff_to_slip(law, motion, contact_state, event)
+        contact_law,
+        motion,
+        contact_state,
+        _liftoff_to_slip(contact_law, motion, contact_state, event),
     )
-    s, is_impact = law.s, event.is_impact
+    s, is_impact = contact_law.s, event.is_impact
     was_touching = (contact_state.contact_modes != ContactMode.OFF) | event.lands
     was_locked = (contact_state.locked | event.meets_stopper) & ~event.leaves_stopper
-    velocity_solution, slots, is_held = _solve_velocity_level(law, motion, contact_state, event)
-    if law.restitution is not None:
+    velocity_solution, contact_slots, is_held = _solve_velocity_level(
+        contact_law, motion, contact_state, event
+    )
+    if contact_law.restitution is not None:
         inelastic_solution = _solve_velocity_level(
-            law._replace(restitution=None), motion, contact_state, event
+            contact_law._replace(restitution=None), motion, contact_state, event
         )[0]
-        velocity_solution = _limit_energy_gain(law, motion, velocity_solution, inelastic_solution)
-    impact_modes = slots.scatter(velocity_solution.chosen_combination.slot_modes).astype(jnp.int32)
+        velocity_solution = _limit_energy_gain(
+            contact_law, motion, velocity_solution, inelastic_solution
+        )
+    impact_modes = contact_slots.scatter(velocity_solution.chosen_combination.slot_modes).astype(
+        jnp.int32
+    )
     stays_locked = jnp.where(
-        slots.is_filled,
-        slots.scatter(velocity_solution.chosen_combination.is_held) > 0,
+        contact_slots.is_filled,
+        contact_slots.scatter(velocity_solution.chosen_combination.is_held) > 0,
         was_locked & is_held,
     )
-    if law.restitution is not None:  # Only a part of the impulse may act.
-        stays_locked = stays_locked & (jnp.abs(velocity_solution.motion.dL) < law.rest_speed)
+    if contact_law.restitution is not None:  # Only a part of the impulse may act.
+        stays_locked = stays_locked & (
+            jnp.abs(velocity_solution.motion.dL) < contact_law.rest_speed
+        )
     rest_result = _bring_to_rest(
-        law, velocity_solution.motion, slots, impact_modes, stays_locked, was_locked
+        contact_law, velocity_solution.motion, contact_slots, impact_modes, stays_locked, was_locked
     )
     motion_after, contact_modes, is_at_stopper = tree_where(
         is_impact, rest_result, (motion, contact_state.contact_modes, was_locked)
     )
     directions = leg_directions(s, motion.theta)
-    has_no_slot = was_touching & ~slots.is_filled
+    has_no_slot = was_touching & ~contact_slots.is_filled
     energy_lost = kinetic_energy(s, motion) - kinetic_energy(s, motion_after)
     stopper_impulse = jnp.where(is_held, velocity_solution.stopper_push, jnp.inf)
 
-    acceleration_solution, slots, was_resting, is_held = _solve_acceleration_level(
-        law, motion_after, contact_modes, is_at_stopper, event
+    acceleration_solution, contact_slots, was_resting, is_held = _solve_acceleration_level(
+        contact_law, motion_after, contact_modes, is_at_stopper, event
     )
-    contact_modes = slots.scatter(acceleration_solution.slot_modes).astype(jnp.int32)
+    contact_modes = contact_slots.scatter(acceleration_solution.slot_modes).astype(jnp.int32)
     is_locked = jnp.where(
-        slots.is_filled, slots.scatter(acceleration_solution.is_held) > 0, is_at_stopper & is_held
+        contact_slots.is_filled,
+        contact_slots.scatter(acceleration_solution.is_held) > 0,
+        is_at_stopper & is_held,
     )
     is_sliding = (acceleration_solution.slot_modes == ContactMode.SLIP_DOWN) | (
         acceleration_solution.slot_modes == ContactMode.SLIP_UP
@@ -711,7 +756,7 @@ def resolve_event(
         locked=is_locked,
         has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
         has_just_unlocked=(contact_state.locked | event.meets_stopper) & ~is_locked,
-        has_just_slid=slots.scatter(is_sliding & was_resting) > 0,
+        has_just_slid=contact_slots.scatter(is_sliding & was_resting) > 0,
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
     n_force_solutions = acceleration_solution.n_solutions
@@ -763,17 +808,20 @@ def project_motion(
         (contact_modes != ContactMode.OFF) & ~is_locked, motion.z / directions.cos, motion.L
     )
     motion = motion._replace(L=jnp.where(is_locked, s.L0, L))
-    slots = find_slots(contact_modes != ContactMode.OFF)
-    is_airborne_locked = is_locked & ~slots.is_filled
-    slot_modes, is_held = slots.gather_codes(contact_modes), slots.gather_flags(is_locked)
+    contact_slots = find_slots(contact_modes != ContactMode.OFF)
+    is_airborne_locked = is_locked & ~contact_slots.is_filled
+    slot_modes, is_held = (
+        contact_slots.gather_codes(contact_modes),
+        contact_slots.gather_flags(is_locked),
+    )
     # Two resting feet on two held legs would constrain the hub twice.
     is_overdetermined = jnp.all((slot_modes == ContactMode.STICK) & is_held, axis=0)
     is_held = jnp.stack([is_held[0], is_held[1] & ~is_overdetermined])
     slot_coefficients = (
-        jnp.zeros_like(motion.theta) if friction is None else slot_friction(friction, slots)
+        jnp.zeros_like(motion.theta) if friction is None else slot_friction(friction, contact_slots)
     )
     configuration = ContactConfiguration(
-        s, motion, slot_coefficients, slots, slot_modes, is_held, is_airborne_locked
+        s, motion, slot_coefficients, contact_slots, slot_modes, is_held, is_airborne_locked
     )
     projected_motion = _motion_after_impact(motion, solve_impact(configuration))
     return projected_motion._replace(dL=jnp.where(is_locked, 0.0, projected_motion.dL))

@@ -89,7 +89,7 @@ def stop_gradients(tree: Any) -> Any:
     return eqx.combine(lax.stop_gradient(float_leaves), other_leaves)
 
 
-class Slots(NamedTuple):
+class ContactSlots(NamedTuple):
     """Masks of the two legs whose feet may be loaded, fore first.
 
     The mask of an empty slot is False for all legs.
@@ -135,13 +135,15 @@ class Slots(NamedTuple):
         )
 
 
-def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> Slots:
+def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
     """Return the slots of the first two legs whose feet touch the ground."""
     touching_rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
-    return Slots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
+    return ContactSlots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
 
 
-def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise | SlotPair:
+def slot_friction(
+    friction: Elementwise | SlotPair, contact_slots: ContactSlots
+) -> Elementwise | SlotPair:
     """Return the friction coefficient of each slot's foot, or the common one.
 
     A pair `friction` holds the coefficient of the foot that landed last, Leg 1's, and that of all
@@ -150,13 +152,13 @@ def slot_friction(friction: Elementwise | SlotPair, slots: Slots) -> Elementwise
     if not isinstance(friction, tuple):
         return friction
     last_friction, other_friction = friction
-    return jnp.where(slots.first_mask[0], last_friction, other_friction), other_friction
+    return jnp.where(contact_slots.first_mask[0], last_friction, other_friction), other_friction
 
 
 class ContactInverseInertia(NamedTuple):
     """Inverse inertia of the hub, and responses of hub and slots to the slots' forces."""
 
-    legs: LegDirections
+    leg_directions: LegDirections
     is_released: Bool[Array, " n_legs"]  # whether a leg is eliminated: free in length, or in a slot
     inverse_inertia: tuple[Any, ...]  # xx, xz, x theta, zz, z theta, theta theta
     sin: SlotPair
@@ -209,32 +211,32 @@ def _invert_inertia(
 class Posture(NamedTuple):
     """Directions of all legs, and directions and lengths of the slots' legs."""
 
-    legs: LegDirections
+    leg_directions: LegDirections
     sin: SlotPair
     cos: SlotPair
     L: SlotPair
 
 
-def make_posture(s: Symbols, motion: WheelMotion, slots: Slots) -> Posture:
+def make_posture(s: Symbols, motion: WheelMotion, contact_slots: ContactSlots) -> Posture:
     """Return the directions of all legs, and the directions and lengths of the slots' legs."""
     directions = leg_directions(s, motion.theta)
     return Posture(
         directions,
-        slots.gather(directions.sin),
-        slots.gather(directions.cos),
-        slots.gather(motion.L),
+        contact_slots.gather(directions.sin),
+        contact_slots.gather(directions.cos),
+        contact_slots.gather(motion.L),
     )
 
 
 def make_inverse_inertia(
-    s: Symbols, motion: WheelMotion, slots: Slots, is_airborne_locked: Array
+    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, is_airborne_locked: Array
 ) -> ContactInverseInertia:
     """Return the responses of hub and slots to contact forces at this posture.
 
     - `is_airborne_locked`: whether a leg is in the air on its stopper.
     """
-    directions, sin, cos, L = make_posture(s, motion, slots)
-    is_released = slots.is_filled | ~is_airborne_locked
+    directions, sin, cos, L = make_posture(s, motion, contact_slots)
+    is_released = contact_slots.is_filled | ~is_airborne_locked
     inverse_inertia = _invert_inertia(s, directions, motion.L - s.a, is_released)
     e = [(cos[i], -sin[i], -L[i]) for i in range(2)]
     u = [(sin[i], cos[i], jnp.zeros_like(sin[i])) for i in range(2)]
@@ -265,11 +267,11 @@ def make_inverse_inertia(
 class FreeMotion(NamedTuple):
     """Motion without contact forces: accelerations, or velocities in an impact."""
 
-    hub: HubVector
+    hub_vector: HubVector
     leg_motion: LegArray  # of a released leg's length, minus the part u . hub
     slot_leg_motion: SlotPair  # the same for the slots' legs
-    foot_transverse: SlotPair  # of the slots' feet, transverse to the leg
-    foot_radial: SlotPair  # of the slots' feet, along the leg
+    foot_transverse_motion: SlotPair  # of the slots' feet, transverse to the leg
+    foot_radial_motion: SlotPair  # of the slots' feet, along the leg
 
 
 def free_leg_motion(s: Symbols, motion: WheelMotion, directions: LegDirections) -> LegArray:
@@ -286,18 +288,18 @@ def free_leg_motion(s: Symbols, motion: WheelMotion, directions: LegDirections) 
 
 
 def free_acceleration(
-    s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
+    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, inertia: ContactInverseInertia
 ) -> FreeMotion:
     """Return the accelerations due to gravity, springs, dampers and rotation alone.
 
     The slots' feet and stoppers exert no force.
     """
-    sin, cos = inertia.legs
+    sin, cos = inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
     gx, gz = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration, leg_acceleration = (
         b * dtheta * dtheta,
-        free_leg_motion(s, motion, inertia.legs),
+        free_leg_motion(s, motion, inertia.leg_directions),
     )
     coriolis_acceleration = 2.0 * motion.dL * dtheta
     radial_acceleration = (
@@ -312,8 +314,8 @@ def free_acceleration(
     torque = -s.m * sum_over_legs(b * (coriolis_acceleration + cos * gx - sin * gz))
     hub_acceleration = apply_inverse(inertia.inverse_inertia, (force_x, force_z, torque))
     slot_coriolis, slot_leg_acceleration = (
-        slots.gather(coriolis_acceleration),
-        slots.gather(leg_acceleration),
+        contact_slots.gather(coriolis_acceleration),
+        contact_slots.gather(leg_acceleration),
     )
     foot_transverse = [
         inertia.cos[i] * hub_acceleration[0]
@@ -333,13 +335,13 @@ def free_acceleration(
 
 
 def free_velocity(
-    s: Symbols, motion: WheelMotion, slots: Slots, inertia: ContactInverseInertia
+    s: Symbols, motion: WheelMotion, contact_slots: ContactSlots, inertia: ContactInverseInertia
 ) -> FreeMotion:
     """Return the velocities after an impact without impulses at feet or slots' stoppers.
 
     An airborne leg on its stopper whose length still changes meets the stopper, inelastically.
     """
-    sin, cos = inertia.legs
+    sin, cos = inertia.leg_directions
     b, dtheta = motion.L - s.a, motion.dtheta
     hub_outward = sin * motion.vx + cos * motion.vz
     leg_velocity = jnp.where(inertia.is_released, motion.dL - hub_outward, 0.0)
@@ -351,7 +353,7 @@ def free_velocity(
         b * (cos * motion.vx - sin * motion.vz - transverse_velocity)
     )
     hub_velocity = apply_inverse(inertia.inverse_inertia, (px, pz, angular_momentum))
-    slot_leg_velocity = slots.gather(leg_velocity)
+    slot_leg_velocity = contact_slots.gather(leg_velocity)
     foot_transverse = [
         inertia.cos[i] * hub_velocity[0]
         - inertia.sin[i] * hub_velocity[1]
@@ -375,10 +377,10 @@ class FootVelocity(NamedTuple):
 
 
 def foot_velocity(
-    motion: WheelMotion, slots: Slots, posture: ContactInverseInertia | Posture
+    motion: WheelMotion, contact_slots: ContactSlots, posture: ContactInverseInertia | Posture
 ) -> FootVelocity:
     """Return the velocity of the slots' feet along the slope and normal to the slope, m/s."""
-    dL = slots.gather(motion.dL)
+    dL = contact_slots.gather(motion.dL)
     x = [
         motion.vx - dL[i] * posture.sin[i] - posture.L[i] * motion.dtheta * posture.cos[i]
         for i in range(2)

@@ -308,7 +308,7 @@ def build_contact_step_sampler(
         )
         return sample_interval(dynamics, motion, *sampling_arguments)
 
-    def sample_step(*leaves: Array) -> SampledIntervals:
+    def sample_whole_step(*leaves: Array) -> SampledIntervals:
         wheel, params, *_ = jax.tree.unflatten(argument_structure, leaves)
         initial_state = compiled_start(*leaves)
         log_template = jax.eval_shape(compiled_advance, leaves, initial_state)[1]
@@ -365,7 +365,7 @@ def build_contact_step_sampler(
             ("samples on real ground", cache_key, n_samples),
         )
     )
-    return jax.jit(sample_step)
+    return jax.jit(sample_whole_step)
 
 
 def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[Array, Array, Array]:
@@ -387,9 +387,9 @@ def _unpack_sample_rows(n: int, log: IntervalLog, sample_rows: Array) -> tuple[A
         time_since_event[..., None],
         accumulators,
     ]
-    slots = jax.vmap(lambda contact: find_slots(contact != ContactMode.OFF))(log.contact)
+    contact_slots = jax.vmap(lambda contact: find_slots(contact != ContactMode.OFF))(log.contact)
     scatter_to_legs = jax.vmap(
-        jax.vmap(lambda slots, slot_pair: slots.scatter(slot_pair), (None, 0))
+        jax.vmap(lambda contact_slots, slot_pair: contact_slots.scatter(slot_pair), (None, 0))
     )
-    normal, tangential = (scatter_to_legs(slots, forces[..., i : i + 2]) for i in (0, 2))
+    normal, tangential = (scatter_to_legs(contact_slots, forces[..., i : i + 2]) for i in (0, 2))
     return jnp.concatenate(state_parts, -1), tangential, normal

@@ -93,8 +93,8 @@ def make_contact_law(
 
 
 def process_event(
-    law: ContactLaw,
-    layout: GuardLayout,
+    contact_law: ContactLaw,
+    guard_layout: GuardLayout,
     motion: WheelMotion,
     contact_state: ContactState,
     guard: Int[Array, "..."],
@@ -112,10 +112,14 @@ def process_event(
     projection, the foot would land again immediately.
     """
     ramp_start = max(rest_options.n_events_before_ramp, max_events // 4)
-    law = law._replace(rest_speed=law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0)))
-    motion = project_motion(law.s, motion, contact_state.contact_modes, contact_state.locked)
-    event = classify_event(layout, guard)
-    result = resolve_event(law, motion, contact_state, event)
+    contact_law = contact_law._replace(
+        rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - ramp_start, 0))
+    )
+    motion = project_motion(
+        contact_law.s, motion, contact_state.contact_modes, contact_state.locked
+    )
+    event = classify_event(guard_layout, guard)
+    result = resolve_event(contact_law, motion, contact_state, event)
     outcome = jnp.where(result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
     outcome = jnp.where(result.is_paradox, Outcome.PAINLEVE_PARADOX, outcome)
     outcome = jnp.where(result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
@@ -166,7 +170,7 @@ def add_interval(
 
 def interval_outcome(
     counters: StepCounters,
-    layout: GuardLayout,
+    guard_layout: GuardLayout,
     has_reached_event: Array,
     guard: Array,
     has_landed: Array,
@@ -181,8 +185,8 @@ def interval_outcome(
     `is_resting`, CAME_TO_REST replaces either.
     """
     outcome = jnp.where(counters.n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-    outcome = jnp.where(guard == layout.rolling_rate, Outcome.FELL_BACK, outcome)
-    outcome = jnp.where(guard == layout.collapse, Outcome.COLLAPSED, outcome)
+    outcome = jnp.where(guard == guard_layout.rolling_rate, Outcome.FELL_BACK, outcome)
+    outcome = jnp.where(guard == guard_layout.collapse, Outcome.COLLAPSED, outcome)
     outcome = jnp.where(
         has_reached_event, jnp.where(has_landed, Outcome.STEPPED, outcome), failure_outcome
     )

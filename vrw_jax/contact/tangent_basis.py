@@ -35,13 +35,13 @@ from vrw_jax.contact.dynamics_jvp import (
 )
 from vrw_jax.contact.mechanics import (
     ContactInverseInertia,
+    ContactSlots,
     FootVelocity,
     FreeMotion,
     HubVector,
     LegArray,
     LegDirections,
     SlotPair,
-    Slots,
     WheelMotion,
     foot_velocity,
     make_posture,
@@ -93,14 +93,14 @@ class _UnitLengthResponse(NamedTuple):
     """
 
     leg_lengths: LegArray  # acceleration of the leg's length
-    hub: tuple[LegArray, LegArray, LegArray]
+    hub_vector: tuple[LegArray, LegArray, LegArray]
     slot_responses: tuple[SlotPair, SlotPair, SlotPair, SlotPair]
 
 
 class _LengthResponse(NamedTuple):
     """Response to lengths and length rates of some legs along a tangent."""
 
-    hub: HubVector
+    hub_vector: HubVector
     slot_length: SlotPair  # length of the slots' legs
     slot_length_rate: SlotPair
     damping: Array
@@ -128,15 +128,15 @@ class _PointLinearization(NamedTuple):
 
     def make_leg_residual(
         self, leg_slice: slice
-    ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]:
+    ) -> Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]:
         """Return a function of a tangent to the residual's tangent for some legs, and to the slots
         of these legs.
         """
         static_leaves = eqx.filter(self.configuration, eqx.is_inexact_array, inverse=True)
         configuration = _restrict_legs(self.configuration, leg_slice)
-        directions = LegDirections(*(leg_row[leg_slice] for leg_row in self.inertia.legs))
+        directions = LegDirections(*(leg_row[leg_slice] for leg_row in self.inertia.leg_directions))
         hub = self.inertia._replace(
-            legs=directions, is_released=self.inertia.is_released[leg_slice]
+            leg_directions=directions, is_released=self.inertia.is_released[leg_slice]
         )
         solution = self.solution._replace(length_motion=self.solution.length_motion[leg_slice])
 
@@ -150,20 +150,20 @@ class _PointLinearization(NamedTuple):
             )
             return residual_jvp(*residual_arguments, *motion_equation_tangents(*residual_arguments))
 
-        return lambda tangent: (compute_residual(tangent), configuration.slots)
+        return lambda tangent: (compute_residual(tangent), configuration.contact_slots)
 
     def foot_speed_tangent(self, tangent: WheelMotion) -> SlotPair:
         """Return the tangent of the slots' foot speeds along the slope."""
-        s, slots = self.dynamics.s, self.dynamics.slots
+        s, contact_slots = self.dynamics.s, self.dynamics.contact_slots
         compute_speeds = lambda motion: (
-            foot_velocity(motion, slots, make_posture(s, motion, slots)).x
+            foot_velocity(motion, contact_slots, make_posture(s, motion, contact_slots)).x
         )
         return jax.jvp(compute_speeds, (self.motion,), (tangent,))[1]
 
     def linearize_along(
         self,
         motion: WheelMotion,
-        leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]],
+        leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]],
     ) -> tuple:
         """Return residual tangent, slots and foot speeds of some legs along a tangent of the
         motion.
@@ -183,16 +183,16 @@ class _PointLinearization(NamedTuple):
             unit_tangent = jnp.stack(
                 [x + float(i in range(len(leg_row))[leg_slice]) for i, x in enumerate(leg_row)]
             )
-            residual, slots, foot_speed = self.linearize_along(
+            residual, contact_slots, foot_speed = self.linearize_along(
                 self.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}), leg_residual
             )
             return _UnitLengthResponse(
                 residual.leg_lengths,
                 residual.hub_by_leg,
                 (
-                    slots.gather(residual.leg_lengths),
-                    residual.foot_transverse,
-                    residual.foot_radial,
+                    contact_slots.gather(residual.leg_lengths),
+                    residual.foot_transverse_motion,
+                    residual.foot_radial_motion,
                     foot_speed,
                 ),
             )
@@ -210,17 +210,19 @@ class _PointLinearization(NamedTuple):
             solution = solve_combination(
                 s, self.inertia, free_motion, slot_modes, is_held, friction
             )
-            return solution.hub, solution.pull, solution.tangential
+            return solution.hub_vector, solution.pull, solution.tangential
 
         return jax.linearize(solve, self.free_motion)[1]
 
 
 def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> ContactConfiguration:
     """Return the configuration restricted to some legs."""
-    motion, slots = configuration.motion, configuration.slots
+    motion, contact_slots = configuration.motion, configuration.contact_slots
     return configuration._replace(
         motion=motion._replace(L=motion.L[leg_slice], dL=motion.dL[leg_slice]),
-        slots=Slots(slots.first_mask[leg_slice], slots.second_mask[leg_slice]),
+        contact_slots=ContactSlots(
+            contact_slots.first_mask[leg_slice], contact_slots.second_mask[leg_slice]
+        ),
         is_airborne_locked=configuration.is_airborne_locked[leg_slice],
     )
 
@@ -236,7 +238,7 @@ class TangentBasis(NamedTuple):
     linearization: _PointLinearization
     forces: ContactForces
     solve_tangent: Callable[[FreeMotion], tuple[HubVector, SlotPair, SlotPair]]
-    all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, Slots]]
+    all_leg_residual: Callable[[ContactConfiguration], tuple[ResidualTangent, ContactSlots]]
     angle_responses: tuple[UnitResponse, UnitResponse]  # response to the angle, and to its rate
     length_responses: tuple[
         tuple[_UnitLengthResponse, _UnitLengthResponse],
@@ -292,13 +294,13 @@ class TangentBasis(NamedTuple):
         unit_tangent = jnp.ones_like(motion.theta)
 
         def respond_to_angle(coordinate_name: str) -> UnitResponse:
-            residual, slots, foot_speed = linearization.linearize_along(
+            residual, contact_slots, foot_speed = linearization.linearize_along(
                 linearization.zero_tangent.motion._replace(**{coordinate_name: unit_tangent}),
                 all_leg_residual,
             )
             return UnitResponse(
                 residual.leg_lengths,
-                sum_residual(slots, residual),
+                sum_residual(contact_slots, residual),
                 foot_speed,
                 jnp.zeros_like(unit_tangent),
             )
@@ -350,10 +352,10 @@ class TangentBasis(NamedTuple):
                 total_response: UnitResponse, group_tangent: Array = group_tangent
             ) -> UnitResponse:
                 configuration, damping_tangent = column_pushforward(group_tangent)
-                residual, slots = self.all_leg_residual(configuration)
+                residual, contact_slots = self.all_leg_residual(configuration)
                 response = UnitResponse(
                     residual.leg_lengths,
-                    sum_residual(slots, residual),
+                    sum_residual(contact_slots, residual),
                     zero_response.foot_speed,
                     damping_tangent,
                 )
@@ -400,8 +402,8 @@ class TangentBasis(NamedTuple):
         total_tangent, foot_speed, damping_tangent = combined_responses
         slot_rows = (
             total_tangent.slot_lengths,
-            total_tangent.foot_transverse,
-            total_tangent.foot_radial,
+            total_tangent.foot_transverse_motion,
+            total_tangent.foot_radial_motion,
             foot_speed,
         )
         slot_lengths, foot_transverse, foot_radial, foot_speed = (
@@ -413,7 +415,7 @@ class TangentBasis(NamedTuple):
             )
             for a, b, c in zip(slot_rows, *self.slot_responses, strict=True)
         )
-        hub_tangent = tuple(map(operator.add, total_tangent.hub, length_response.hub))
+        hub_tangent = tuple(map(operator.add, total_tangent.hub_vector, length_response.hub_vector))
         total_tangent = TotalTangent(
             hub_tangent, slot_lengths, foot_transverse, foot_radial, total_tangent.friction_force
         )
@@ -457,9 +459,11 @@ class TangentBasis(NamedTuple):
         length_response, rate_response = self.length_responses[group_index]
         leg_slice = _LEG_GROUP_SLICES[group_index]
         sum_response = lambda a, b: sum_over_legs(a * L + b * dL)
-        x, z, rotation = map(sum_response, length_response.hub, rate_response.hub)
-        slots = self.linearization.dynamics.slots
-        group_slots = Slots(slots.first_mask[leg_slice], slots.second_mask[leg_slice])
+        x, z, rotation = map(sum_response, length_response.hub_vector, rate_response.hub_vector)
+        contact_slots = self.linearization.dynamics.contact_slots
+        group_slots = ContactSlots(
+            contact_slots.first_mask[leg_slice], contact_slots.second_mask[leg_slice]
+        )
         return _LengthResponse(
             (x, z, rotation),
             group_slots.gather(L),
@@ -488,7 +492,7 @@ class TangentBasis(NamedTuple):
             column_leg_response[leg_slice],
         )
         configuration = _restrict_legs(linearization.configuration, leg_slice)
-        sin, cos = (leg_row[leg_slice] for leg_row in linearization.inertia.legs)
+        sin, cos = (leg_row[leg_slice] for leg_row in linearization.inertia.leg_directions)
         outward_motion = (
             angle_response
             + length_response.leg_lengths * L
@@ -497,7 +501,7 @@ class TangentBasis(NamedTuple):
             + cos * hub_tangent[1]
         )
         outward_motion = (
-            outward_motion - configuration.slots.scatter(pull_tangent) / configuration.s.m
+            outward_motion - configuration.contact_slots.scatter(pull_tangent) / configuration.s.m
         )
         return jnp.where(
             linearization.configuration.has_fixed_length[leg_slice], 0.0, outward_motion

@@ -390,9 +390,9 @@ class UnilateralWheel(AbstractWheel):
 
             def compute_foot_forces(state: PackedState) -> tuple:
                 solution = compute_forces(dynamics, unpack_state(state)[0]).solution
-                return dynamics.slots.scatter(solution.tangential), dynamics.slots.scatter(
-                    solution.normal
-                )
+                return dynamics.contact_slots.scatter(
+                    solution.tangential
+                ), dynamics.contact_slots.scatter(solution.normal)
 
             states = sample_in_units(*sampling_arguments)
             return states, *jax.vmap(compute_foot_forces)(states)
@@ -427,8 +427,8 @@ def _run_event_loop(
     is_valid, params, friction, x = replace_invalid_start(params, wheel.friction, x, tilt)
     s, n = params.symbols(), params.n_legs
     law_arguments = s, _foot_friction(wheel, friction), options, wheel.has_one_sided_stoppers
-    law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
-    layout = make_guard_layout(n, wheel.has_one_sided_stoppers)
+    contact_law = make_contact_law(*law_arguments, True, wheel.restitution, tilt)
+    guard_layout = make_guard_layout(n, wheel.has_one_sided_stoppers)
     motion, contact_state = unpack_section_state(s, x)
     float_zero = jnp.zeros_like(motion.theta)
     state = pack_state(motion, Accumulators(float_zero, float_zero, float_zero, float_zero))
@@ -439,14 +439,14 @@ def _run_event_loop(
     initial_state = _EventLoopState(
         state=state,
         contact_state=contact_state,
-        guard=jnp.int32(layout.landing),
+        guard=jnp.int32(guard_layout.landing),
         outcome=jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT).astype(jnp.int32),
         is_running=is_valid,
         counters=init_counters(x[0]),
         details=init_details(x.dtype) if is_detailed else None,
         log=jax.tree.map(allocate, log_template) if has_log else None,
     )
-    advance = partial(_advance_to_event, law, layout, wheel.max_events, options)
+    advance = partial(_advance_to_event, contact_law, guard_layout, wheel.max_events, options)
     return lax.while_loop(
         lambda event_loop_state: opaque_condition(
             event_loop_state.is_running, event_loop_state.counters.n_events
@@ -457,8 +457,8 @@ def _run_event_loop(
 
 
 def _advance_to_event(
-    law: ContactLaw,
-    layout: GuardLayout,
+    contact_law: ContactLaw,
+    guard_layout: GuardLayout,
     max_events: int,
     options: StepOptions,
     event_loop_state: _EventLoopState,
@@ -467,10 +467,14 @@ def _advance_to_event(
     motion, accumulators = unpack_state(event_loop_state.state)
     event_arguments = event_loop_state.guard, event_loop_state.counters.n_events, max_events
     event_result, event, outcome = process_event(
-        law, layout, motion, event_loop_state.contact_state, *event_arguments
+        contact_law, guard_layout, motion, event_loop_state.contact_state, *event_arguments
     )
     dynamics = make_mode_dynamics(
-        law.s, law.friction, law.is_one_sided, event_result.contact_state, tilt=law.tilt
+        contact_law.s,
+        contact_law.friction,
+        contact_law.is_one_sided,
+        event_result.contact_state,
+        tilt=contact_law.tilt,
     )
     is_valid = outcome == Outcome.STEPPED
     start_state = pack_state(
@@ -480,7 +484,7 @@ def _advance_to_event(
     start_state = jnp.where(is_valid, start_state, event_loop_state.state)
     guard_spec = MonitoredFunctions(
         partial(compute_guard_values, dynamics),
-        layout.n_guards,
+        guard_layout.n_guards,
         guard_scales=compute_guard_scales(dynamics),
     )
     units = compute_packed_units(dynamics.s), compute_wheel_units(dynamics.s).time
@@ -510,12 +514,12 @@ def _advance_to_event(
     )
     end_motion, end_solution = unpack_state(interval_end.state)[0], end_forces[1].solution
     rates = lax.stop_gradient(pack_coordinates(end_motion)[1])
-    accelerations = lax.stop_gradient([*end_solution.hub, *end_solution.length_motion])
-    guard = choose_stopping_guard(layout, dynamics, rates, interval_end.guard, options.atol)
+    accelerations = lax.stop_gradient([*end_solution.hub_vector, *end_solution.length_motion])
+    guard = choose_stopping_guard(guard_layout, dynamics, rates, interval_end.guard, options.atol)
     is_resting = is_wheel_at_rest(dynamics.s, rates, accelerations, options.atol)
     has_event = is_valid & (guard >= 0) & ~is_singular
-    has_landed = has_event & (guard == layout.foremost_landing)
-    outcome_arguments = counters, layout, has_event, guard, has_landed, failure_outcome
+    has_landed = has_event & (guard == guard_layout.foremost_landing)
+    outcome_arguments = counters, guard_layout, has_event, guard, has_landed, failure_outcome
     outcome = interval_outcome(*outcome_arguments, is_resting, max_events)
     details, log = event_loop_state.details, event_loop_state.log
     if details is not None:

@@ -245,14 +245,17 @@ class BatchWalkSettings(NamedTuple):
 
         A lane at the end of its walk gets its outcome. Running lanes are unchanged.
         """
-        interval, layout = lane_state.interval, make_guard_layout(self.n_legs, self.is_one_sided)
+        interval, guard_layout = (
+            lane_state.interval,
+            make_guard_layout(self.n_legs, self.is_one_sided),
+        )
         s, friction = self.unpack_columns(input_columns)
         dynamics_before = self.make_dynamics(input_columns, interval.contact_state)
         rates = lax.stop_gradient(interval.point.v)
         accelerations = lax.stop_gradient(interval.point.dynamics_rows[: len(rates)])
         is_resting = is_wheel_at_rest(s, rates, accelerations, self.options.atol)
         guard_arguments = (
-            layout,
+            guard_layout,
             dynamics_before,
             rates,
             interval.triggered_guard,
@@ -273,10 +276,10 @@ class BatchWalkSettings(NamedTuple):
             )
             step_accumulators = step_accumulators + interval.interval_accumulators
         is_at_event = interval.status == LaneStatus.EVENT
-        has_landed = is_at_event & (interval.triggered_guard == layout.foremost_landing)
+        has_landed = is_at_event & (interval.triggered_guard == guard_layout.foremost_landing)
         outcome_arguments = (
             counters,
-            layout,
+            guard_layout,
             is_at_event,
             interval.triggered_guard,
             has_landed,
@@ -300,12 +303,12 @@ class BatchWalkSettings(NamedTuple):
         counters, details, step_accumulators = tree_where(
             opens_step, (new_counters, *new_records), (counters, details, step_accumulators)
         )
-        guard = jnp.where(opens_step, layout.landing, interval.triggered_guard)
+        guard = jnp.where(opens_step, guard_layout.landing, interval.triggered_guard)
         law_arguments = s, friction, self.options, self.is_one_sided, self.is_detailed
-        law = make_contact_law(*law_arguments, tilt=self.tilt(input_columns))
+        contact_law = make_contact_law(*law_arguments, tilt=self.tilt(input_columns))
         event_arguments = guard, counters.n_events, self.max_events
         event_result, event, event_outcome = process_event(
-            law, layout, motion, contact_state, *event_arguments
+            contact_law, guard_layout, motion, contact_state, *event_arguments
         )
         dynamics = self.make_dynamics(input_columns, event_result.contact_state)
         next_interval = init_interval(
@@ -324,10 +327,12 @@ class BatchWalkSettings(NamedTuple):
         continued_lane = LaneState(
             next_interval, counters, details, step_accumulators, n_stepped, lane_state.outcome
         )
-        is_at_end = (interval.status != LaneStatus.RUNNING) & (
+        has_interval_ended = (interval.status != LaneStatus.RUNNING) & (
             lane_state.outcome == STATUS_UNFINISHED
         )
-        return tree_where(is_at_end, tree_where(has_ended, ended_lane, continued_lane), lane_state)
+        return tree_where(
+            has_interval_ended, tree_where(has_ended, ended_lane, continued_lane), lane_state
+        )
 
     def compute_result(self, lane_state: LaneState, tilt: Array | None) -> Any:
         """Return the result of the last step of lanes whose walk has ended."""

@@ -395,7 +395,9 @@ def _evaluate_stages(
     n_dynamics_rows, last_stage = len(tangent_template.dynamics_rows), len(tableau.nodes) - 1
     is_at_interval_start = (interval.status == LaneStatus.RUNNING) & (interval.time == 0.0)
 
-    def evaluate_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def evaluate_stage_with_tangents(
+        state: tuple[Array, Array, Array],
+    ) -> tuple[Array, Array, Array]:
         i, stage_rows, stage_row_tangents = state
 
         stage_coordinates = compute_stage_state(tableau, i, point.q, point.v, stage_rows, h)
@@ -451,7 +453,7 @@ def _evaluate_stages(
     first_stage = jnp.where(jnp.any(is_at_interval_start), 0, 1).astype(jnp.int32)
     should_continue = lambda state: state[0] <= last_stage
     return lax.while_loop(
-        should_continue, evaluate_stage, (first_stage, stage_rows, stage_row_tangents)
+        should_continue, evaluate_stage_with_tangents, (first_stage, stage_rows, stage_row_tangents)
     )[1:]
 
 
@@ -470,7 +472,7 @@ def _stage_tangent(
     n_stages, node = len(tableau.matrix[0]), jnp.asarray(tableau.nodes)[i]
 
     def add_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        j, first_sum, second_sum = state
+        j, rate_increment, coordinate_increment = state
         a, b = (
             lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
             for flat_matrix in flat_matrices
@@ -478,12 +480,14 @@ def _stage_tangent(
         row_tangent = lax.dynamic_index_in_dim(known_row_tangents, j, 0, False)[: len(tangent.q)][
             leg_slice
         ]
-        return j + 1, first_sum + a * row_tangent, second_sum + b * row_tangent
+        return j + 1, rate_increment + a * row_tangent, coordinate_increment + b * row_tangent
 
     q, v = tangent.q[leg_slice], tangent.v[leg_slice]
     initial_state = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
-    _, first_sum, second_sum = lax.while_loop(lambda state: state[0] < i, add_stage, initial_state)
-    return q + h * (node * v + h * second_sum), v + h * first_sum
+    _, rate_increment, coordinate_increment = lax.while_loop(
+        lambda state: state[0] < i, add_stage, initial_state
+    )
+    return q + h * (node * v + h * coordinate_increment), v + h * rate_increment
 
 
 def _max_stable_step(

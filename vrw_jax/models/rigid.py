@@ -480,8 +480,8 @@ def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
 
     def duplicate(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, y, z = xyz
-        root_x, root_y, root_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
-        duplication_shift = root_x * root_y + root_y * root_z + root_z * root_x
+        sqrt_x, sqrt_y, sqrt_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        duplication_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
         return (
             0.25 * (x + duplication_shift),
             0.25 * (y + duplication_shift),

@@ -30,7 +30,7 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
             - reference_velocity
         ).max()
     )
-    gentle_gait = e.slope_branch.sel(slope=0.10, method="nearest")
+    gentle_slope_gait = e.slope_branch.sel(slope=0.10, method="nearest")
     is_settled = e.gentle_slope_branch.settled.values
     return {
         "wrong": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=True),
@@ -42,9 +42,9 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
         "off": abs(landing.impulse[3] - library_impulse),
         "off_new": velocity_error(0.0),
         "off_old": velocity_error(float(section_state[2])),
-        "slow_settled": bool(gentle_gait.settled),
-        "share": 100.0 * float(gentle_gait.dls_fraction),
-        "period": float(gentle_gait.period),
+        "slow_settled": bool(gentle_slope_gait.settled),
+        "share": 100.0 * float(gentle_slope_gait.dls_fraction),
+        "period": float(gentle_slope_gait.period),
         "rear": float(e.gentle_slope_branch.lambda_4_plus.values[is_settled].min())
         if is_settled.any()
         else math.nan,
