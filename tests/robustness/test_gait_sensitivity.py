@@ -88,7 +88,6 @@ def test_gradients_are_central_differences():
     assert abs(gradient / ((4.0 * inner - outer) / 3.0) - 1.0) < 1e-6
 
 
-@pytest.mark.slow  # the program of its scan compiles for a minute, and waited for ever once
 def test_the_norm_is_a_measure_of_cycles_tables_and_scans(tmp_path):
     names = ["gait_sensitivity_period", "gait_sensitivity_speed"]
     expected = vrw.gait_sensitivity(TABLE_1, ("period", "speed")).norm

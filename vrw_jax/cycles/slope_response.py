@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import Array, Float
 
 from vrw_jax.collocation import reconstruct_step
@@ -92,12 +91,38 @@ def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
     A = jnp.where(is_stable, A, 0.0)
     b = A @ B0 + B1
     equation = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
-    P = jnp.linalg.solve(equation, jnp.outer(b, b).ravel()).reshape(n, n)
+    inverse = invert_by_elimination(lax.stop_gradient(equation))
+    forcing = jnp.outer(b, b).ravel()
+    covariance = inverse @ forcing
+    for _ in range(N_REFINEMENTS):
+        covariance = covariance - inverse @ (equation @ covariance - forcing)
+    P = covariance.reshape(n, n)
     later_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step = C @ B0 + D1
     norm = _root(D0**2 + beginning_step**2 + later_squared)
     if_stable = lambda value: jnp.where(is_stable, value, jnp.inf)
     return GaitSensitivityNorm(if_stable(norm), D0, beginning_step, if_stable(_root(later_squared)))
+
+
+def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the inverse of a matrix by Gauss-Jordan elimination with row exchanges.
+
+    LAPACK's batched solver takes threads of the pool on which XLA runs the program. Two programs at
+    a time, as a scan runs on two cores, then wait for each other and never end (jaxlib 0.10).
+    """
+    n = len(matrix)
+    augmented = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+
+    def eliminate_column(k: Array, augmented: Array) -> Array:
+        candidates = jnp.where(jnp.arange(n) >= k, jnp.abs(augmented[:, k]), -1.0)
+        pivot_index = jnp.argmax(candidates)
+        pivot_row, replaced_row = augmented[pivot_index], augmented[k]
+        augmented = augmented.at[pivot_index].set(replaced_row)
+        pivot_row = pivot_row / pivot_row[k]
+        eliminated = augmented - augmented[:, k, None] * pivot_row
+        return eliminated.at[k].set(pivot_row)
+
+    return lax.fori_loop(0, n, eliminate_column, augmented)[:, n:]
 
 
 def _root(squared_value: Array) -> Array:
@@ -209,11 +234,12 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
 
         inputs = jnp.concatenate([section, jnp.full(2, parameters[slope_index])])
         jacobian = jax.jacfwd(residual)(unknowns_of_gait, *lax.stop_gradient((inputs, parameters)))
-        lu_factors = lu_factor(jacobian)
+        inverse_jacobian = invert_by_elimination(jacobian)
 
         def evaluate(inputs: Array) -> Array:
             def refine(unknowns: Array, _: None) -> tuple[Array, None]:
-                return unknowns - lu_solve(lu_factors, residual(unknowns, inputs, parameters)), None
+                correction = inverse_jacobian @ residual(unknowns, inputs, parameters)
+                return unknowns - correction, None
 
             unknowns, _ = lax.scan(refine, unknowns_of_gait, length=N_REFINEMENTS)
             _, end, passages = reconstruct(unknowns, inputs, parameters)
