@@ -44,7 +44,7 @@ from vrw_jax.validation import (
     is_traced,
     refuse_renamed_arguments,
 )
-from vrw_jax.wheel import Outcome, WheelParams, stack_parameters
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
 
 RETRY_OUTCOMES = (
     Outcome.NO_CYCLE_FOUND,
@@ -228,13 +228,17 @@ def limit_cycles(
     if len(shape) != 1:
         raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
     if shape == (0,):
-        is_invalid = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
-        has_single_missing = limit_cycles(
-            is_invalid, period_n=period_n, model=model, options=options, which=which
+        invalid_params = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
+        missing_cycle = limit_cycles(
+            invalid_params, period_n=period_n, model=model, options=options, which=which
         )
-        return _take_rows_on_device(has_single_missing, slice(0, 0))
-    params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
-    single_params = jax.tree.map(lambda x: x[0], params)
+        return _take_rows_on_device(missing_cycle, slice(0, 0))
+    if is_traced(params):
+        params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
+        single_params = jax.tree.map(lambda x: x[0], params)
+    else:  # by numpy, because JAX would compile a program for each batch size
+        params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), shape), params)
+        params, single_params = jax.device_put((params, take_rows(params, 0)))
     finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
     cycle: Any = _search_with_fallbacks(finder, params, None, options is None, which)
     return cycle
@@ -328,21 +332,24 @@ def _keep_first_reason(cycle: LimitCycle, retry: LimitCycle) -> LimitCycle:
 
     All functions therefore report the same reason, with or without fallbacks, and in any batch.
     """
-    is_missing = ~cycle.found & ~retry.found
-    keep_first_if_missing = lambda first, last: jnp.where(is_missing, first, last)
-    failed_check = keep_first_if_missing(
-        cycle.collocation_state.failed_check, retry.collocation_state.failed_check
-    )
-    return eqx.tree_at(
-        lambda x: (x.outcome, x.collocation_state.failed_check),
-        retry,
-        (keep_first_if_missing(cycle.outcome, retry.outcome), failed_check),
-    )
+    get_reason = lambda x: (x.outcome, x.collocation_state.failed_check)
+    first_reason, last_reason = get_reason(cycle), get_reason(retry)
+    where: Any = jnp.where
+    if not is_traced((first_reason, last_reason)):  # numpy compiles nothing for a new batch size
+        first_reason, last_reason = jax.tree.map(np.asarray, (first_reason, last_reason))
+        where = lambda *arrays: jax.device_put(np.where(*arrays))
+    is_missing = (first_reason[0] != Outcome.STEPPED) & (last_reason[0] != Outcome.STEPPED)
+    reason = [where(is_missing, *pair) for pair in zip(first_reason, last_reason, strict=True)]
+    return eqx.tree_at(get_reason, retry, tuple(reason))
 
 
 def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
     """Return the cycle of one wheel, or the cycles of a batch."""
-    return (finder.find_cycles if params.damping.ndim else finder.find_cycle)(params, guess)
+    if not params.damping.ndim:
+        return finder.find_cycle(params, guess)
+    if guess is not None or is_traced(params):
+        return finder.find_cycles(params, guess)
+    return map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
 
 
 def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
@@ -350,6 +357,11 @@ def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
     for each shape.
     """
     return jax.device_put(take_rows(tree, row_indices))
+
+
+def _stack_known_parameters(params: WheelParams) -> np.ndarray:
+    """Return `stack_parameters` of a batch by numpy, for the same reason."""
+    return np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
 
 
 def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
@@ -389,7 +401,7 @@ def _measure_period_defect(
     Changes are relative to the wheel's units of angle, angular velocity and velocity.
     """
     period = step_batch(params, states, finder.period_n, model=finder.model)
-    units = stack_section_units(finder.model, np.asarray(stack_parameters(params)).T, params.n_legs)
+    units = stack_section_units(finder.model, _stack_known_parameters(params).T, params.n_legs)
     distance = np.abs((np.asarray(period.section_state) - states) / units).max(-1)
     return np.where(np.asarray(period.outcome) == Outcome.STEPPED, distance, np.inf)
 
@@ -416,7 +428,7 @@ def _walk_from_all_starts(
     solvers do not walk, because the walks of one such wheel would take minutes with an implicit
     solver.
     """
-    solver_index = select_solver(np.asarray(stack_parameters(params)), StepOptions())
+    solver_index = select_solver(_stack_known_parameters(params), StepOptions())
     needs_walk = needs_walk & (solver_index != SolverIndex.IMPLICIT)
     n_wheels = len(needs_walk)
     smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
@@ -486,7 +498,8 @@ def _fallback_starts(
     mesh.
     """
     outcome = np.asarray(cycle.outcome)
-    has_large_mesh_error = refines_mesh & (np.asarray(cycle.mesh_error) > options.refine_above)
+    mesh_error = map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle)
+    has_large_mesh_error = refines_mesh & (np.asarray(mesh_error) > options.refine_above)
     is_missing = np.isin(outcome, RETRY_OUTCOMES)
     is_unresolved = is_missing | has_large_mesh_error
     if not is_unresolved.any():
@@ -525,7 +538,10 @@ def _fallback_starts(
         retry = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, guesses
         )
-        is_found, mesh_error = np.asarray(retry.found), np.asarray(retry.mesh_error)
+        is_found = np.asarray(retry.outcome) == Outcome.STEPPED
+        mesh_error = np.asarray(
+            map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retry)
+        )
         collocation_state = _replace_rows(
             collocation_state,
             wheel_indices[is_found],

@@ -5,6 +5,7 @@ Code with independent wheels on the last axis runs several times faster than the
 wheel under `jax.vmap`. Here every `vmap`, including nested ones, is merged into that axis.
 """
 
+import bisect
 from collections.abc import Callable
 from typing import Any
 
@@ -144,6 +145,8 @@ def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -
 
     It is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
     """
+    if len(jax.tree.leaves(trees)[0]) in sizes:
+        return function(*trees)
     call_on_device = lambda *rows: function(*jax.device_put(rows))
     return jax.device_put(map_in_numpy_batches(call_on_device, sizes, *trees))
 
@@ -153,10 +156,22 @@ def map_in_numpy_batches(function: Callable, sizes: tuple[int, ...], *trees: PyT
 
     For small batches this takes a fraction of the time.
     """
-    n, results = len(jax.tree.leaves(trees)[0]), []
-    for first_row in range(0, n, sizes[-1]):
-        n_rows = min(n - first_row, sizes[-1])
-        batch_size = next(size for size in sizes if size >= n_rows)
-        rows = take_rows(trees, np.minimum(np.arange(first_row, first_row + batch_size), n - 1))
-        results.append(take_rows(function(*rows), slice(0, n_rows)))
+    n_rows, results = len(jax.tree.leaves(trees)[0]), []
+    first_row = 0
+    while first_row < n_rows:
+        batch_size = _choose_batch_size(n_rows - first_row, sizes)
+        last_row = min(first_row + batch_size, n_rows)
+        row_indices = np.minimum(np.arange(first_row, first_row + batch_size), n_rows - 1)
+        batch = function(*take_rows(trees, row_indices))
+        results.append(take_rows(batch, slice(0, last_row - first_row)))
+        first_row = last_row
     return concat_rows(*results) if len(results) > 1 else results[0]
+
+
+def _choose_batch_size(n_rows: int, sizes: tuple[int, ...]) -> int:
+    """Return the smallest of `sizes` that holds all rows, or the next smaller one if several
+    batches of that size have at most half of its elements."""
+    i = min(bisect.bisect_left(sizes, n_rows), len(sizes) - 1)
+    if i > 0 and -(-n_rows // sizes[i - 1]) * sizes[i - 1] <= sizes[i] // 2:
+        return sizes[i - 1]
+    return sizes[i]

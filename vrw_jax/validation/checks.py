@@ -154,6 +154,10 @@ def check_reals(name: str, value: Any, advice: str = "give a number, or an array
     """
     refuse_fork()
     try:
+        if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
+            # jnp.asarray compiles a program for each shape. The copy keeps its values if the
+            # caller changes the array.
+            return jax.device_put(value.copy())
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None

@@ -1,0 +1,156 @@
+"""Call each batch function with random batch sizes, and record what the process holds.
+
+After each tenth of the calls, resident memory, memory maps, file descriptors and threads are
+counted. The counts of a function must reach a plateau: the last half of its calls may add at most
+the limits of `MAX_GROWTH`. The counts are written as a table and drawn.
+
+    python -m experiments.hardening.resources results --calls 2000
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import vrw_jax as vrw
+from experiments.shared.command import make_parser, require_extra
+from experiments.shared.tables import write_table
+
+MAX_BATCH_SIZE = 300
+"""Largest number of wheels of a call, chosen because several padded batch sizes occur below it."""
+N_COUNTS = 10
+"""Number of counts over the calls of a function."""
+
+
+class ProcessResources(NamedTuple):
+    """What a process holds."""
+
+    resident_mib: int
+    memory_maps: int
+    file_descriptors: int
+    threads: int
+
+    @classmethod
+    def count(cls) -> "ProcessResources":
+        """Return the counts of this process, from Linux's /proc."""
+        folder = Path("/proc/self")
+        pages = int((folder / "statm").read_text().split()[1])
+        return cls(
+            pages * os.sysconf("SC_PAGE_SIZE") // 2**20,
+            len((folder / "maps").read_text().splitlines()),
+            len(os.listdir(folder / "fd")),
+            len(os.listdir(folder / "task")),
+        )
+
+
+MAX_GROWTH = ProcessResources(100, 100, 4, 4)
+"""Largest growth over the last half of the calls. It is chosen because a fault adds 18 MiB and 240
+maps at each new batch size, while an allocator keeps some tens of MiB."""
+
+
+def draw_wheels(rng: np.random.Generator) -> vrw.WheelParams:
+    """Return a batch of wheels of random size from the paper's box."""
+    n = int(rng.integers(1, MAX_BATCH_SIZE + 1))
+    draw = lambda low, high: rng.uniform(low, high, n)
+    return vrw.WheelParams(
+        damping=draw(100.0, 215.0), stiffness=draw(450.0, 540.0), slope=draw(0.28, 0.32)
+    )
+
+
+def repeat_start(params: vrw.WheelParams) -> np.ndarray:
+    """Return the paper's start for each wheel, shape (wheels, 3)."""
+    return np.tile(np.asarray(vrw.paper_start()), (len(params.damping), 1))
+
+
+CONTACT = vrw.UnilateralWheel(friction=0.8)
+BATCH_FUNCTIONS: dict[str, Callable[[vrw.WheelParams], object]] = {
+    "step_batch": lambda p: vrw.step_batch(p, repeat_start(p)),
+    "step_batch, 3 steps": lambda p: vrw.step_batch(p, repeat_start(p), 3),
+    "step_batch, derivatives": lambda p: vrw.step_batch(
+        p, repeat_start(p), derivatives=["damping"]
+    ),
+    "step_batch, unilateral contact": lambda p: vrw.step_batch(p, repeat_start(p), model=CONTACT),
+    "limit_cycles": vrw.limit_cycles,
+    "limit_cycles, unilateral contact": lambda p: vrw.limit_cycles(p, model=CONTACT),
+    "scan": lambda p: vrw.scan(
+        vrw.uniform(damping=(100.0, 215.0), n=len(p.damping)),
+        measures=["period"],
+    ),
+}
+"""Public functions of a batch of wheels."""
+
+
+def count_over_calls(name: str, n_calls: int, seed: int) -> list[ProcessResources]:
+    """Return the counts after each tenth of the calls of a function."""
+    rng, function = np.random.default_rng(seed), BATCH_FUNCTIONS[name]
+    counts = []
+    for i in range(n_calls):
+        function(draw_wheels(rng))
+        if (i + 1) * N_COUNTS // n_calls > i * N_COUNTS // n_calls:
+            counts.append(ProcessResources.count())
+    return counts
+
+
+def find_growth(counts: list[ProcessResources]) -> list[str]:
+    """Return the resources that grew by more than `MAX_GROWTH` over the last half of the calls."""
+    first, last = counts[len(counts) // 2 - 1], counts[-1]
+    return [
+        f"{resource} grew from {before} to {after}"
+        for resource, before, after, limit in zip(
+            ProcessResources._fields, first, last, MAX_GROWTH, strict=True
+        )
+        if after - before > limit
+    ]
+
+
+def draw_counts(counts: dict[str, list[ProcessResources]], n_calls: int, path: Path) -> None:
+    """Draw each resource against the number of calls, one line for each function."""
+    plt = require_extra("matplotlib.pyplot")
+    figure, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, layout="constrained")
+    calls = np.linspace(n_calls / N_COUNTS, n_calls, N_COUNTS)
+    labels = ("resident memory, MiB", "memory maps", "file descriptors", "threads")
+    for i, (axis, label) in enumerate(zip(axes.flat, labels, strict=True)):
+        for name, function_counts in counts.items():
+            axis.plot(calls, [count[i] for count in function_counts], marker=".", label=name)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=0)
+    for axis in axes[1]:
+        axis.set_xlabel("calls with random batch sizes")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Count the resources of each function, write the table and the figure."""
+    parser = make_parser(__doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default="results")
+    parser.add_argument("--calls", type=int, default=2000, help="calls of each function")
+    parser.add_argument("--functions", nargs="+", default=list(BATCH_FUNCTIONS))
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    vrw.start_jax()
+    counts = {}
+    for name in chosen.functions:
+        counts[name] = count_over_calls(name, chosen.calls, chosen.seed)
+        growth = "; ".join(find_growth(counts[name])) or "plateau"
+        print(f"{name}: {growth} ({counts[name][-1].memory_maps} maps)", flush=True)
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    write_table(
+        chosen.folder / "resources.csv",
+        ("function", "calls", *ProcessResources._fields),
+        [
+            (name, (i + 1) * chosen.calls // N_COUNTS, *count)
+            for name, function_counts in counts.items()
+            for i, count in enumerate(function_counts)
+        ],
+    )
+    draw_counts(counts, chosen.calls, chosen.folder / "resources.png")
+    if any(map(find_growth, counts.values())):
+        sys.exit("Some function has no plateau.")
+
+
+if __name__ == "__main__":
+    main()
