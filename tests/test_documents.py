@@ -1,7 +1,10 @@
 """What documents and comments name exists: files, commands, modules."""
 
 import ast
+import json
 import re
+import subprocess
+import sys
 import unicodedata
 from pathlib import Path
 
@@ -92,17 +95,26 @@ def test_the_architecture_page_lists_every_package_in_import_order():
 
 
 LINK_PATTERN = re.compile(r"\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]+))?\)")
+
+
+def read_markdown(path):
+    """Return the text of a page, or that of a notebook's text cells."""
+    if path.suffix == ".md":
+        return path.read_text()
+    cells = json.loads(path.read_text())["cells"]
+    return "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+
+
 PAGES_WITHOUT_CODE = {
-    path: re.sub(r"```.*?```|`[^`\n]*`", "", path.read_text(), flags=re.DOTALL)
+    path: re.sub(r"```.*?```|`[^`\n]*`", "", read_markdown(path), flags=re.DOTALL)
     for path in DOCUMENTS
-    if path.suffix == ".md"
 }
 """Text of each page without code, whose brackets are no links."""
 
 
 def list_anchors(path):
     """Return the anchors of a page's headings, as the site makes them."""
-    headings = re.findall(r"^#+ +(.*?) *$", path.read_text(), re.MULTILINE)
+    headings = re.findall(r"^#+ +(.*?) *$", read_markdown(path), re.MULTILINE)
     ascii_headings = [
         unicodedata.normalize("NFKD", heading).encode("ascii", "ignore").decode()
         for heading in headings
@@ -115,7 +127,7 @@ def find_broken_links(path):
     """Links of a page to files or headings that are not in the checkout."""
     for place, anchor in LINK_PATTERN.findall(PAGES_WITHOUT_CODE[path]):
         target = path.parent / place if place else path
-        is_page = target.suffix == ".md"
+        is_page = target.suffix in (".md", ".ipynb")
         if not target.exists() or (
             anchor and is_page and anchor.lower() not in list_anchors(target)
         ):
@@ -132,6 +144,29 @@ def test_a_broken_link_is_found(tmp_path, monkeypatch):
     page.write_text("# A b-c\n[x](gone.md) [y](page.md#a-b-c) [z](#gone)")
     monkeypatch.setitem(PAGES_WITHOUT_CODE, page, page.read_text())
     assert list(find_broken_links(page)) == ["gone.md", "#gone"]
+
+
+def test_a_broken_link_of_the_built_site_is_found(tmp_path):
+    from website.links import find_broken_links
+
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "index.html").write_text(
+        '<h1 id="x">A</h1> <a href="#x">1</a> <a href="../b.html#y z">2</a> <a href="./">3</a>'
+        '<a href="gone.html">4</a> <a href="#gone">5</a> <a href="https://example.org">6</a>'
+    )
+    (tmp_path / "b.html").write_text(
+        '<h2 id="y z">B</h2> <img src="gone.png"> <a href="a/#x">1</a>'
+    )
+    broken = [f"a/index.html: {link}" for link in ("gone.html", "#gone")] + ["b.html: gone.png"]
+    assert list(find_broken_links(tmp_path)) == broken
+
+
+@pytest.mark.slow
+def test_every_link_of_the_built_site_leads_somewhere():
+    pytest.importorskip("zensical")
+    command = [sys.executable, "-m", "website", "--stored"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize("name", ["toml", "measures"])

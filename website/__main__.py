@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from website.links import find_broken_links
 from website.notebooks import page_of
 from website.reference import measures_page, toml_page
 
@@ -82,7 +83,7 @@ def configuration() -> Path:
 
 
 def main() -> int:
-    """Prepare and build the site; any warning is an error."""
+    """Prepare and build the site; any warning or broken link is an error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stored", action="store_true", help="show the notebooks as stored")
     parser.add_argument("--pages", action="store_true", help="only write the generated pages")
@@ -93,10 +94,13 @@ def main() -> int:
     prepare(execute=not arguments.stored)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
     status = subprocess.run([*command, "-f", str(configuration())], cwd=ROOT, check=False)
-    if status.returncode == 0:
+    broken_links = list(find_broken_links(SITE))
+    for link in broken_links:
+        print(f"Broken link on {link}")
+    if status.returncode == 0 and not broken_links:
         print(f"The site is in {SITE}. Open {SITE / 'index.html'} in a browser, or serve it, with")
         print(f"its search, by: python -m http.server --directory {SITE.relative_to(ROOT)}")
-    return status.returncode
+    return status.returncode or bool(broken_links)
 
 
 if __name__ == "__main__":
