@@ -292,7 +292,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
         return_map = lambda z, p: self._iterate_return_map(wheel, z, p)
-        return arclength.fixed_point_newton_step(return_map, z, p, self.n_coordinates)
+        return arclength.make_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
 
 class GroundProblem(AbstractReturnMapProblem):

@@ -1,10 +1,9 @@
 """Pseudo-arclength continuation of fixed points in one parameter, through folds.
 
-A problem is an `AbstractContinuationProblem`, which defines how Newton's method corrects the
-unknowns z at a parameter p and how z changes with p. Many branches run concurrently, each with
-buffers of fixed size for its points.
-
-Lengths are measured in the section state and in the parameter as a fraction of its range.
+A problem is an `AbstractContinuationProblem`. It defines how Newton's method corrects the unknowns
+z at a parameter p, and how z changes with p. Many branches run concurrently, each with buffers of
+fixed size for its points. Lengths are measured in the section state and in the parameter as a
+fraction of its range.
 """
 
 import abc
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.continuation.crossings import Doubt, is_accounted_for
+from vrw_jax.continuation.crossings import BranchJumpSuspicion, is_multiplier_change_explained
 from vrw_jax.numerics import Scalar, StatusCode, batch_sizes, tree_where, value_and_jacobian
 from vrw_jax.validation import (
     check_int,
@@ -86,17 +85,18 @@ class ArclengthOptions:
 class NewtonStep(NamedTuple):
     """Correction and tangent of Newton's method at a trial point (z, p)."""
 
-    correction: Unknowns  # of z at fixed p
+    correction: Unknowns  # correction of z at fixed p
     tangent: Unknowns  # dz/dp, the tangent of the branch
-    jacobian: Float[Array, "n n"]  # of the return map over the section's numbers
+    jacobian: Float[Array, "n n"]  # Jacobian of the return map with respect to the section state
 
 
 class AbstractContinuationProblem(eqx.Module):
     """Base class of continuation problems; `args` is a pytree with all other inputs."""
 
     is_traceable: ClassVar[bool] = True
-    """Whether `linearize` can be compiled into a loop. If not, it is called for a batch of points
-    from outside of compiled code."""
+    """Whether `linearize` can be compiled into a loop. If not, it is called for a batch of
+    points from outside of compiled code.
+    """
 
     has_multipliers: ClassVar[bool] = True
     """Whether the Jacobians are those of the equations that are continued."""
@@ -106,22 +106,26 @@ class AbstractContinuationProblem(eqx.Module):
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
-        """Return correction, tangent and Jacobian; not finite if the map is undefined there."""
+        """Return correction, tangent and Jacobian; they are not finite if the map is undefined
+        at (z, p).
+        """
 
     @abc.abstractmethod
     def section_state(self, z: Unknowns) -> SectionVector:
-        """Return the section state, a part of z."""
+        """Return the section state, which is a part of z."""
 
     def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
-        """Return the guess of Newton's method at a fraction in [0, 1] between two points."""
+        """Return the initial guess of Newton's method at a fraction in [0, 1] between two
+        points.
+        """
         return jax.tree.map(lambda a, b: a + fraction * (b - a), left, right)
 
     def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
-        """Return whether the branch has no kink between two points, as far as they show it."""
+        """Return whether two neighboring points show no kink of the branch between them."""
         return jnp.asarray(True)
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
-        """Return the norm of a correction that is compared with the tolerance."""
+        """Return the norm of a correction, which is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
@@ -129,35 +133,37 @@ class AbstractContinuationProblem(eqx.Module):
         return jnp.all(jnp.isfinite(z))
 
 
-def fixed_point_newton_step(
+def make_fixed_point_newton_step(
     return_map: Callable[[Array, Scalar], Array], z: Array, p: Scalar, n_continuous: int
 ) -> NewtonStep:
     """Return the Newton step of the equation `return_map(z, p)` = z.
 
-    Its first `n_continuous` entries are continuous. The others are codes, which are copied from the
-    image.
+    The first `n_continuous` entries of z are continuous. The others are codes, which are copied
+    from the image.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
     image_point, jacobians = value_and_jacobian(continuous_map, z[:n_continuous], p)
     jacobian_z, jacobian_p = (jacobian[:n_continuous] for jacobian in jacobians)
     defect = image_point - z
-    rhs = jnp.stack([defect[:n_continuous], jacobian_p], -1)
-    solutions = jnp.linalg.solve(jnp.eye(n_continuous, dtype=z.dtype) - jacobian_z, rhs)
+    right_sides = jnp.stack([defect[:n_continuous], jacobian_p], -1)
+    solutions = jnp.linalg.solve(jnp.eye(n_continuous, dtype=z.dtype) - jacobian_z, right_sides)
     code_changes = defect[n_continuous:]
     tangent = jnp.concatenate([solutions[:, 1], jnp.zeros_like(code_changes)])
     return NewtonStep(jnp.concatenate([solutions[:, 0], code_changes]), tangent, jacobian_z)
 
 
 class FixedPointProblem(AbstractContinuationProblem):
-    """Fixed points of a map x -> `function(args, x, p)` that JAX differentiates in forward mode.
+    """Continuation problem of fixed points of a map x -> `function(args, x, p)`.
 
-    The map returns NaN if it is not defined.
+    JAX differentiates the map in forward mode. The map returns NaN if it is not defined.
     """
 
     function: Callable[[Any, SectionVector, Scalar], SectionVector] = eqx.field(static=True)
 
     def linearize(self, args: Any, z: Unknowns, p: Scalar) -> NewtonStep:
-        return fixed_point_newton_step(lambda x, p: self.function(args, x, p), z, p, z.shape[0])
+        return make_fixed_point_newton_step(
+            lambda x, p: self.function(args, x, p), z, p, z.shape[0]
+        )
 
     def section_state(self, z: Unknowns) -> SectionVector:
         return z
@@ -176,12 +182,13 @@ class ContinuationStatus(StatusCode):
 
 
 class ContinuationPoint(NamedTuple):
-    """A point of a branch with the unit tangent to the branch."""
+    """A point of a branch with the unit tangent of the branch."""
 
     z: Unknowns
     p: Scalar
-    tangent: Unknowns  # dz per length along the branch; () for stored points
-    fraction_rate: Scalar  # rate of the parameter, as a fraction of its range, per length
+    tangent: Unknowns  # derivative of z with respect to arc length; () for stored points
+    # derivative of the parameter, as a fraction of its range, with respect to arc length
+    fraction_rate: Scalar
     jacobian: Float[Array, "n n"]
     is_admissible: Bool[Array, ""]
 
@@ -191,12 +198,14 @@ class ContinuationResult(NamedTuple):
 
     points: ContinuationPoint
     n_points: Int[Array, " branches"]
-    status: Int[Array, " branches"]  # a ContinuationStatus
-    n_linearizations: Int[Array, " branches"]  # calls of `linearize`
+    status: Int[Array, " branches"]  # a ContinuationStatus for each branch
+    n_linearizations: Int[Array, " branches"]  # number of calls of `linearize`
 
 
 class ConstraintPlane(NamedTuple):
-    """Condition that selects a point of a branch: it lies on this plane through a given point."""
+    """Plane that selects a point of a branch: the point lies on it. The plane contains a given
+    point.
+    """
 
     section_state: SectionVector
     fraction: Scalar
@@ -210,11 +219,11 @@ class CorrectorState(NamedTuple):
     z: Unknowns
     fraction: Scalar
     correction_norm: Scalar
-    tangent: Unknowns  # dz per fraction of the parameter's range
+    tangent: Unknowns  # derivative of z with respect to the parameter as a fraction of its range
     jacobian: Float[Array, "n n"]
 
 
-def newton_step_at_fraction(
+def evaluate_newton_step_at_fraction(
     problem: AbstractContinuationProblem, args: Any, bounds: Array, z: Unknowns, fraction: Scalar
 ) -> NewtonStep:
     """Return the Newton step at a fraction of the parameter's range."""
@@ -229,9 +238,13 @@ def correct_point(
     z: Unknowns,
     fraction: Scalar,
 ) -> CorrectorState:
-    """Apply one Newton iteration to the equations of the branch and of the constraint plane."""
-    scale = bounds[1] - bounds[0]
-    tangent = jax.tree.map(lambda section_state: scale * section_state, newton_step.tangent)
+    """Return the state after one Newton iteration on the equations of the branch and of the
+    constraint plane.
+    """
+    parameter_range = bounds[1] - bounds[0]
+    tangent = jax.tree.map(
+        lambda section_state: parameter_range * section_state, newton_step.tangent
+    )
     section_state = problem.section_state(z) + problem.section_state(newton_step.correction)
     plane_residual = plane.normal_section @ (
         section_state - plane.section_state
@@ -262,13 +275,13 @@ def parameter_from_fraction(fraction: Array, bounds: Array) -> Array:
 
 
 class _TrialPoint(NamedTuple):
-    """Predicted point of a branch, with the plane on which Newton's method solves for it."""
+    """Predicted point of a branch, with the plane on which Newton's method solves for the point."""
 
     plane: ConstraintPlane
     z: Unknowns
     fraction: Scalar
     length: Scalar  # predicted arc length from the last point
-    is_final: Bool[Array, ""]  # whether it lies on the end of the range
+    is_final: Bool[Array, ""]  # whether the point lies on the end of the range
 
 
 def _predict_point(
@@ -281,24 +294,26 @@ def _predict_point(
 ) -> _TrialPoint:
     """Return the predicted point: one step along the tangent, or the nearer end of the range.
 
-    With `has_two_points`, Newton's method starts on the cubic through the last two points and along
-    their tangents. The cubic is nearer to the branch by two orders and saves one iteration of
-    three.
+    With `has_two_points`, Newton's method starts on the cubic through the last two points with
+    their tangents. The cubic is nearer to the branch by two orders and saves one of three
+    iterations.
     """
     fraction = _fraction_from_parameter(current_point.p, bounds)
     fraction_rate = current_point.fraction_rate
-    bound = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
+    range_end = jnp.where(fraction_rate > 0.0, 1.0, 0.0)
     is_stationary = fraction_rate == 0.0
     bound_distance = jnp.where(
-        is_stationary, jnp.inf, (bound - fraction) / jnp.where(is_stationary, 1.0, fraction_rate)
+        is_stationary,
+        jnp.inf,
+        (range_end - fraction) / jnp.where(is_stationary, 1.0, fraction_rate),
     )
     is_final = bound_distance <= ds
-    length = jnp.where(is_final, bound_distance, ds)
+    predicted_length = jnp.where(is_final, bound_distance, ds)
     section_tangent = problem.section_state(current_point.tangent)
     section_state = problem.section_state(current_point.z)
-    target_fraction = jnp.where(is_final, bound, fraction + length * fraction_rate)
+    target_fraction = jnp.where(is_final, range_end, fraction + predicted_length * fraction_rate)
     plane = ConstraintPlane(
-        section_state + length * section_tangent,
+        section_state + predicted_length * section_tangent,
         target_fraction,
         jnp.where(is_final, 0.0, section_tangent),
         jnp.where(is_final, 1.0, fraction_rate),
@@ -308,16 +323,22 @@ def _predict_point(
         section_state - problem.section_state(previous_point.z), fraction - previous_fraction
     )
     has_two_points = has_two_points & problem.is_smooth_between(previous_point.z, current_point.z)
-    # After a kink the two points are equal but for round-off.
+    # After a kink the two points are equal up to round-off.
     has_two_points = has_two_points & (displacement @ displacement > (1e-9 * ds) ** 2)
-    chord = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
+    chord_length = jnp.where(has_two_points, jnp.sqrt(displacement @ displacement), 1.0)
 
-    def extrapolate(a: Array, da: Array, b: Array, db: Array) -> Array:
-        mean_rate = (b - a) / chord
-        curvature = (db - mean_rate) / chord + (length + chord) * (
-            da + db - 2.0 * mean_rate
-        ) / chord**2
-        return b + length * db + jnp.where(has_two_points, length**2 * curvature, 0.0)
+    def extrapolate(
+        previous_value: Array, previous_rate: Array, current_value: Array, current_rate: Array
+    ) -> Array:
+        mean_rate = (current_value - previous_value) / chord_length
+        curvature = (current_rate - mean_rate) / chord_length + (
+            predicted_length + chord_length
+        ) * (previous_rate + current_rate - 2.0 * mean_rate) / chord_length**2
+        return (
+            current_value
+            + predicted_length * current_rate
+            + jnp.where(has_two_points, predicted_length**2 * curvature, 0.0)
+        )
 
     z = jax.tree.map(
         extrapolate,
@@ -328,10 +349,10 @@ def _predict_point(
     )
     fraction = jnp.where(
         is_final,
-        bound,
+        range_end,
         extrapolate(previous_fraction, previous_point.fraction_rate, fraction, fraction_rate),
     )
-    return _TrialPoint(plane, z, fraction, length, is_final)
+    return _TrialPoint(plane, z, fraction, predicted_length, is_final)
 
 
 class ContinuationState(NamedTuple):
@@ -339,10 +360,10 @@ class ContinuationState(NamedTuple):
 
     previous_point: ContinuationPoint
     current_point: ContinuationPoint
-    first_point: ContinuationPoint  # of the branch, if it exists
+    first_point: ContinuationPoint  # first point of the branch, if it exists
     ds: Scalar
     trial: _TrialPoint
-    doubt: Doubt
+    suspicion: BranchJumpSuspicion
     iteration: Int[Array, ""]
     n_points: Int[Array, ""]
     status: Int[Array, ""]
@@ -350,12 +371,15 @@ class ContinuationState(NamedTuple):
 
 
 class _TrialAssessment(NamedTuple):
-    """Assessment of a trial after one Newton iteration; without a flag the iteration continues."""
+    """Assessment of a trial after one Newton iteration; if no flag is set, the iteration
+    continues.
+    """
 
     is_accepted: Bool[Array, ""]
     has_failed: Bool[Array, ""]
-    is_kink: Bool[Array, ""]  # accepted, although the branch turns by more than `max_turn_angle`
-    fraction_rate: Scalar  # in the direction of continuation
+    # the trial is accepted, although the branch turns by more than `max_turn_angle`
+    is_kink: Bool[Array, ""]
+    fraction_rate: Scalar  # rate of the parameter in the direction of continuation
 
 
 def _assess_trial(
@@ -378,52 +402,56 @@ def _assess_trial(
         problem.section_state(current_point.tangent) @ section_tangent + current_point.fraction_rate
     )
     alignment = jnp.where(is_first, direction, alignment)
-    norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
-    is_straight = is_first | (jnp.abs(alignment) >= norm * jnp.cos(options.max_turn_angle))
-    # A branch turns by more than the limit at a kink, however short the step is.
-    is_kink = is_converged & ~is_straight & (state.ds < options.kink_step_factor * options.min_ds)
+    tangent_norm = jnp.sqrt(1.0 + section_tangent @ section_tangent)
+    turns_little = is_first | (jnp.abs(alignment) >= tangent_norm * jnp.cos(options.max_turn_angle))
+    # At a kink a branch turns by more than the limit, however short the step is.
+    is_kink = is_converged & ~turns_little & (state.ds < options.kink_step_factor * options.min_ds)
     is_kink = is_kink & problem.has_kinks
-    is_accepted = is_converged & (is_straight | is_kink)
+    is_accepted = is_converged & (turns_little | is_kink)
     has_failed = ~is_accepted & (
         ~is_valid | is_converged | (state.iteration + 1 >= options.max_newton_iterations)
     )
     return _TrialAssessment(
-        is_accepted, has_failed, is_kink, jnp.where(alignment >= 0.0, 1.0, -1.0) / norm
+        is_accepted, has_failed, is_kink, jnp.where(alignment >= 0.0, 1.0, -1.0) / tangent_norm
     )
 
 
-def _is_doubtful(
+def _is_suspicious(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     state: ContinuationState,
     assessment: _TrialAssessment,
     new_point: ContinuationPoint,
 ) -> Bool[Array, ""]:
-    """Return whether an accepted trial may lie on another branch, which a shorter step may show."""
+    """Return whether an accepted trial may lie on another branch, which a shorter step may
+    avoid.
+    """
     if not problem.has_multipliers:
         return jnp.asarray(False)
     current_point = state.current_point
     turns_back = current_point.fraction_rate * new_point.fraction_rate < 0.0
-    is_explained = is_accounted_for(current_point.jacobian, new_point.jacobian, turns_back)
-    can_be_doubtful = (
+    is_explained = is_multiplier_change_explained(
+        current_point.jacobian, new_point.jacobian, turns_back
+    )
+    can_be_suspicious = (
         assessment.is_accepted
         & (state.n_points > 0)
-        & ~state.doubt.is_resolved
+        & ~state.suspicion.is_resolved
         & new_point.is_admissible
     )
-    return can_be_doubtful & ~is_explained
+    return can_be_suspicious & ~is_explained
 
 
 def _choose_next_ds(
     options: ArclengthOptions, state: ContinuationState, assessment: _TrialAssessment
 ) -> Scalar:
-    """Return the next continuation step.
+    """Return the length of the next continuation step.
 
-    The step grows after few Newton iterations, shrinks after many, and halves after a failure.
+    The step grows after few Newton iterations, shrinks after many, and is halved after a failure.
     """
-    is_quick, is_slow = state.iteration < 4, state.iteration >= 6
-    growth = jnp.where(is_quick, 1.4, jnp.where(is_slow, 0.6, 1.0))
-    longer_ds = jnp.minimum(state.ds * growth, options.max_ds)
+    converged_quickly, converged_slowly = state.iteration < 4, state.iteration >= 6
+    growth_factor = jnp.where(converged_quickly, 1.4, jnp.where(converged_slowly, 0.6, 1.0))
+    longer_ds = jnp.minimum(state.ds * growth_factor, options.max_ds)
     shorter_ds = jnp.where(assessment.has_failed, 0.5 * state.ds, state.ds)
     ds = jnp.where(assessment.is_accepted, longer_ds, shorter_ds)
     return jnp.where(state.n_points == 0, options.initial_ds, ds)
@@ -436,16 +464,24 @@ def _is_curve_closed(
     next_point: ContinuationPoint,
     bounds: Array,
 ) -> Bool[Array, ""]:
-    """Return whether the segment from one point to the next passes the branch's start."""
-    coordinates_of = lambda point: jnp.append(
+    """Return whether the segment from one point to the next contains the branch's start."""
+    get_coordinates = lambda point: jnp.append(
         problem.section_state(point.z), _fraction_from_parameter(point.p, bounds)
     )
-    chord = coordinates_of(next_point) - coordinates_of(current_point)
-    start_offset = coordinates_of(start) - coordinates_of(current_point)
-    chord_squared = chord @ chord
-    fraction = start_offset @ chord / jnp.where(chord_squared > 0.0, chord_squared, 1.0)
-    deviation = start_offset - fraction * chord
-    return (fraction >= 0.0) & (fraction <= 1.0) & (deviation @ deviation < 0.01 * chord_squared)
+    chord_vector = get_coordinates(next_point) - get_coordinates(current_point)
+    start_offset = get_coordinates(start) - get_coordinates(current_point)
+    squared_chord_length = chord_vector @ chord_vector
+    fraction = (
+        start_offset
+        @ chord_vector
+        / jnp.where(squared_chord_length > 0.0, squared_chord_length, 1.0)
+    )
+    deviation = start_offset - fraction * chord_vector
+    return (
+        (fraction >= 0.0)
+        & (fraction <= 1.0)
+        & (deviation @ deviation < 0.01 * squared_chord_length)
+    )
 
 
 def _update_status(
@@ -460,7 +496,7 @@ def _update_status(
     """Return the status after a trial; `next_length` is the length of the next step."""
     is_accepted, has_failed = assessment.is_accepted, assessment.has_failed
     n_points, status = state.n_points + is_accepted, state.status
-    for has_occurred, code in (
+    for has_occurred, status_code in (
         (ds < options.min_ds, ContinuationStatus.STEP_SIZE_UNDERFLOW),
         (has_failed & (state.n_points == 0), ContinuationStatus.START_NOT_FOUND),
         (is_accepted & (n_points >= options.max_points), ContinuationStatus.MAX_POINTS_REACHED),
@@ -471,7 +507,7 @@ def _update_status(
         (is_accepted & ~new_point.is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
         (is_accepted & is_closed & (state.n_points > 2), ContinuationStatus.CURVE_CLOSED),
     ):
-        status = jnp.where(has_occurred, int(code), status)
+        status = jnp.where(has_occurred, int(status_code), status)
     return status.astype(jnp.int32)
 
 
@@ -485,17 +521,44 @@ def _init_branch(
 ) -> ContinuationState:
     """Return the initial state of one branch, whose first trial is the given point."""
     x = problem.section_state(z)
-    n, dtype = x.shape[0], x.dtype
-    zero, zero_count, false = jnp.zeros((), dtype), jnp.zeros((), jnp.int32), jnp.asarray(False)
-    zero_tangent, fraction = jax.tree.map(jnp.zeros_like, z), _fraction_from_parameter(p, bounds)
-    point = ContinuationPoint(z, p, zero_tangent, zero + direction, jnp.zeros((n, n), dtype), false)
-    trial = _TrialPoint(
-        ConstraintPlane(x, fraction, jnp.zeros_like(x), zero + 1.0), z, fraction, zero, false
+    n_section, dtype = x.shape[0], x.dtype
+    zero_length, zero_count, constant_false = (
+        jnp.zeros((), dtype),
+        jnp.zeros((), jnp.int32),
+        jnp.asarray(False),
     )
-    running = zero_count + int(ContinuationStatus.RUNNING)
-    doubt, first_step = Doubt(zero, false), zero + options.initial_ds
+    zero_tangent, fraction = jax.tree.map(jnp.zeros_like, z), _fraction_from_parameter(p, bounds)
+    point = ContinuationPoint(
+        z,
+        p,
+        zero_tangent,
+        zero_length + direction,
+        jnp.zeros((n_section, n_section), dtype),
+        constant_false,
+    )
+    trial = _TrialPoint(
+        ConstraintPlane(x, fraction, jnp.zeros_like(x), zero_length + 1.0),
+        z,
+        fraction,
+        zero_length,
+        constant_false,
+    )
+    running_status = zero_count + int(ContinuationStatus.RUNNING)
+    suspicion, first_step = (
+        BranchJumpSuspicion(zero_length, constant_false),
+        zero_length + options.initial_ds,
+    )
     return ContinuationState(
-        point, point, point, first_step, trial, doubt, zero_count, zero_count, running, zero_count
+        point,
+        point,
+        point,
+        first_step,
+        trial,
+        suspicion,
+        zero_count,
+        zero_count,
+        running_status,
+        zero_count,
     )
 
 
@@ -521,7 +584,7 @@ def init_branches(
 
 
 def is_active(branches: BranchBatch) -> Array:
-    """Return for each branch whether its continuation still runs."""
+    """Return whether the continuation of each branch still runs."""
     return branches[0].status == int(ContinuationStatus.RUNNING)
 
 
@@ -531,13 +594,14 @@ def iterate_branches(
     batch_args: Any,
     bounds: Array,
     directions: Array,
-    buffer_rows: Array,
+    buffer_indices: Array,
     branches: BranchBatch,
     newton_steps: NewtonStep,
 ) -> BranchBatch:
-    """Advance each branch by one linearization of its trial, and store the accepted points.
+    """Advance each branch by one linearization of its trial, store accepted points, and return the
+    states.
 
-    The points of the branches are stored in the rows `buffer_rows` of the buffers.
+    The points of the branches are stored at the indices `buffer_indices` of the buffers.
     """
 
     def iterate_branch(
@@ -556,10 +620,10 @@ def iterate_branches(
         new_point = ContinuationPoint(
             corrector.z, p, tangent, assessment.fraction_rate, corrector.jacobian, is_admissible
         )
-        is_doubtful = _is_doubtful(problem, options, state, assessment, new_point)
+        is_suspicious = _is_suspicious(problem, options, state, assessment, new_point)
         assessment = assessment._replace(
-            is_accepted=assessment.is_accepted & ~is_doubtful,
-            has_failed=assessment.has_failed | is_doubtful,
+            is_accepted=assessment.is_accepted & ~is_suspicious,
+            has_failed=assessment.has_failed | is_suspicious,
         )
         current_point = tree_where(assessment.is_accepted, new_point, state.current_point)
         first_point = tree_where(
@@ -570,8 +634,8 @@ def iterate_branches(
         previous_point = tree_where(assessment.is_accepted, previous_point, state.previous_point)
         n_points = state.n_points + assessment.is_accepted
         ds = _choose_next_ds(options, state, assessment)
-        doubt = state.doubt.record_trial(is_doubtful, state.ds)
-        doubt, ds = doubt.resolve(assessment.is_accepted, ds, options.min_ds)
+        suspicion = state.suspicion.record_trial(is_suspicious, state.ds)
+        suspicion, ds = suspicion.resolve(assessment.is_accepted, ds, options.min_ds)
         next_trial = _predict_point(
             problem, previous_point, current_point, n_points > 1, ds, bounds
         )
@@ -586,20 +650,27 @@ def iterate_branches(
         iteration = jnp.where(is_finished, 0, state.iteration + 1)
         counters = n_points, status, state.n_linearizations + 1
         next_state = ContinuationState(
-            previous_point, current_point, first_point, ds, next_trial, doubt, iteration, *counters
+            previous_point,
+            current_point,
+            first_point,
+            ds,
+            next_trial,
+            suspicion,
+            iteration,
+            *counters,
         )
         return next_state, new_point, assessment.is_accepted
 
-    # Buffers are updated outside of `tree_where`, which would copy them at every iteration.
+    # Buffers are updated outside of `tree_where`, which would copy them in every iteration.
     state, points = branches
     next_states, new_points, is_accepted = jax.vmap(iterate_branch)(
         batch_args, directions, state, newton_steps
     )
     buffer_index = jnp.where(is_active(branches) & is_accepted, state.n_points, options.max_points)
-    write_row = lambda buffer, new_points: buffer.at[buffer_rows, buffer_index].set(
+    write_point = lambda buffer, new_points: buffer.at[buffer_indices, buffer_index].set(
         new_points, mode="drop"
     )
-    points = jax.tree.map(write_row, points, new_points._replace(tangent=()))
+    points = jax.tree.map(write_point, points, new_points._replace(tangent=()))
     return jax.vmap(tree_where)(is_active(branches), next_states, state), points
 
 
@@ -620,7 +691,7 @@ def continue_from(
     directions: Float[Array, "*branches"],
     is_requested: Bool[Array, "*branches"] | None = None,
 ) -> ContinuationResult:
-    """Continue the branches from the points near (z, p) in the given directions.
+    """Continue branches from the points near (z, p) in the given directions, and return all points.
 
     The parameter grows if the direction is 1 and shrinks if it is -1. The input is one branch, or
     several with a leading axis, of which only the requested ones run. Each branch ends at the end
@@ -637,26 +708,39 @@ def continue_from(
     is_requested = jnp.ones(p.shape, bool) if is_requested is None else is_requested
 
     def advance_group(branches: BranchBatch) -> BranchBatch:
-        rows = jnp.argsort(~is_active(branches), stable=True)[: batch_sizes.BRANCH_BATCH_SIZE]
-        group_args, group_directions, state = jax.tree.map(
-            lambda x: x[rows], (batch_args, directions, branches[0])
+        group_indices = jnp.argsort(~is_active(branches), stable=True)[
+            : batch_sizes.BRANCH_BATCH_SIZE
+        ]
+        group_args, group_directions, queue_state = jax.tree.map(
+            lambda x: x[group_indices], (batch_args, directions, branches[0])
         )
-        has_waiting = jnp.sum(is_active(branches)) > len(rows)
+        has_waiting_branch = jnp.sum(is_active(branches)) > len(group_indices)
 
         def advance_once(branches: BranchBatch) -> BranchBatch:
-            linearize_trial = lambda args, trial: newton_step_at_fraction(
+            linearize_trial = lambda args, trial: evaluate_newton_step_at_fraction(
                 problem, args, bounds, trial.z, trial.fraction
             )
             newton_steps = jax.vmap(linearize_trial)(group_args, branches[0].trial)
             return iterate_branches(
-                problem, options, group_args, bounds, group_directions, rows, branches, newton_steps
+                problem,
+                options,
+                group_args,
+                bounds,
+                group_directions,
+                group_indices,
+                branches,
+                newton_steps,
             )
 
-        has_active = lambda branches: jnp.where(
-            has_waiting, jnp.all(is_active(branches)), jnp.any(is_active(branches))
+        has_active_branch = lambda branches: jnp.where(
+            has_waiting_branch, jnp.all(is_active(branches)), jnp.any(is_active(branches))
         )
-        state, points = lax.while_loop(has_active, advance_once, (state, branches[1]))
-        return jax.tree.map(lambda x, new: x.at[rows].set(new), branches[0], state), points
+        queue_state, points = lax.while_loop(
+            has_active_branch, advance_once, (queue_state, branches[1])
+        )
+        return jax.tree.map(
+            lambda x, new_point: x.at[group_indices].set(new_point), branches[0], queue_state
+        ), points
 
     branches = init_branches(problem, options, z, p, bounds, directions, is_requested)
     return to_continuation_result(

@@ -1,7 +1,7 @@
 """Points of branches on constraint planes, and concurrent branches outside of compiled code.
 
-If a map is machine code for a batch of points, it is not traced: linearizations are called from
-outside of compiled code, and `arclength` performs the rest of each iteration.
+If a map is machine code for a batch of points, it is not traced. Linearizations are then called
+from outside of compiled code, and `arclength` performs the rest of each iteration.
 """
 
 import functools
@@ -24,10 +24,10 @@ from vrw_jax.continuation.arclength import (
     NewtonStep,
     Unknowns,
     correct_point,
+    evaluate_newton_step_at_fraction,
     init_branches,
     is_active,
     iterate_branches,
-    newton_step_at_fraction,
     parameter_from_fraction,
     to_continuation_result,
 )
@@ -82,9 +82,11 @@ def iterate_plane_solve(
     )
     # The last Jacobian is exact if the correction is negligible; then no other iteration follows.
     negligible_correction = options.jacobian_reuse_fraction * options.tolerance
-    n_counted = jnp.where(next_corrector.correction_norm < negligible_correction, 2, 1)
+    n_converged_before = jnp.where(next_corrector.correction_norm < negligible_correction, 2, 1)
     n_converged = jnp.where(
-        next_corrector.correction_norm < options.tolerance, state.n_converged + n_counted, 0
+        next_corrector.correction_norm < options.tolerance,
+        state.n_converged + n_converged_before,
+        0,
     )
     return PlaneSolveState(next_corrector, state.n_iterations + 1, n_converged)
 
@@ -96,7 +98,9 @@ def finish_plane_solve(
     plane: ConstraintPlane,
     state: PlaneSolveState,
 ) -> tuple[ContinuationPoint, Bool[Array, ""]]:
-    """Return the point, and whether it converged; its rate is positive along the plane's normal."""
+    """Return the point and whether it converged; the parameter's rate is that along the plane's
+    normal.
+    """
     corrector, p = state.corrector, parameter_from_fraction(state.corrector.fraction, bounds)
     is_admissible = problem.is_admissible(args, corrector.z, p)
     section_tangent = problem.section_state(corrector.tangent)
@@ -124,13 +128,13 @@ def solve_on_plane(
     """
 
     def iterate_once(state: PlaneSolveState) -> PlaneSolveState:
-        newton_step = newton_step_at_fraction(
+        newton_step = evaluate_newton_step_at_fraction(
             problem, args, bounds, state.corrector.z, state.corrector.fraction
         )
         return iterate_plane_solve(problem, options, bounds, plane, state, newton_step)
 
-    needs_more = functools.partial(needs_iteration, options)
-    state = lax.while_loop(needs_more, iterate_once, init_plane_solve(z, plane))
+    needs_more_iterations = functools.partial(needs_iteration, options)
+    state = lax.while_loop(needs_more_iterations, iterate_once, init_plane_solve(z, plane))
     return finish_plane_solve(problem, args, bounds, plane, state)
 
 
@@ -144,16 +148,18 @@ def continue_many_from(
     directions: Float[Array, " branches"],
     is_requested: Bool[Array, " branches"],
 ) -> ContinuationResult:
-    """Continue branches as `arclength.continue_from` does, outside of compiled code."""
+    """Continue branches as `arclength.continue_from` does, outside of compiled code, and return
+    all points.
+    """
     branches = init_branches(problem, options, z, p, bounds, directions, is_requested)
-    buffer_rows = jnp.arange(len(p))
+    buffer_indices = jnp.arange(len(p))
     while np.any(is_unfinished := np.asarray(_is_active_jit(branches))):
         trial = branches[0].trial
         newton_steps = _linearize_selected(
             problem, batch_args, bounds, trial.z, trial.fraction, is_unfinished
         )
         branches = _iterate_branches_jit(
-            problem, options, batch_args, bounds, directions, buffer_rows, branches, newton_steps
+            problem, options, batch_args, bounds, directions, buffer_indices, branches, newton_steps
         )
     return to_continuation_result(branches)
 
@@ -170,10 +176,14 @@ def _linearize_selected(
     lower_bound, upper_bound = np.asarray(bounds)
     p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
     selected_steps = problem.linearize(*jax.device_put(take_rows((batch_args, z, p), is_selected)))
-    make_nan_rows = lambda x: np.full((len(is_selected), *x.shape[1:]), np.nan)
-    all_steps = jax.tree.map(make_nan_rows, selected_steps)
-    for target, x in zip(jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True):
-        target[is_selected] = x
+    fill_with_nan = lambda selected_values: np.full(
+        (len(is_selected), *selected_values.shape[1:]), np.nan
+    )
+    all_steps = jax.tree.map(fill_with_nan, selected_steps)
+    for all_values, selected_values in zip(
+        jax.tree.leaves(all_steps), jax.tree.leaves(selected_steps), strict=True
+    ):
+        all_values[is_selected] = selected_values
     return jax.device_put(all_steps)
 
 

@@ -1,8 +1,8 @@
-"""Whether two neighboring points are on one branch, by their multipliers.
+"""Test by the multipliers whether two neighboring points are on one branch.
 
 A continuation step may pass several special points, or reach another branch nearby. Both change the
 number of multipliers outside the unit circle, or the sign of the determinant of Newton's equations
-along the branch, which changes at branch points alone.
+along the branch. That sign changes only at branch points.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from vrw_jax.continuation.floquet import (
 from vrw_jax.numerics import Scalar
 
 
-def is_accounted_for(
+def is_multiplier_change_explained(
     jacobian_before: Float[Array, "n n"],
     jacobian_after: Float[Array, "n n"],
     turns_back: Bool[Array, ""],
@@ -29,52 +29,62 @@ def is_accounted_for(
 ) -> Bool[Array, ""]:
     """Return whether bifurcations explain the change of the multipliers between two points.
 
-    `turns_back` is whether the parameter turns back between the points.
+    The flag `turns_back` is True if the parameter turns back between the points.
     """
     margins_before, margins_after = map(bifurcation_margins, (jacobian_before, jacobian_after))
     has_sign_change = margins_before * margins_after < 0.0
-    crosses_branch = has_sign_change[0] != turns_back
+    crosses_other_branch = has_sign_change[0] != turns_back
     if jacobian_before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
-        return ~crosses_branch  # Eigenvalues of larger matrices are computed on CPUs alone.
+        return ~crosses_other_branch  # Eigenvalues of larger matrices are computed on CPUs alone.
     n_explained = has_sign_change[0].astype(int) + has_sign_change[1]
     n_explained = n_explained + (2 * has_sign_change[2] if len(has_sign_change) > 2 else 0)
 
     def count_outside(jacobian: Array) -> tuple[Array, Array]:
-        """Return the least and the largest number of multipliers outside the unit circle."""
+        """Return the least and the largest possible number of multipliers outside the unit
+        circle.
+        """
         moduli, tolerance = jnp.abs(floquet_multipliers(jacobian)), tolerances.on_circle
         return jnp.sum(moduli > 1.0 + tolerance), jnp.sum(moduli > 1.0 - tolerance)
 
     min_before, max_before = count_outside(jacobian_before)
     min_after, max_after = count_outside(jacobian_after)
     n_changed = jnp.maximum(min_after - max_before, min_before - max_after)
-    return ~crosses_branch & (n_changed <= n_explained)
+    return ~crosses_other_branch & (n_changed <= n_explained)
 
 
-class Doubt(NamedTuple):
-    """Doubt whether the last step of a continuation left the branch, which shortens the next ones.
+class BranchJumpSuspicion(NamedTuple):
+    """Suspicion that the last step of a continuation left the branch, which shortens the next
+    steps.
 
-    - `step`: length of the first doubtful step, 0 if there is no doubt;
+    - `suspicious_step`: length of the first suspicious step, 0 if there is none;
     - `is_resolved`: whether no shorter step helped, so that the next step is accepted whatever its
       multipliers are.
     """
 
-    step: Scalar
+    suspicious_step: Scalar
     is_resolved: Bool[Array, ""]
 
-    def record_trial(self, is_doubtful: Bool[Array, ""], step: Scalar) -> "Doubt":
-        """Return the doubt after a trial of length `step`."""
-        is_first = is_doubtful & (self.step == 0.0)
-        return self._replace(step=jnp.where(is_first, step, self.step))
+    def record_trial(
+        self, is_suspicious: Bool[Array, ""], trial_step: Scalar
+    ) -> "BranchJumpSuspicion":
+        """Return the suspicion after a trial of length `trial_step`."""
+        is_first = is_suspicious & (self.suspicious_step == 0.0)
+        return self._replace(suspicious_step=jnp.where(is_first, trial_step, self.suspicious_step))
 
     def resolve(
-        self, is_accepted: Bool[Array, ""], step: Scalar, min_step: float
-    ) -> tuple["Doubt", Scalar]:
-        """Return the doubt before the next trial, and the length of its step.
+        self, is_accepted: Bool[Array, ""], proposed_step: Scalar, min_step: float
+    ) -> tuple["BranchJumpSuspicion", Scalar]:
+        """Return the suspicion before the next trial, and the length of that trial's step.
 
-        The length is `step`, or that of the first doubtful step if `step` is too short.
+        The length is `proposed_step`, or that of the first suspicious step if `proposed_step` is
+        too short.
         """
-        is_too_short = (self.step > 0.0) & ~self.is_resolved & (step < min_step)
-        next_step = jnp.where(is_too_short, self.step, step)
-        has_passed = is_accepted & (self.is_resolved | (next_step >= self.step))
+        is_too_short = (self.suspicious_step > 0.0) & ~self.is_resolved & (proposed_step < min_step)
+        trial_step = jnp.where(is_too_short, self.suspicious_step, proposed_step)
+        has_passed_suspicious_step = is_accepted & (
+            self.is_resolved | (trial_step >= self.suspicious_step)
+        )
         is_resolved = jnp.where(is_accepted, False, self.is_resolved | is_too_short)
-        return Doubt(jnp.where(has_passed, 0.0, self.step), is_resolved), next_step
+        return BranchJumpSuspicion(
+            jnp.where(has_passed_suspicious_step, 0.0, self.suspicious_step), is_resolved
+        ), trial_step

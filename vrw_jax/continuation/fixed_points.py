@@ -48,7 +48,9 @@ class FixedPointResult(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return whether Newton's method converged, as a sentence; a batch has an array of them."""
+        """Return whether Newton's method converged, as a sentence; for a batch, an array of
+        sentences.
+        """
         return describe_elements(_describe_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
@@ -69,7 +71,7 @@ class FixedPointResult(NamedTuple):
 
 
 def _describe_convergence(converged: bool, n_iterations: int) -> str:
-    """Return the sentence about one fixed point."""
+    """Return a sentence on the convergence to one fixed point."""
     if converged:
         return f"Newton's method converged after {n_iterations} iterations."
     return (
@@ -79,7 +81,9 @@ def _describe_convergence(converged: bool, n_iterations: int) -> str:
 
 
 MAX_NEWTON_ITERATIONS = 30
-"""Default limit of Newton's iterations, chosen far above the number that a near start needs."""
+"""Default limit of Newton's iterations, chosen far above the number that a start near the point
+needs.
+"""
 
 
 @refuse_renamed_arguments(iterations="max_iterations")
@@ -149,7 +153,7 @@ def _solve_checked(
     tolerance: float | Scalar,
     iterations: int,
 ) -> FixedPointResult:
-    """Validate the arguments, and return the fixed point by one of the two methods below."""
+    """Check the arguments, and return the fixed point by one of the two methods below."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     iterations = check_int("iterations", iterations)
@@ -169,15 +173,15 @@ def _solve_checked(
             "its like: take a map of a state to the next."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    static = (run_newton, function, period_n, iterations)
+    map_and_iterations = (run_newton, function, period_n, iterations)
     arguments = start, tolerance
-    is_cached = isinstance(function, ReturnMap)
-    program = find_program(_solve, static, *arguments) if is_cached else None
-    return (program or functools.partial(_solve, static))(*arguments)
+    uses_program_cache = isinstance(function, ReturnMap)
+    program = find_program(_solve, map_and_iterations, *arguments) if uses_program_cache else None
+    return (program or functools.partial(_solve, map_and_iterations))(*arguments)
 
 
-def _solve(static: tuple, start: Array, tolerance: Array) -> FixedPointResult:
-    run_newton, function, period_n, iterations = static
+def _solve(map_and_iterations: tuple, start: Array, tolerance: Array) -> FixedPointResult:
+    run_newton, function, period_n, iterations = map_and_iterations
 
     def iterate(x: Array) -> Array:
         for _ in range(period_n):
@@ -194,22 +198,25 @@ ConvertedMap = Callable[..., Array]
 def _newton_correction(
     converted_map: ConvertedMap, x: Array, closed_over: tuple
 ) -> tuple[Array, Array, Array]:
-    """Return Newton's correction, the map's Jacobian, and the defect of the map."""
+    """Return Newton's correction, the map's Jacobian, and the defect map(x) - x."""
     image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over), x)
     defect = image_point - x
     return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, defect), jacobian, defect
 
 
 N_DERIVATIVE_ITERATIONS = 2
-"""Number of iterations with derivatives, chosen because a single one gives only first derivatives
-of the point."""
+"""Number of iterations with derivatives, chosen because a single one gives only first
+derivatives of the point.
+"""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton(
     converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
 ) -> FixedPointResult:
-    """Run Newton's method in one loop, so that the map, often a large program, is compiled once."""
+    """Return the fixed point by Newton's method in one loop, in which the map, often a large
+    program, is compiled once.
+    """
 
     def is_searching(correction_norm: Array, n_iterations: Array) -> Array:
         return (
@@ -228,7 +235,8 @@ def _run_newton(
         x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
         n_searching = is_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
         correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
-        # It is checked in the last iterations too, because the map may jump next to the point.
+        # The correction is also checked in the last iterations, because the map may jump near the
+        # point.
         correction_norm = jnp.max(jnp.abs(correction))
         next_x = jnp.where(jnp.all(jnp.isfinite(correction)), x + correction, x)
         return (
@@ -240,12 +248,12 @@ def _run_newton(
             jnp.max(jnp.abs(defect)),
         )
 
-    zero, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    zero_count, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
     initial_state = (
         start,
         unit_norm,
-        zero,
-        zero,
+        zero_count,
+        zero_count,
         jnp.zeros((start.size,) * 2, start.dtype),
         unit_norm,
     )
@@ -263,7 +271,7 @@ def _run_newton(
 def _run_newton_jvp(
     converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the fixed point and its tangent, by iterations with derivatives from it."""
+    """Return the fixed point and its tangent, by iterations with derivatives from the point."""
     start, _, *closed_over = primals
     result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
 
@@ -288,7 +296,9 @@ def _run_newton_jvp(
 def _run_newton_implicit(
     converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
 ) -> FixedPointResult:
-    """Run Newton's method; its derivative rule is that of the implicit function theorem."""
+    """Return the fixed point by Newton's method, with the derivative rule of the implicit
+    function theorem.
+    """
     return _run_newton(converted_map, iterations, start, tolerance, *closed_over)
 
 

@@ -2,8 +2,8 @@
 
 Matrices are Jacobians of a return map, shape (..., n, n) with n = 1, 2 or 3. For larger matrices,
 LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU.
-Eigenvalues are not differentiable if two of them meet; the Jury margins, polynomials of the matrix,
-are.
+Eigenvalues are not differentiable if two of them are equal. The Jury margins, which are polynomials
+of the matrix, are always differentiable.
 """
 
 import functools
@@ -22,22 +22,23 @@ MAX_CLOSED_FORM_SIZE = 3
 """Size of the largest matrix whose characteristic polynomial is solved in closed form."""
 
 SMOOTH_MIN_SHARPNESS = 50.0
-"""Sharpness of the smooth minimum in `stability_margin`, chosen because it is then at most
-log(4)/50 below the minimum."""
+"""Sharpness of the smooth minimum in `stability_margin`, chosen because the result is then at
+most log(4)/50 below the minimum.
+"""
 
 
 @dataclass(frozen=True)
 class MultiplierTolerances:
-    """Distances at which multipliers count as equal, real or on the unit circle.
+    """Distances within which multipliers count as equal, real or on the unit circle.
 
-    - `on_circle`: distance from modulus 1 within which a multiplier counts to either side, chosen
-      because multipliers of maps that preserve areas are on the circle but for round-off, which is
-      1e-8 if two meet;
+    - `on_circle`: distance from modulus 1 within which a multiplier counts to either side. It is
+      chosen because multipliers of maps that preserve areas are on the circle up to round-off,
+      which is 1e-8 if two are equal;
     - `located_on_circle`: largest distance from modulus 1 of the pair of a located Neimark-Sacker
       bifurcation;
-    - `min_imaginary`: imaginary part below which multipliers on the unit circle count as real,
-      chosen because three equal real ones are computed with imaginary parts of 1e-5;
-    - `equal_moduli`: distance between moduli of ranks that cross the circle at once, chosen as
+    - `min_imaginary`: imaginary part below which multipliers on the unit circle count as real. It
+      is chosen because three equal real ones are computed with imaginary parts of 1e-5;
+    - `equal_moduli`: distance between moduli of ranks that cross the circle together, chosen as
       `on_circle`.
     """
 
@@ -48,29 +49,40 @@ class MultiplierTolerances:
 
 
 MULTIPLIER_TOLERANCES = MultiplierTolerances()
-"""Tolerances of all continuations."""
+"""Tolerances of multipliers, for all continuations."""
 
 
 def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
     """Return the coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
-    m = lambda i, j: matrix[..., i, j]
+    entries = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
         raise ValueError(
             f"the matrix has shape {matrix.shape}, but multipliers are built for 1x1, 2x2 and 3x3."
         )
     if n == 1:
-        return (-m(0, 0),)
+        return (-entries(0, 0),)
     if n == 2:
-        return m(0, 0) * m(1, 1) - m(0, 1) * m(1, 0), -(m(0, 0) + m(1, 1))
-    minors = [m(i, i) * m(j, j) - m(i, j) * m(j, i) for i, j in ((0, 1), (0, 2), (1, 2))]
-    cofactors = [
-        m(1, 1) * m(2, 2) - m(1, 2) * m(2, 1),
-        m(1, 2) * m(2, 0) - m(1, 0) * m(2, 2),
-        m(1, 0) * m(2, 1) - m(1, 1) * m(2, 0),
+        return entries(0, 0) * entries(1, 1) - entries(0, 1) * entries(1, 0), -(
+            entries(0, 0) + entries(1, 1)
+        )
+    minors = [
+        entries(i, i) * entries(j, j) - entries(i, j) * entries(j, i)
+        for i, j in ((0, 1), (0, 2), (1, 2))
     ]
-    determinant = m(0, 0) * cofactors[0] + m(0, 1) * cofactors[1] + m(0, 2) * cofactors[2]
-    return -determinant, minors[0] + minors[1] + minors[2], -(m(0, 0) + m(1, 1) + m(2, 2))
+    cofactors = [
+        entries(1, 1) * entries(2, 2) - entries(1, 2) * entries(2, 1),
+        entries(1, 2) * entries(2, 0) - entries(1, 0) * entries(2, 2),
+        entries(1, 0) * entries(2, 1) - entries(1, 1) * entries(2, 0),
+    ]
+    determinant = (
+        entries(0, 0) * cofactors[0] + entries(0, 1) * cofactors[1] + entries(0, 2) * cofactors[2]
+    )
+    return (
+        -determinant,
+        minors[0] + minors[1] + minors[2],
+        -(entries(0, 0) + entries(1, 1) + entries(2, 2)),
+    )
 
 
 def _safe_sqrt(x: Array) -> Array:
@@ -102,24 +114,30 @@ def _solve_quadratic(a0: Array, a1: Array) -> _EigenvaluePair:
 def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the others.
 
-    The root is computed without derivative. Newton's method then makes it exact, with derivatives
+    The root is computed without derivatives. Newton's method then makes it exact, with derivatives
     up to order 3.
     """
     b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
-    shift = -b2 / 3.0
-    p = b1 - b2 * b2 / 3.0  # z = shift + y with y^3 + p y + q = 0
-    q = b0 + shift * (b1 + shift * (b2 + shift))
+    mean_root = -b2 / 3.0
+    p = b1 - b2 * b2 / 3.0  # The shifted root y = z - mean_root satisfies y^3 + p y + q = 0.
+    q = b0 + mean_root * (b1 + mean_root * (b2 + mean_root))
     discriminant = 0.25 * q * q + p * p * p / 27.0
     has_three_real_roots = discriminant < 0.0
-    # If there is one real root, it is the sum of cube roots without cancellation.
-    larger = jnp.cbrt(-0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant))
-    one_root = larger - jnp.where(larger == 0.0, 0.0, p / (3.0 * jnp.where(larger == 0, 1, larger)))
-    # If there are three real roots, it is the extreme one on the side where it is isolated.
+    # A single real root is the sum of two cube roots, computed without cancellation.
+    larger_cube_root = jnp.cbrt(
+        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant)
+    )
+    single_root = larger_cube_root - jnp.where(
+        larger_cube_root == 0.0,
+        0.0,
+        p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
+    )
+    # Of three real roots, the extreme one on the isolated side is computed.
     radius = 2.0 * _safe_sqrt(-p / 3.0)
     cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
-    extreme = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
-    z = shift + jnp.where(
-        has_three_real_roots, jnp.where(cosine >= 0.0, extreme, -extreme), one_root
+    extreme_root = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
+    z = mean_root + jnp.where(
+        has_three_real_roots, jnp.where(cosine >= 0.0, extreme_root, -extreme_root), single_root
     )
     for _ in range(3):
         value = a0 + z * (a1 + z * (a2 + z))
@@ -147,7 +165,7 @@ def _split_eigenvalues(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair
 
 @jax.jit
 def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
-    """Return all eigenvalues, the one of largest modulus first."""
+    """Return all eigenvalues, largest modulus first."""
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return _sort_by_modulus(jnp.linalg.eigvals(matrix))
     isolated_values, pair = _split_eigenvalues(matrix)
@@ -171,7 +189,7 @@ def _sort_by_modulus(values: Array) -> Array:
 def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of an eigenvalue.
 
-    If two eigenvalues meet, its derivative is one-sided or zero.
+    If two eigenvalues are equal, its derivative is one-sided or zero.
     """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return jnp.abs(floquet_multipliers(matrix)[..., 0])
@@ -185,10 +203,12 @@ def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
 
 @jax.jit
 def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
-    """Return polynomials of the matrix that are positive exactly if all multipliers are stable.
+    """Return polynomials of the matrix that are all positive if and only if all multipliers are
+    stable.
 
     The first vanishes at a fold (multiplier 1), the second at a period doubling (-1). The third,
-    for n > 1, vanishes if a pair crosses the circle. For n = 3 the fourth completes the criterion.
+    for n > 1, vanishes if a pair crosses the unit circle. For n = 3 the fourth completes the
+    criterion.
     """
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
@@ -206,7 +226,7 @@ def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
 def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
     """Return the first three Jury margins (two for n = 1) of a matrix of any size.
 
-    Beyond closed forms they are det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j
+    For large matrices they are det(1 - matrix), det(1 + matrix), and the product of 1 - z_i z_j
     over all pairs of eigenvalues.
     """
     n = matrix.shape[-1]
@@ -224,20 +244,21 @@ def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
 def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return a smooth minimum of the Jury margins, which is never above the smallest one.
 
-    A positive value means stable.
+    A positive value means that the gait is stable.
     """
     margins = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
-    lowest = lax.stop_gradient(jnp.min(margins, -1))
-    excess = jnp.sum(jnp.exp(lowest[..., None] - margins), -1)
-    return (lowest - jnp.log(excess)) / SMOOTH_MIN_SHARPNESS
+    lowest_margin = lax.stop_gradient(jnp.min(margins, -1))
+    scaled_excess = jnp.sum(jnp.exp(lowest_margin[..., None] - margins), -1)
+    return (lowest_margin - jnp.log(scaled_excess)) / SMOOTH_MIN_SHARPNESS
 
 
 @jax.jit
 def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[Array, "..."]:
-    """Return whether the two largest moduli agree within `tolerance`.
+    """Return whether the two largest moduli agree within `tolerance`, so that the spectral radius
+    has a kink.
 
-    The spectral radius has a kink there. The moduli of a complex pair always agree and are smooth,
-    so that a pair counts only if it is about to become real.
+    The moduli of a complex pair always agree and are smooth, so that a pair counts only if it is
+    about to become real.
     """
     isolated_values, pair = _split_eigenvalues(matrix)
     if pair is None:

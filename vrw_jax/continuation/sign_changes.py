@@ -23,7 +23,7 @@ BIFURCATION_NAMES = ("fold", "period_doubling", "neimark_sacker")
 
 @dataclass(frozen=True)
 class ZeroSearchOptions:
-    """Numbers of the search for zeros of `locate_zeros`.
+    """Options of the search for zeros by `locate_zeros`.
 
     - `max_smooth_rounds`: limit of rounds to locate a smooth zero, after which an unresolved
       bracket counts as a jump;
@@ -35,7 +35,7 @@ class ZeroSearchOptions:
 
 
 ZERO_SEARCH_OPTIONS = ZeroSearchOptions()
-"""Options of all searches."""
+"""Options of all searches for zeros."""
 
 
 def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
@@ -46,8 +46,8 @@ def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     """
     margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
     values = np.full((*margins.shape[:-1], len(BIFURCATION_NAMES)), np.nan)
-    n = min(margins.shape[-1], len(BIFURCATION_NAMES))
-    values[..., :n] = margins[..., :n]
+    n_margins = min(margins.shape[-1], len(BIFURCATION_NAMES))
+    values[..., :n_margins] = margins[..., :n_margins]
     return values
 
 
@@ -74,22 +74,25 @@ class SignChange(NamedTuple):
 
 
 def find_sign_changes(values: np.ndarray) -> list[SignChange]:
-    """Return the sign changes between neighboring points in `values` (point, quantity).
+    """Return the sign changes between neighboring points of `values`, an array (point, quantity).
 
-    NaN and zero have no sign. Two changes between neighbors are not detected, so the continuation
-    step must be short enough.
+    NaN and zero have no sign. Two changes between neighboring points are not detected, so the
+    continuation step must be short enough.
     """
     signs = np.sign(np.nan_to_num(values))
-    rows = np.argwhere(signs[:-1] * signs[1:] < 0.0)
-    return [SignChange(int(i), int(i) + 1, int(q)) for i, q in rows]
+    signed_points = np.argwhere(signs[:-1] * signs[1:] < 0.0)
+    return [
+        SignChange(int(position), int(position) + 1, int(quantity_index))
+        for position, quantity_index in signed_points
+    ]
 
 
 class LocatedZeros(NamedTuple):
     """Locations of sign changes in [0, 1], one per bracket."""
 
-    best: np.ndarray  # the side with the smaller value
-    left_end: np.ndarray  # with the sign at location 0
-    right_end: np.ndarray  # with the sign at location 1
+    best: np.ndarray  # location of the end with the smaller value
+    left_end: np.ndarray  # end with the sign at location 0
+    right_end: np.ndarray  # end with the sign at location 1
 
 
 def locate_zeros(
@@ -98,7 +101,8 @@ def locate_zeros(
     width: np.ndarray,
     options: ZeroSearchOptions = ZERO_SEARCH_OPTIONS,
 ) -> LocatedZeros:
-    """Return zeros of functions with opposite signs at 0 and 1, by Chandrupatla's method.
+    """Return the locations of zeros of functions with opposite signs at 0 and 1, by Chandrupatla's
+    method.
 
     `function` takes locations and the indices of their brackets; `end_values` are its values at 0
     and 1. A round uses inverse quadratic interpolation if it is reliable, and otherwise bisection.
@@ -108,17 +112,20 @@ def locate_zeros(
     side of 1.
     """
     values_at_zero, values_at_one = end_values
-    # Rows: the newest location, the end of the other sign, and the location that it replaced.
-    x = np.outer((0.0, 1.0, 1.0), np.ones_like(width))
-    f = np.stack([values_at_zero, values_at_one, values_at_one])
+    # The rows are the newest location, the end with the other sign, and the location replaced by
+    # the newest one.
+    locations = np.outer((0.0, 1.0, 1.0), np.ones_like(width))
+    function_values = np.stack([values_at_zero, values_at_one, values_at_one])
     is_jump, n_rounds, n_sections = np.zeros(len(width), bool), 0, options.n_sections
-    while len(unresolved_indices := np.flatnonzero(np.abs(x[0] - x[1]) > width)):
+    while len(unresolved_indices := np.flatnonzero(np.abs(locations[0] - locations[1]) > width)):
         smooth_brackets = unresolved_indices[~is_jump[unresolved_indices]]
         jump_brackets = unresolved_indices[is_jump[unresolved_indices]]
         proposals = _propose_location(
-            x[:, smooth_brackets], f[:, smooth_brackets], width[smooth_brackets]
+            locations[:, smooth_brackets],
+            function_values[:, smooth_brackets],
+            width[smooth_brackets],
         )
-        lower_ends, upper_ends = np.sort(x[:2, jump_brackets], 0)
+        lower_ends, upper_ends = np.sort(locations[:2, jump_brackets], 0)
         section_ends = np.linspace(lower_ends, upper_ends, n_sections + 1, axis=-1)
         bracket_indices = np.concatenate(
             [smooth_brackets, np.repeat(jump_brackets, n_sections - 1)]
@@ -128,47 +135,74 @@ def locate_zeros(
         )
         is_undefined = np.isnan(values)
         values = np.where(is_undefined, values_at_one[bracket_indices], values)
-        value = values[: len(smooth_brackets)]
+        proposal_values = values[: len(smooth_brackets)]
         section_values = values[len(smooth_brackets) :].reshape(-1, n_sections - 1)
-        has_same_sign = np.sign(value) == np.sign(f[0, smooth_brackets])
-        for table, newest_row in ((x, proposals), (f, value)):
-            first_row, other_row, _ = table[:, smooth_brackets]
-            table[:, smooth_brackets] = (
-                newest_row,
-                np.where(has_same_sign, other_row, first_row),
-                np.where(has_same_sign, first_row, other_row),
+        has_same_sign = np.sign(proposal_values) == np.sign(function_values[0, smooth_brackets])
+        for stored_values, proposed_values in (
+            (locations, proposals),
+            (function_values, proposal_values),
+        ):
+            newest_values, opposite_values, _ = stored_values[:, smooth_brackets]
+            stored_values[:, smooth_brackets] = (
+                proposed_values,
+                np.where(has_same_sign, opposite_values, newest_values),
+                np.where(has_same_sign, newest_values, opposite_values),
             )
-        x[1, smooth_brackets[value == 0.0]] = proposals[value == 0.0]
+        locations[1, smooth_brackets[proposal_values == 0.0]] = proposals[proposal_values == 0.0]
         is_left_side = np.sign(section_values) != np.sign(values_at_one[jump_brackets])[:, None]
         # The last location on the side of 0 precedes the first one on the side of 1.
-        last_left = np.sum(np.cumprod(is_left_side, 1), 1)
-        x[:2, jump_brackets] = section_ends[
-            np.arange(len(jump_brackets)), np.stack([last_left, last_left + 1])
+        last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
+        locations[:2, jump_brackets] = section_ends[
+            np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])
         ]
         n_rounds += 1
         is_jump[smooth_brackets] = (
             is_undefined[: len(smooth_brackets)]
-            | (value == f[2, smooth_brackets])
+            | (proposal_values == function_values[2, smooth_brackets])
             | (n_rounds >= options.max_smooth_rounds)
         )
     best_location = np.where(
-        is_jump, np.min(x[:2], 0), np.where(np.abs(f[0]) < np.abs(f[1]), x[0], x[1])
+        is_jump,
+        np.min(locations[:2], 0),
+        np.where(
+            np.abs(function_values[0]) < np.abs(function_values[1]), locations[0], locations[1]
+        ),
     )
-    return LocatedZeros(best_location, *np.sort(x[:2], 0))
+    return LocatedZeros(best_location, *np.sort(locations[:2], 0))
 
 
-def _propose_location(x: np.ndarray, f: np.ndarray, width: np.ndarray) -> np.ndarray:
+def _propose_location(
+    locations: np.ndarray, function_values: np.ndarray, width: np.ndarray
+) -> np.ndarray:
     """Return the next locations of Chandrupatla's method (1997, doi 10/d9zjj8)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        xi, phi = (x[0] - x[1]) / (x[2] - x[1]), (f[0] - f[1]) / (f[2] - f[1])
-        is_trusted = (1.0 - np.sqrt(1.0 - xi) < phi) & (phi < np.sqrt(xi))
-        interpolated_fraction = f[0] / (f[0] - f[1]) * f[2] / (f[2] - f[1])
-        interpolated_fraction -= (
-            (x[2] - x[0]) / (x[1] - x[0]) * f[0] / (f[2] - f[0]) * f[1] / (f[1] - f[2])
+        location_ratio, value_ratio = (
+            (locations[0] - locations[1]) / (locations[2] - locations[1]),
+            (function_values[0] - function_values[1]) / (function_values[2] - function_values[1]),
         )
-    span = x[1] - x[0]
-    margin = 0.5 * width / np.abs(span)
+        is_trusted = (1.0 - np.sqrt(1.0 - location_ratio) < value_ratio) & (
+            value_ratio < np.sqrt(location_ratio)
+        )
+        interpolated_fraction = (
+            function_values[0]
+            / (function_values[0] - function_values[1])
+            * function_values[2]
+            / (function_values[2] - function_values[1])
+        )
+        interpolated_fraction -= (
+            (locations[2] - locations[0])
+            / (locations[1] - locations[0])
+            * function_values[0]
+            / (function_values[2] - function_values[0])
+            * function_values[1]
+            / (function_values[1] - function_values[2])
+        )
+    bracket_length = locations[1] - locations[0]
+    min_fraction = 0.5 * width / np.abs(bracket_length)
     return (
-        x[0]
-        + np.clip(np.where(is_trusted, interpolated_fraction, 0.5), margin, 1.0 - margin) * span
+        locations[0]
+        + np.clip(
+            np.where(is_trusted, interpolated_fraction, 0.5), min_fraction, 1.0 - min_fraction
+        )
+        * bracket_length
     )

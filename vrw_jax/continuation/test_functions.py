@@ -1,7 +1,7 @@
 """Curves in two parameters on which a test function of fixed points is zero, for `arclength`.
 
-The second parameter joins the unknowns of Newton's method, and the test function joins its
-equations. A curve is then a branch along the first parameter, through turning points as through
+The second parameter is added to the unknowns of Newton's method, and the test function to its
+equations. A curve is then a branch along the first parameter, which turns back as branches do at
 folds.
 """
 
@@ -29,11 +29,13 @@ ParameterPair = Float[Array, "2"]
 class TestFunctionNewtonStep(NamedTuple):
     """Newton step at a trial (z, p), and the test function whose zero is continued."""
 
-    correction: Unknowns  # of z at fixed p
-    tangents: tuple[Unknowns, Unknowns]  # dz/dp along the curve of fixed points
-    jacobian: Float[Array, "n n"]  # of the return map
-    value: Scalar  # of the test function at the corrected z
-    parameter_gradient: ParameterPair  # derivatives of the value by p along the fixed points
+    correction: Unknowns  # correction of z at fixed p
+    # dz/dp along the curve of fixed points, for both parameters
+    tangents: tuple[Unknowns, Unknowns]
+    jacobian: Float[Array, "n n"]  # Jacobian of the return map
+    value: Scalar  # value of the test function at the corrected z
+    # derivatives of the value with respect to p along the fixed points
+    parameter_gradient: ParameterPair
 
 
 class AbstractTestFunction(eqx.Module):
@@ -44,14 +46,14 @@ class AbstractTestFunction(eqx.Module):
 
     @abc.abstractmethod
     def linearize(self, args: Any, z: Unknowns, p: ParameterPair) -> TestFunctionNewtonStep:
-        """Return the Newton step; it is not finite if the map is undefined there."""
+        """Return the Newton step; it is not finite if the map is undefined at (z, p)."""
 
     @abc.abstractmethod
     def section_state(self, z: Unknowns) -> SectionVector:
-        """Return the section state, a part of z."""
+        """Return the section state, which is a part of z."""
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
-        """Return the norm of a correction that is compared with the tolerance."""
+        """Return the norm of a correction, which is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
     def is_admissible(self, args: Any, z: Unknowns, p: ParameterPair) -> Bool[Array, ""]:
@@ -63,42 +65,44 @@ class TestFunctionPoint(NamedTuple):
     """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
 
     z: Unknowns
-    fraction: Elementwise  # of the second parameter's range
+    fraction: Elementwise  # second parameter as a fraction of its range
 
 
 class TestFunctionCurve(AbstractContinuationProblem):
-    """Curve on which a test function is zero, continued along the first of its parameters.
+    """Curve on which a test function is zero, continued along the first of its two parameters.
 
-    Lengths along it include the second parameter as a fraction of its range. The curve ends if this
+    Arc lengths include the second parameter as a fraction of its range. The curve ends if this
     fraction leaves [0, 1].
     """
 
     test_function: AbstractTestFunction
-    bounds: tuple[float, float] = eqx.field(static=True)  # of the second parameter
+    bounds: tuple[float, float] = eqx.field(static=True)  # bounds of the second parameter
 
     has_multipliers: ClassVar[bool] = False
 
     def second_parameter(self, z: TestFunctionPoint) -> Elementwise:
         """Return the second parameter at a point of the curve."""
-        low, high = self.bounds
-        return low + (high - low) * z.fraction
+        lower_bound, upper_bound = self.bounds
+        return lower_bound + (upper_bound - lower_bound) * z.fraction
 
     def linearize(self, args: Any, z: TestFunctionPoint, p: Scalar) -> NewtonStep:
-        scale = self.bounds[1] - self.bounds[0]
+        parameter_range = self.bounds[1] - self.bounds[0]
         newton_step = self.test_function.linearize(
             args, z.z, jnp.stack([p, self.second_parameter(z)])
         )
         derivative_first = newton_step.parameter_gradient[0]
-        derivative_fraction = scale * newton_step.parameter_gradient[1]
+        derivative_fraction = parameter_range * newton_step.parameter_gradient[1]
         fraction_change = -newton_step.value / derivative_fraction
         fraction_tangent = -derivative_first / derivative_fraction
         first_tangent, second_tangent = newton_step.tangents
-        add_second = lambda change: lambda a, b: a + scale * change * b
-        correction = jax.tree.map(
-            add_second(fraction_change), newton_step.correction, second_tangent
+        add_second_tangent = lambda change: (
+            lambda first_entry, second_entry: first_entry + parameter_range * change * second_entry
         )
-        tangent = jax.tree.map(add_second(fraction_tangent), first_tangent, second_tangent)
-        # The fraction gets a zero multiplier, which has no effect.
+        correction = jax.tree.map(
+            add_second_tangent(fraction_change), newton_step.correction, second_tangent
+        )
+        tangent = jax.tree.map(add_second_tangent(fraction_tangent), first_tangent, second_tangent)
+        # A zero multiplier is added for the fraction; it has no effect.
         jacobian = jnp.pad(newton_step.jacobian, (0, 1))
         return NewtonStep(
             TestFunctionPoint(correction, fraction_change),
