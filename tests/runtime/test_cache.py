@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def process(monkeypatch):
-    monkeypatch.setattr(store, "_warned", set())
+    monkeypatch.setattr(store, "_warned_kinds", set())
     return CodeRegistrySpy(monkeypatch)
 
 
@@ -66,7 +66,7 @@ def check_recompiles(process, warns=True):
     """The right numbers in a later process, with one warning at most, and then without any."""
     for again in range(2):
         process.reset_registry()
-        store._warned.clear()
+        store._warned_kinds.clear()
         with warnings.catch_warnings(record=True) as seen:
             warnings.simplefilter("always")
             np.testing.assert_array_equal(multiples(), expected())

@@ -36,7 +36,7 @@ from vrw_jax.collocation.gauss import (
 )
 from vrw_jax.numerics import (
     Elementwise,
-    HoldFn,
+    FusionBarrierFn,
     LaneArray,
     Vector,
     apply_matrix,
@@ -138,7 +138,7 @@ class _PassContext(NamedTuple):
     constants_tangents: tuple[
         LaneArray, ...
     ]  # the tangents of each constant, with respect to the parameters only
-    prevent_fusion: HoldFn
+    prevent_fusion: FusionBarrierFn
 
     @property
     def n_tangents(self) -> int:

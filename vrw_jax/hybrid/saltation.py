@@ -13,7 +13,7 @@ from jaxtyping import Array
 from vrw_jax.hybrid.phase_integration import sample_phase
 from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, collect_modes
-from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
+from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 from vrw_jax.validation import check_reals
 
 
@@ -39,7 +39,7 @@ def flow_jacobian_determinant(
     options = StepOptions() if options is None else options
     modes, start = collect_modes(modes), check_reals("start", start)
     product = call_compiled(_multiply_event_factors, modes, start, solution, options)
-    return refuse_reverse_mode("flow_jacobian_determinant", product)
+    return forbid_reverse_mode("flow_jacobian_determinant", product)
 
 
 def _multiply_event_factors(

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
 from vrw_jax.hybrid.program_cache import call_compiled
-from vrw_jax.numerics import Scalar, StepOptions, refuse_reverse_mode
+from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 
 
 class FlowSegments(NamedTuple):
@@ -66,7 +66,7 @@ def segment_maps(
     constants = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
     segments = call_compiled(_integrate_segments, constants, start, duration, options)
-    return refuse_reverse_mode("segment_maps", segments)
+    return forbid_reverse_mode("segment_maps", segments)
 
 
 def _integrate_segments(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
 from vrw_jax.hybrid.program_cache import call_compiled
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions, opaque_condition, refuse_reverse_mode
+from vrw_jax.numerics import Scalar, StatusCode, StepOptions, forbid_reverse_mode, opaque_condition
 from vrw_jax.printing import describe_ending
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
@@ -134,7 +134,7 @@ def simulate_hybrid(
     options.check_tolerances(start.dtype)
     mode_index = jnp.asarray(mode, jnp.int32)
     solution = call_compiled(_simulate, (modes, events), options, start, mode_index)
-    return refuse_reverse_mode("simulate_hybrid", solution)
+    return forbid_reverse_mode("simulate_hybrid", solution)
 
 
 def time_errors(

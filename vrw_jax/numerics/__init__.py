@@ -1,4 +1,4 @@
-"""Types, options, trigonometry, helpers for automatic differentiation and for batches."""
+"""Types, options, trigonometry, and helpers for automatic differentiation and for batches."""
 
 from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.autodiff import (
@@ -12,7 +12,7 @@ from vrw_jax.numerics.autodiff import (
     zero_tangent,
 )
 from vrw_jax.numerics.batch_algebra import (
-    HoldFn,
+    FusionBarrierFn,
     LaneArray,
     apply_matrix,
     contract_axes,
@@ -42,7 +42,7 @@ from vrw_jax.numerics.cubic_minima import (
     evaluate_cubic,
     find_cubic_minimum,
 )
-from vrw_jax.numerics.forward_only import refuse_reverse_mode
+from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine

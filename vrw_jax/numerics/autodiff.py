@@ -1,9 +1,10 @@
 """Derivatives of any order and mode of a function that supports only forward-mode AD.
 
-Loops of unknown length (adaptive steps until an event) have no reverse mode. The rule here forms
-the Jacobian in forward mode, over the inputs that are perturbed, and returns Jacobian times
-tangent. This is linear in the tangent, so `jax.grad` transposes a small matrix instead of a loop.
-The Jacobian itself is wrapped again, so Hessians work in every combination of modes.
+Loops of unknown length, such as adaptive steps until an event, have no reverse mode. The rule here
+computes the Jacobian in forward mode, with respect to the inputs that are perturbed, and returns
+Jacobian times tangent. The product is linear in the tangent, so `jax.grad` transposes a small
+matrix instead of a loop. The Jacobian itself has the same rule, so Hessians work in every
+combination of modes.
 """
 
 import functools
@@ -22,7 +23,7 @@ from vrw_jax.numerics.batching import BatchFunction, unbatch
 from vrw_jax.runtime import with_default_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
-"""A map from float arrays to (float outputs, other outputs without derivative)."""
+"""A function of float arrays that returns (float outputs, other outputs without derivatives)."""
 
 
 def enable_all_ad_modes(
@@ -39,13 +40,15 @@ def enable_all_ad_modes(
     outputs in another way. Function and Jacobians are compiled once each: outside of `jit`, forward
     mode, reverse mode and single directions all call the same compiled Jacobian.
     """
-    differentiable = function if function_to_differentiate is None else function_to_differentiate
+    differentiable_function = (
+        function if function_to_differentiate is None else function_to_differentiate
+    )
     compiled_function = jax.jit(function)
     wrapped_function = jax.custom_jvp(compiled_function)
 
     @functools.cache
     def get_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        forward_jacobian = _jacobian_function(differentiable, argnums)
+        forward_jacobian = _jacobian_function(differentiable_function, argnums)
         return (
             enable_all_ad_modes(forward_jacobian)
             if make_jacobian is None
@@ -54,7 +57,9 @@ def enable_all_ad_modes(
 
     @with_default_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
-        argnums = tuple(i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
+        argnums = tuple(
+            i for i, entry in enumerate(tangents) if not isinstance(entry, SymbolicZero)
+        )
         if not argnums:
             outputs = wrapped_function(*primals)
             return outputs, zero_tangent(outputs)
@@ -68,14 +73,16 @@ def enable_all_ad_modes(
 
     def call_function(*arrays: Any) -> tuple:
         is_traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
-        # The custom rule costs as much as a solver step, so it is applied to tracers only.
+        # The rule costs as much as a solver step, so it is applied only to traced arguments.
         return wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
 
     return call_function
 
 
 def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
-    """Return a function with the float outputs (Jacobian by argument, value) in one evaluation."""
+    """Return a function that returns (Jacobian for each argument, value) of the float outputs,
+    and the other outputs.
+    """
 
     def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
         float_outputs, other_outputs = function(*arrays)
@@ -85,15 +92,17 @@ def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> F
         argument_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
-        by_argument = tuple(
+        jacobians_by_argument = tuple(
             jax.tree.map(
-                lambda _, argument_jacobian, k=k: argument_jacobian[k],
+                lambda _, argument_jacobian, argument_index=argument_index: argument_jacobian[
+                    argument_index
+                ],
                 float_outputs,
                 argument_jacobians,
             )
-            for k in range(len(argnums))
+            for argument_index in range(len(argnums))
         )
-        return (by_argument, float_outputs), other_outputs
+        return (jacobians_by_argument, float_outputs), other_outputs
 
     return jacobian
 
@@ -116,20 +125,24 @@ def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tup
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
-"""A wrapper that selects the execution of a batch function, given the order of the derivative it
-is."""
+"""A function that selects how a batch function is executed, given the order of the derivative
+that it computes.
+"""
 
 
 def with_implicit_derivative(
-    function: BatchFunction, tangents_of: Callable, wrap_execution: ExecutionWrapper, order: int = 0
+    function: BatchFunction,
+    compute_tangents: Callable,
+    wrap_execution: ExecutionWrapper,
+    order: int = 0,
 ) -> Callable:
     """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
     mode.
 
-    `function(p, z)` acts on a batch. `tangents_of(p, z)` is dz/dp of one wheel with a leading axis
-    over p, correct wherever z = z(p), and itself made by this function. The rule ignores the
-    tangent of z, which can only be dz/dp times that of p, and returns the total derivative times
-    the tangent of p.
+    `function(p, z)` acts on a batch. `compute_tangents(p, z)` returns dz/dp of one wheel with a
+    leading axis over p. It is correct if z = z(p), and is itself made by this function. The rule
+    ignores the tangent of z, which can only be dz/dp times that of p. It returns the total
+    derivative times the tangent of p.
     """
     unbatched_function = unbatch(wrap_execution(function, order))
     wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
@@ -137,7 +150,9 @@ def with_implicit_derivative(
     @wrapped_function.defjvp
     @with_default_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
-        jacobian = implicit_jacobian(function, tangents_of, wrap_execution, order + 1)(*primals)
+        jacobian = implicit_jacobian(function, compute_tangents, wrap_execution, order + 1)(
+            *primals
+        )
         return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])
 
     return wrapped_function
@@ -145,48 +160,54 @@ def with_implicit_derivative(
 
 def implicit_jacobian(
     function: BatchFunction,
-    tangents_of: Callable,
+    compute_tangents: Callable,
     wrap_execution: ExecutionWrapper,
     order: int = 1,
     make_jacobian: BatchFunction | None = None,
 ) -> Callable:
-    """Return d function(p, z(p)) / dp with a leading axis over p, differentiable as in
-    `with_implicit_derivative`.
+    """Return a function that computes d function(p, z(p)) / dp, with a leading axis over p.
 
-    `make_jacobian(p, (z, dz/dp))` may be a faster evaluation of it.
+    The result is differentiable as in `with_implicit_derivative`. `make_jacobian(p, (z, dz/dp))`
+    may be a faster evaluation of it.
     """
 
     def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
-        """Return the derivatives over a batch, one direction after another, for short code."""
-        n, (z, dz) = p.shape[0], z_and_jacobian
-        units = jnp.broadcast_to(jnp.eye(n, dtype=p.dtype)[:, :, None], (n, *p.shape))
-        return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (units, dz))
+        """Return the derivatives over a batch, computed one direction after another so that the
+        code is short.
+        """
+        n_parameters, (z, dz) = p.shape[0], z_and_jacobian
+        unit_tangents = jnp.broadcast_to(
+            jnp.eye(n_parameters, dtype=p.dtype)[:, :, None], (n_parameters, *p.shape)
+        )
+        return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, dz))
 
     def tangents_of_known(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
         z, dz = z_and_jacobian
-        second_derivatives = jax.jacfwd(tangents_of)(p, z)
+        second_derivatives = jax.jacfwd(compute_tangents)(p, z)
         return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
 
     jacobian_function = with_implicit_derivative(
         make_jacobian or jvp_sequentially, tangents_of_known, wrap_execution, order
     )
-    return lambda p, z: jacobian_function(p, lax.stop_gradient((z, tangents_of(p, z))))
+    return lambda p, z: jacobian_function(p, lax.stop_gradient((z, compute_tangents(p, z))))
 
 
 def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
-    """Return the outputs of `function`, and the derivatives of its floats on last axes, in one
-    program.
+    """Return the outputs of `function`, and the derivatives of its float outputs on last axes, in
+    one program.
 
-    With several arguments, a leaf's derivatives are a tuple with one entry for each argument.
+    With several arguments, the derivatives of a leaf are a tuple with one entry for each argument.
     """
 
-    def floats_of(*arguments: Array) -> tuple:
-        floats, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
-        return floats, (floats, other_outputs)
+    def select_float_outputs(*arguments: Array) -> tuple:
+        float_outputs, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
+        return float_outputs, (float_outputs, other_outputs)
 
     argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    jacobian, (floats, other_outputs) = jax.jacfwd(floats_of, argnums, has_aux=True)(*arguments)
-    return eqx.combine(floats, other_outputs), jacobian
+    jacobian, (float_jacobians, other_outputs) = jax.jacfwd(
+        select_float_outputs, argnums, has_aux=True
+    )(*arguments)
+    return eqx.combine(float_jacobians, other_outputs), jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
@@ -195,7 +216,7 @@ def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
 
 
 def zero_tangent(tree: PyTree) -> PyTree:
-    """Return the zero tangent of any outputs."""
+    """Return the zero tangent of any tree of outputs."""
     zero = lambda x: (
         jnp.zeros_like(x)
         if jnp.issubdtype(jnp.result_type(x), jnp.inexact)

@@ -1,8 +1,8 @@
 """Linear algebra of many small systems together, batch last, as sums of elementwise products.
 
-XLA on CPU computes cheap producers again for each consumer, which costs more than all arithmetic
-here. `lax.cond` on a predicate that is always true, but only known at run time, is a barrier that
-XLA can't remove.
+XLA on CPU computes inexpensive intermediate results again for each use, which costs more than all
+arithmetic here. A `lax.cond` prevents this: its predicate is always true, but XLA cannot know it at
+compile time.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,17 +20,17 @@ from vrw_jax.runtime import with_default_settings
 
 LaneArray = Float[Array, "... lanes"]
 
-HoldFn = Callable[[Any], Any]
+FusionBarrierFn = Callable[[Any], Any]
 
 
-def fusion_barrier(lanes: Float[Array, "... lanes"]) -> HoldFn:
-    """Return an identity function that XLA can't fuse across.
+def fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
+    """Return an identity function across which XLA cannot fuse operations.
 
-    `lanes` must not hold NaN, which XLA can't prove.
+    `lane_values` must not contain NaN, a fact that XLA cannot prove.
     """
     if simd.targets_machine_code():
         return lax.optimization_barrier
-    is_always_true = ~jnp.isnan(jnp.max(lanes))
+    is_always_true = ~jnp.isnan(jnp.max(lane_values))
 
     def hide_from_fusion(tree: Any) -> Any:
         return lax.cond(
@@ -43,8 +43,10 @@ def fusion_barrier(lanes: Float[Array, "... lanes"]) -> HoldFn:
 def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
     """Return a matrix product over the leading axis as a sum of elementwise products."""
     shape = (-1,) + (1,) * (x.ndim - 1)
-    terms = [x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])]
-    return sum(terms[1:], start=terms[0])
+    weighted_terms = [
+        x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])
+    ]
+    return sum(weighted_terms[1:], start=weighted_terms[0])
 
 
 def weighted_sum(weights: np.ndarray, x: Array) -> Array:
@@ -66,23 +68,29 @@ def contract_axes(left_array: Array, right_array: Array) -> Array:
 
 
 def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
-    """Return the inverse of a 1x1, 2x2 or 3x3 matrix by cofactors."""
-    m = matrix
-    if m.shape[0] == 1:
-        return 1.0 / m
-    if m.shape[0] == 2:
-        determinant = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
-        adjugate_2x2 = jnp.stack([jnp.stack([m[1, 1], -m[0, 1]]), jnp.stack([-m[1, 0], m[0, 0]])])
+    """Return the inverse of each 1x1, 2x2 or 3x3 matrix by cofactors."""
+    entries = matrix
+    if entries.shape[0] == 1:
+        return 1.0 / entries
+    if entries.shape[0] == 2:
+        determinant = entries[0, 0] * entries[1, 1] - entries[0, 1] * entries[1, 0]
+        adjugate_2x2 = jnp.stack(
+            [jnp.stack([entries[1, 1], -entries[0, 1]]), jnp.stack([-entries[1, 0], entries[0, 0]])]
+        )
         return adjugate_2x2 / determinant
-    if m.shape[0] != 3:
-        raise ValueError(f"the matrix has {m.shape[0]} rows, but only 1, 2 or 3 are built.")
+    if entries.shape[0] != 3:
+        raise ValueError(f"the matrix has {entries.shape[0]} rows, but only 1, 2 or 3 are built.")
 
     def cofactor(i: int, j: int) -> Array:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return m[a, c] * m[b, d] - m[a, d] * m[b, c]
+        return entries[a, c] * entries[b, d] - entries[a, d] * entries[b, c]
 
     adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
-    determinant = m[0, 0] * adjugate[0][0] + m[0, 1] * adjugate[1][0] + m[0, 2] * adjugate[2][0]
+    determinant = (
+        entries[0, 0] * adjugate[0][0]
+        + entries[0, 1] * adjugate[1][0]
+        + entries[0, 2] * adjugate[2][0]
+    )
     return jnp.stack([jnp.stack(row) for row in adjugate]) / determinant
 
 
@@ -90,57 +98,65 @@ def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]
 def solve_node_equations(
     matrix: Float[Array, "nodes dim nodes dim lanes"],
     rhs: Float[Array, "nodes dim columns lanes"],
-    for_barrier: LaneArray,
+    barrier_values: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
-    """Solve the node equations of one mesh interval, block by block without pivoting.
+    """Return the solution of the node equations of one mesh interval, by block elimination without
+    pivoting.
 
-    The matrix is the mass matrix plus terms of order h; its diagonal blocks stay regular.
+    The matrix is the mass matrix plus terms of order h, so its diagonal blocks stay regular.
+    `barrier_values` is the argument of `fusion_barrier`.
     """
-    hide_from_fusion = fusion_barrier(for_barrier)
-    n, dim = matrix.shape[:2]
-    remaining = jnp.concatenate([matrix.reshape(n, dim, n * dim, -1), rhs], axis=2)
+    prevent_fusion = fusion_barrier(barrier_values)
+    n_nodes, dim = matrix.shape[:2]
+    remaining_system = jnp.concatenate(
+        [matrix.reshape(n_nodes, dim, n_nodes * dim, -1), rhs], axis=2
+    )
     rows: list[Array] = []
-    for _ in range(n):
-        pivot = remaining[0]
-        row = contract_axes(invert_small(pivot[:, :dim]), pivot[:, dim:])
-        if len(rows) < n - 1:
-            row = hide_from_fusion(row)
-            remaining = hide_from_fusion(
-                remaining[1:, :, dim:] - contract_axes(remaining[1:, :, :dim], row)
+    for _ in range(n_nodes):
+        pivot_block = remaining_system[0]
+        block_row = contract_axes(invert_small(pivot_block[:, :dim]), pivot_block[:, dim:])
+        if len(rows) < n_nodes - 1:
+            block_row = prevent_fusion(block_row)
+            remaining_system = prevent_fusion(
+                remaining_system[1:, :, dim:]
+                - contract_axes(remaining_system[1:, :, :dim], block_row)
             )
-        rows.append(row)
+        rows.append(block_row)
     solution = rows[-1]
-    for row in rows[-2::-1]:
-        n_solved = solution.shape[0]
-        block_solution = row[:, n_solved:] - contract_axes(row[:, :n_solved], solution)
+    for block_row in rows[-2::-1]:
+        n_solved_blocks = solution.shape[0]
+        block_solution = block_row[:, n_solved_blocks:] - contract_axes(
+            block_row[:, :n_solved_blocks], solution
+        )
         solution = jnp.concatenate([block_solution, solution])
-    return solution.reshape(n, dim, *solution.shape[1:])
+    return solution.reshape(n_nodes, dim, *solution.shape[1:])
 
 
 @solve_node_equations.defjvp
 @with_default_settings
 def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Return the tangent by a second solve; differentiating the elimination would double
-    its work.
+    """Return the solution and its tangent, by a second solve; differentiating the elimination
+    would double its work.
     """
-    (matrix, _, for_barrier), (d_matrix, d_right, _) = primals, tangents
+    (matrix, _, barrier_values), (d_matrix, d_rhs, _) = primals, tangents
     solution = solve_node_equations(*primals)
-    n, dim = matrix.shape[:2]
-    flat_tangent = d_matrix.reshape(n, dim, n * dim, -1)
-    matrix_term = contract_axes(flat_tangent, solution.reshape(n * dim, *solution.shape[2:]))
-    return solution, solve_node_equations(matrix, d_right - matrix_term, for_barrier)
+    n_nodes, dim = matrix.shape[:2]
+    flat_tangent = d_matrix.reshape(n_nodes, dim, n_nodes * dim, -1)
+    matrix_term = contract_axes(flat_tangent, solution.reshape(n_nodes * dim, *solution.shape[2:]))
+    return solution, solve_node_equations(matrix, d_rhs - matrix_term, barrier_values)
 
 
 def value_and_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple:
     """Return value and JVPs of `function` along tangents with a leading axis of directions."""
-    jvp_along = lambda *t: jax.jvp(function, primals, t)
-    return jax.vmap(jvp_along, in_axes=0, out_axes=(None, 0))(*tangents)
+    compute_jvp = lambda *t: jax.jvp(function, primals, t)
+    return jax.vmap(compute_jvp, in_axes=0, out_axes=(None, 0))(*tangents)
 
 
 def value_and_partials(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Return the value of an elementwise function, and each output's derivatives by all arguments.
+    """Return the value of an elementwise function, and each output's derivatives with respect to
+    all arguments.
 
     The derivatives use reverse mode, because a phase has fewer equations than arguments.
     """

@@ -1,4 +1,4 @@
-"""Batch functions with the batch on the last axis, seen as functions of one element under
+"""Batch functions with the batch on the last axis, converted to functions of one element under
 `jax.vmap`.
 
 Code with independent wheels on the last axis runs several times faster than the same code for one
@@ -23,7 +23,7 @@ BatchFunction = Callable[..., PyTree[Array]]
 
 
 def unbatch(function: BatchFunction) -> BatchFunction:
-    """Return `function` for arrays without the batch axis; its `vmap` is `function` over
+    """Return `function` for arrays without the batch axis; under `vmap` it is `function` over
     the batch.
     """
     batched_function = custom_vmap(function)
@@ -33,16 +33,16 @@ def unbatch(function: BatchFunction) -> BatchFunction:
     def merge_axis(axis_size: int, is_batched_tree: PyTree, *arrays: PyTree) -> tuple:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
 
-        def merge(x: Array, is_batched: bool) -> Array:
+        def merge_into_lanes(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
             transposed = jnp.moveaxis(x, 0, -2)
             return transposed.reshape(*transposed.shape[:-2], axis_size * n_lanes)
 
-        def split(x: Array) -> Array:
+        def split_lanes(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
-        outputs = batched_function(*jax.tree.map(merge, arrays, tuple(is_batched_tree)))
-        return jax.tree.map(split, outputs), jax.tree.map(lambda _: True, outputs)
+        outputs = batched_function(*jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_tree)))
+        return jax.tree.map(split_lanes, outputs), jax.tree.map(lambda _: True, outputs)
 
     def evaluate_single(*arrays: PyTree) -> PyTree:
         outputs = batched_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
@@ -65,10 +65,10 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
             return function(*arrays)
         has_lanes = [jnp.ndim(x) > 0 for x in leaves]
 
-        def split_blocks(x: Array) -> Array:  # the last element pads the last block
-            n_missing = -n_lanes % block_size
-            padded = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_missing, -1)], -1)
-            return jnp.moveaxis(padded.reshape(*x.shape[:-1], -1, block_size), -2, 0)
+        def split_blocks(x: Array) -> Array:  # The last element pads the last block.
+            n_padding = -n_lanes % block_size
+            padded_array = jnp.concatenate([x, jnp.repeat(x[..., -1:], n_padding, -1)], -1)
+            return jnp.moveaxis(padded_array.reshape(*x.shape[:-1], -1, block_size), -2, 0)
 
         def evaluate_block(batched_leaves: list[Array]) -> PyTree:
             remaining_leaves = iter(batched_leaves)
@@ -100,50 +100,52 @@ def is_inside_jit() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def run_if_any(flag: Array, function: Callable[[PyTree], PyTree], fallback: PyTree) -> PyTree:
-    """Return `function(fallback)` if the flag, one for the whole batch, is set, otherwise
+def run_if_any(
+    any_needs_it: Array, function: Callable[[PyTree], PyTree], fallback: PyTree
+) -> PyTree:
+    """Return `function(fallback)` if the flag, one for the whole batch, is set; otherwise return
     `fallback`.
 
-    It is a loop of at most one iteration, which machine code skips if the flag is not set.
+    The call is a loop of at most one iteration, which machine code skips if the flag is not set.
     """
     run_once = lambda carry: (jnp.zeros((), bool), function(carry[1]))
-    return lax.while_loop(lambda carry: carry[0], run_once, (flag, fallback))[1]
+    return lax.while_loop(lambda carry: carry[0], run_once, (any_needs_it, fallback))[1]
 
 
 def opaque_condition(condition: Array, count: Array) -> Array:
     """Return `condition` as a loop condition that also reads a count, which is never negative.
 
-    In a condition that reads only one number, XLA looks for an iteration counter with a copy of the
+    If a condition reads only one number, XLA looks for an iteration counter with a copy of the
     loop's body. That takes a fifth of the compile time of a step with unilateral contact.
     """
     return condition & (count >= 0)
 
 
 def tree_where(condition: Array, if_true: PyTree, if_false: PyTree) -> PyTree:
-    """Return `jnp.where`, leaf by leaf."""
+    """Return `jnp.where(condition, if_true, if_false)` of each pair of leaves."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-    """Return zeros in the structure of the output of `function`, without calling it."""
+    """Return zeros in the structure of the output of `function`, which is not called."""
     make_zeros = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
     return jax.tree.map(make_zeros, jax.eval_shape(function, *arguments))
 
 
 def take_rows(tree: PyTree, row_indices: Any) -> PyTree:
-    """Return the selected rows of arrays with a leading axis, as numpy arrays."""
+    """Return the selected rows of arrays with a leading axis, as NumPy arrays."""
     return jax.tree.map(lambda x: np.asarray(x)[row_indices], tree)
 
 
 def concat_rows(*trees: PyTree) -> PyTree:
-    """Return the trees concatenated along the leading axis, as numpy arrays."""
+    """Return the trees concatenated along the leading axis, as NumPy arrays."""
     return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
 
 
 def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Apply `function` to trees with a leading axis, padded to one of `sizes` rows at a time.
+    """Return `function` of trees with a leading axis, computed in batches padded to one of `sizes`.
 
-    It is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
+    The function is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in sizes:
         return function(*trees)
@@ -152,7 +154,8 @@ def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -
 
 
 def map_in_numpy_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Apply a compiled function as `map_in_batches` does; inputs and outputs are numpy arrays.
+    """Return a compiled function of trees as `map_in_batches` does; inputs and outputs are NumPy
+    arrays.
 
     For small batches this takes a fraction of the time.
     """

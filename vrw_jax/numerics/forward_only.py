@@ -1,4 +1,4 @@
-"""An error with one clear sentence for reverse mode through a loop of unknown length."""
+"""A clear error for reverse mode through a loop of unknown length."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _FORWARD_ONLY = Primitive("forward_only")
 """The identity, whose transpose raises an error."""
 
 
-def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
+def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, name: str) -> None:
     """Raise the error of reverse mode."""
     raise ValueError(
         f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
@@ -23,17 +23,19 @@ def _refuse(_cotangent: Any, _value: Any, *, name: str) -> None:
 
 _FORWARD_ONLY.def_impl(lambda x, *, name: x)
 _FORWARD_ONLY.def_abstract_eval(lambda x, *, name: x)
-ad.deflinear2(_FORWARD_ONLY, _refuse)
+ad.deflinear2(_FORWARD_ONLY, _raise_reverse_mode_error)
 batching.defvectorized(_FORWARD_ONLY)
 mlir.register_lowering(_FORWARD_ONLY, lambda _context, x, *, name: [x])
 
 
-def refuse_reverse_mode(name: str, tree: PyTree) -> PyTree:
-    """Return the results of `hybrid.<name>`, which raise an error in reverse mode."""
+def forbid_reverse_mode(name: str, tree: PyTree) -> PyTree:
+    """Return `tree`, the results of `hybrid.<name>`, marked so that reverse mode raises an
+    error.
+    """
 
-    def mark(leaf: Any) -> Any:
+    def mark_leaf(leaf: Any) -> Any:
         if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
             return _FORWARD_ONLY.bind(leaf, name=name)
         return leaf
 
-    return jax.tree.map(mark, tree)
+    return jax.tree.map(mark_leaf, tree)

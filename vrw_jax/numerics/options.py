@@ -24,35 +24,36 @@ SolverName = Literal[
     "Kvaerno3", "Kvaerno4", "Kvaerno5", "ImplicitEuler",
 ]  # fmt: skip
 """Names of diffrax's Runge-Kutta solvers with an error estimate: explicit ones, then implicit
-ones."""
+ones.
+"""
 SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 EngineName = Literal["auto", "lanes", "diffrax"]
 """Names of the engines that integrate the steps of wheels with compliant legs."""
 
-TIGHTENING_FLOOR_EPS = 90.0
-"""Units of round-off below which tolerances are not tightened (2e-14 in float64).
+TIGHTENING_FLOOR_IN_EPS = 90.0
+"""Smallest tightened tolerance, in units of round-off (2e-14 in float64).
 
 It is chosen because a walk of many steps gains nothing below it.
 """
-MIN_TOLERANCE_EPS = 4.5
-"""Least tolerance allowed in float64, in units of round-off.
+MIN_TOLERANCE_IN_EPS = 4.5
+"""Smallest tolerance allowed in float64, in units of round-off.
 
 It is chosen because a walk of few steps that grazes a guard gains accuracy down to it.
 """
 
 
 REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0")
-"""Options that are real numbers."""
+"""Names of the options that are real numbers."""
 
 
 def _positive_field(name: str, default: float) -> Any:
-    """Return the field of a positive number."""
+    """Return a field of a dataclass for a positive number."""
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
 def _int_field(name: str, default: int) -> Any:
-    """Return the field of a positive integer."""
+    """Return a field of a dataclass for a positive integer."""
     return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
 
 
@@ -120,8 +121,9 @@ class StepOptions(AbstractPrintable):
         for name in REAL_OPTION_NAMES:
             value = getattr(self, name)
             if not isinstance(value, jax.core.Tracer):
-                for one in np.ravel(np.asarray(value)):  # several are for jax.vmap
-                    check_positive(name, one)
+                # Options under `jax.vmap` have several numbers.
+                for number_dtype in np.ravel(np.asarray(value)):
+                    check_positive(name, number_dtype)
 
     def summary_rows(self) -> list[TextRow]:
         units = {"max_phase_time": "s", "dt0": "s"}
@@ -131,14 +133,14 @@ class StepOptions(AbstractPrintable):
         ]
 
     def with_engine(self, engine: EngineName) -> "StepOptions":
-        """Return these options with another engine; "auto" leaves the engine as it is."""
+        """Return these options with another engine; "auto" leaves the engine unchanged."""
         check_choice("engine", engine, get_args(EngineName))
         return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
     @classmethod
     def tight(cls) -> "StepOptions":
-        """Return options with the tightest useful tolerances in float64: steps accurate to about
-        1e-12.
+        """Return options with the tightest useful tolerances in float64, for steps accurate to
+        about 1e-12.
         """
         return cls(rtol=1e-13, atol=1e-13)
 
@@ -154,7 +156,7 @@ class StepOptions(AbstractPrintable):
         )
 
     def require_scalars(self) -> None:
-        """Refuse several numbers where one is meant."""
+        """Raise a ValueError if an option contains several numbers where one is required."""
         for name in REAL_OPTION_NAMES:
             if shape := getattr(getattr(self, name), "shape", ()):
                 raise ValueError(
@@ -165,20 +167,20 @@ class StepOptions(AbstractPrintable):
     def check_tolerances(self, dtype: np.dtype) -> None:
         """Raise a ValueError for an `rtol` below the resolution of the number format.
 
-        `atol` has no such limit: states may be as small as their units make them. 64-bit arrays
-        that were made before `jax_enable_x64` was switched off count as 32-bit ones.
+        `atol` has no such limit, because states may be as small as their units make them. 64-bit
+        arrays that were made before `jax_enable_x64` was switched off count as 32-bit ones.
         """
         dtype = jax.dtypes.canonicalize_dtype(dtype)
         min_tolerance = (
-            MIN_TOLERANCE_EPS if dtype == np.float64 else TIGHTENING_FLOOR_EPS
+            MIN_TOLERANCE_IN_EPS if dtype == np.float64 else TIGHTENING_FLOOR_IN_EPS
         ) * float(jnp.finfo(dtype).eps)
         rtol = self.rtol
         if isinstance(rtol, jax.core.Tracer) or np.ndim(rtol) or np.asarray(rtol) >= min_tolerance:
             return
         hint = f"ask for no less, as with StepOptions(rtol={1e2 * min_tolerance:.0e})"
         if dtype == np.float32:
-            start = "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
-            hint = f"{start}, or {hint}"
+            start_hint = "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
+            hint = f"{start_hint}, or {hint}"
         raise ValueError(
             f"rtol is {float(rtol):g}, but {np.dtype(dtype).name} numbers can't resolve less than "
             f"{min_tolerance:.0e}: {hint}."
@@ -190,5 +192,5 @@ def _tighten_tolerances(
     tolerances: tuple[Scalar, ...], factor: Scalar | float
 ) -> tuple[Scalar, ...]:
     """Return tolerances divided by a factor, down to round-off."""
-    min_tolerance = TIGHTENING_FLOOR_EPS * jnp.finfo(tolerances[0].dtype).eps
+    min_tolerance = TIGHTENING_FLOOR_IN_EPS * jnp.finfo(tolerances[0].dtype).eps
     return tuple(jnp.maximum(x / factor, jnp.minimum(min_tolerance, x)) for x in tolerances)

@@ -1,4 +1,4 @@
-"""Status codes with one sentence for a reader, which each batch element can carry as an integer."""
+"""Status codes with one sentence for a reader, stored as an integer for each batch element."""
 
 import enum
 
@@ -6,7 +6,7 @@ import enum
 class StatusCode(enum.IntEnum):
     """Base class of status codes, whose members are `NAME = number, "sentence"`.
 
-    The number is the value of the member.
+    The number is the value of the member, and the sentence its attribute `meaning`.
     """
 
     meaning: str

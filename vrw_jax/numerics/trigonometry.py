@@ -12,24 +12,37 @@ from vrw_jax.numerics.types import Elementwise
 from vrw_jax.runtime import with_default_settings
 
 MAX_EXACT_ANGLE = 1.6
-"""Angle up to which the polynomials are accurate to round-off, rad, chosen because it exceeds pi/2,
-the limit of the angle of a valid start."""
+"""Largest angle for which the polynomials are accurate to round-off, rad. It is chosen because
+it exceeds pi/2, the limit of the angle of a valid start.
+"""
 
 
 def _economize_series(offset: int) -> tuple[float, ...]:
-    """Return nine coefficients in the angle's square: of its cosine, or of its sine over the angle.
+    """Return nine coefficients of the cosine, or of the sine over the angle, as a polynomial in the
+    squared angle.
 
-    They are Taylor's series from its second term on, with the last terms exchanged for Chebyshev
-    polynomials of lower degree: three terms fewer at the same error.
+    `offset` is 0 for the cosine and 1 for the sine. The coefficients are those of Taylor's series,
+    whose last terms are replaced by Chebyshev polynomials of lower degree. Three terms fewer then
+    give the same error.
     """
-    factorial, square = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
-    coefficients = [(-1) ** k / factorial(2 * k + offset) for k in range(1, 14)]
+    factorial, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
+    coefficients = [(-1) ** order / factorial(2 * order + offset) for order in range(1, 14)]
     while len(coefficients) > 8:
-        n, last_coefficient = len(coefficients) - 1, coefficients.pop()
-        for k in range(n):  # of the polynomial of degree n over [0, square], scaled to end with 1
-            chebyshev = n * factorial(n + k - 1) / (factorial(n - k) * factorial(2 * k))
-            coefficients[k] -= (
-                last_coefficient * (-1) ** (n - k) * chebyshev * (square / 4.0) ** (n - k) * 2.0
+        degree, last_coefficient = len(coefficients) - 1, coefficients.pop()
+        # These are coefficients of Chebyshev's polynomial over the range of the squared angle,
+        # scaled to end with 1.
+        for order in range(degree):
+            chebyshev = (
+                degree
+                * factorial(degree + order - 1)
+                / (factorial(degree - order) * factorial(2 * order))
+            )
+            coefficients[order] -= (
+                last_coefficient
+                * (-1) ** (degree - order)
+                * chebyshev
+                * (squared_angle_limit / 4.0) ** (degree - order)
+                * 2.0
             )
     return 1.0, *coefficients
 
@@ -38,26 +51,25 @@ _SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = _economize_series(1), _economize_seri
 
 
 def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
-    """Return sine and cosine as polynomials, accurate to round-off for |angle| < 1.6 rad, 1e-13 at
-    1.8.
+    """Return sine and cosine of an angle in rad, computed as polynomials.
 
-    The standard functions are scalar calls in float64 on CPU; these are fused and vectorized. For
-    numpy arrays and plain numbers the results are numpy, in a tenth of the time of single JAX
-    calls.
+    They are accurate to round-off for |angle| < 1.6 rad, and to 1e-13 at 1.8. The standard
+    functions are scalar calls in float64 on CPU, while these are fused and vectorized. For NumPy
+    arrays and plain numbers the results are NumPy, in a tenth of the time of single JAX calls.
     """
     is_concrete = isinstance(angle, (float, np.ndarray))
     return _evaluate_series(np, angle) if is_concrete else _differentiable_sine_cosine(angle)
 
 
 def _evaluate_series(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
-    """Evaluate both polynomials with numpy or JAX."""
-    square = angle * angle
+    """Return both polynomials, evaluated by NumPy or JAX."""
+    squared_angle = angle * angle
 
     def evaluate_polynomial(coefficients: tuple[float, ...]) -> Any:
-        value = array_module.full_like(square, coefficients[-1])
+        partial_value = array_module.full_like(squared_angle, coefficients[-1])
         for coefficient in coefficients[-2::-1]:
-            value = value * square + coefficient
-        return value
+            partial_value = partial_value * squared_angle + coefficient
+        return partial_value
 
     return angle * evaluate_polynomial(_SINE_COEFFICIENTS), evaluate_polynomial(
         _COSINE_COEFFICIENTS

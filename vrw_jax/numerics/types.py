@@ -12,11 +12,12 @@ else:
     Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
 """A quantity with any leading axes, because formulas below `scans` act element by element.
 
-Complex numbers are allowed too, as a complex step needs them."""
+Complex numbers are allowed too, because a complex-step derivative needs them.
+"""
 
 Vector = tuple[Elementwise, ...]
 """A tuple with one array for each component."""
 
 
 RealInput = float | Array | np.ndarray
-"""A number as a caller gives it, or an array of numbers."""
+"""A real number as a caller gives it, or an array of numbers."""

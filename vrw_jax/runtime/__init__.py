@@ -1,4 +1,4 @@
-"""Start of a process, lazily imported libraries, disk cache, compiled programs."""
+"""Start of a process, lazily imported libraries, disk cache and compiled programs."""
 
 from vrw_jax.runtime import disk_cache
 from vrw_jax.runtime.cached_programs import (

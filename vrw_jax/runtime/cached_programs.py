@@ -1,8 +1,10 @@
-"""Traced functions saved beside JAX's compilation cache, to avoid tracing at the next start.
+"""Traced functions saved beside JAX's compilation cache, so that the next start need not trace
+them.
 
 JAX's persistent cache avoids compilation but not tracing, which for a limit cycle with derivatives
-takes longer than a scan of thousands. If that cache is on, its folder also contains traces, under a
-key of everything that they depend on, including the library's source.
+takes longer than a scan of thousands of samples. If that cache is on, its folder also contains
+traces. The key of a trace contains everything on which the trace depends, including the library's
+source.
 """
 
 import hashlib
@@ -26,10 +28,8 @@ def compile_exported(
 ) -> Callable:
     """Return `function` compiled for arguments like these, on `device`.
 
-    The `repr` of `settings` identifies the values in the function's closure.
-
-    The program is always compiled from the exported trace, saved or not, so that all runs compile
-    the same program.
+    The `repr` of `settings` identifies the values in the function's closure. The program is always
+    compiled from the exported trace, saved or not, so that all runs compile the same program.
     """
     exported_trace = _export_trace(function, arguments, settings)
     sharding = SingleDeviceSharding(device)
@@ -43,7 +43,7 @@ def compile_exported(
 
 
 def cached_trace(function: Callable, settings: object) -> Callable:
-    """Return `function`, called through its saved trace if there is one.
+    """Return a function that calls `function` through its saved trace if there is one.
 
     The result is called while a program is traced. `function` must not be mapped or differentiated
     from outside. As with `compile_exported`, first and later runs use the exported trace.
@@ -86,32 +86,40 @@ def cached_lane_function(
 
 
 def _export_trace(function: Callable, arguments: tuple, settings: object) -> export.Exported:
-    """Return the exported trace of `function` for arguments like these, with flat arguments."""
+    """Return the exported trace of `function` for arguments like these, as a function of the
+    flat arguments.
+    """
     leaves, structure = jax.tree.flatten(arguments)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
     # A trace calls the machine code of one processor, but several may share the folder.
-    platform = (jax.default_backend(), simd.describe_processor() if simd.is_available() else None)
-    key_parts = (settings, str(structure), shapes, platform, store.describe_process())
-    name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
-    content = store.load_bytes(name)
-    if content is not None:
-        names, _, trace = content.partition(b"\n")
+    device_platform = (
+        jax.default_backend(),
+        simd.describe_processor() if simd.is_available() else None,
+    )
+    key_parts = (settings, str(structure), shapes, device_platform, store.describe_process())
+    record_name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
+    trace_bytes = store.load_bytes(record_name)
+    if trace_bytes is not None:
+        code_names_bytes, _, trace = trace_bytes.partition(b"\n")
         try:
-            if simd.ensure_loaded(names.decode().split(), store):
+            if simd.ensure_loaded(code_names_bytes.decode().split(), store):
                 return export.deserialize(bytearray(trace))
-        except Exception:  # JAX documents no type of the error for content that is no trace.
-            store.warn_unusable(f"{name} is no trace")
+        except Exception:  # JAX documents no type of error for bytes that are no trace.
+            store.warn_unusable(f"{record_name} is no trace")
     flat_function = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
-    token = _is_exporting.set(True)  # Cached traces that are called inside become part of it.
+    # Cached traces that are called inside become part of this trace.
+    context_token = _is_exporting.set(True)
     try:
         # The export below finds this trace in JAX's cache.
         code_names = sorted(_machine_code_names(flat_function.trace(*shapes).jaxpr))
-        allowed_checks = [export.DisabledSafetyCheck.custom_call(name) for name in code_names]
+        allowed_checks = [
+            export.DisabledSafetyCheck.custom_call(record_name) for record_name in code_names
+        ]
         exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(*shapes)
     finally:
-        _is_exporting.reset(token)
+        _is_exporting.reset(context_token)
     store.save_bytes(
-        name, " ".join(code_names).encode() + b"\n" + bytes(exported_trace.serialize())
+        record_name, " ".join(code_names).encode() + b"\n" + bytes(exported_trace.serialize())
     )
     return exported_trace
 
@@ -119,14 +127,16 @@ def _export_trace(function: Callable, arguments: tuple, settings: object) -> exp
 def _machine_code_names(trace: Any) -> set[str]:
     """Return the names of the machine code that a trace calls."""
     trace = getattr(trace, "jaxpr", trace)
-    names = {
-        e.params["code"].name for e in trace.eqns if e.primitive is simd.MACHINE_CODE_PRIMITIVE
+    code_names = {
+        inner_equation.params["code"].name
+        for inner_equation in trace.eqns
+        if inner_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
     }
     for equation in trace.eqns:
         for leaf in jax.tree.leaves(list(equation.params.values())):
             if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):
-                names |= _machine_code_names(leaf)
-    return names
+                code_names |= _machine_code_names(leaf)
+    return code_names
 
 
 _is_exporting: ContextVar[bool] = ContextVar("_exporting", default=False)

@@ -1,7 +1,7 @@
 """Records of traces and machine code on disk, beside JAX's compiled code.
 
-A record is one file. It begins with a digest of its name and its content. The name covers
-everything that the content depends on. The content is executed, so records are used only from a
+A record is one file. It begins with a digest of its name and its content. The name identifies
+everything on which the content depends. The content is executed, so records are used only from a
 folder that nobody else can write, unless the user trusts those who can.
 """
 
@@ -24,13 +24,13 @@ TRUST_SHARED_VARIABLE = "VRW_TRUST_SHARED_CACHE"
 """Environment variable that allows a cache which others can write, in child processes too."""
 
 TRACE_LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optax", "llvmlite")
-"""Libraries whose version a trace depends on."""
+"""Libraries on whose version a trace depends."""
 
 RECORD_SUFFIX = ".record"
 """Suffix of a record's file name."""
 
-_warned: set[str] = set()
-"""Kinds of warnings that this process has given."""
+_warned_kinds: set[str] = set()
+"""Kinds of warnings that this process has issued."""
 
 
 @functools.cache
@@ -58,7 +58,7 @@ def _library_versions() -> tuple[str, ...]:
 
 
 def describe_process() -> tuple[object, ...]:
-    """Return everything that every trace depends on: source, versions, number format."""
+    """Return everything on which every trace depends: source, versions, number format."""
     config: Any = jax.config
     return (
         source_digest(),
@@ -72,11 +72,13 @@ def describe_process() -> tuple[object, ...]:
 def cache_folder() -> Any:
     """Return the folder of JAX's compilation cache, or None if none is set or it is not trusted."""
     folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not folder or "://" in str(folder):  # Only JAX can read a bucket.
+    if not folder or "://" in str(folder):  # Only JAX can read a storage bucket.
         return None
-    refusal = describe_untrusted_folder(Path(folder))
-    if refusal:
-        _warn_once("folder", f"{refusal}; until then no machine code or trace is kept or used.")
+    distrust_reason = describe_untrusted_folder(Path(folder))
+    if distrust_reason:
+        _warn_once(
+            "folder", f"{distrust_reason}; until then no machine code or trace is kept or used."
+        )
         return None
     return folder
 
@@ -86,7 +88,7 @@ def describe_untrusted_folder(folder: Path) -> str:
     try:
         reason = _describe_distrust(folder.stat())
     except OSError:
-        return ""  # It does not exist or cannot be read, so that nothing is executed either.
+        return ""  # The folder does not exist or cannot be read, so nothing in it is executed.
     if not reason:
         return ""
     return (
@@ -109,51 +111,51 @@ def make_folder(folder: Path) -> None:
 
 
 def load_bytes(name: str) -> bytes | None:
-    """Return the content of the record with this name, or None if there is no usable one."""
+    """Return the content of the record with this name, or None if there is no usable record."""
     path = cache_folder() and Path(cache_folder()) / f"{name}{RECORD_SUFFIX}"
     if not path or not re.fullmatch(r"\w+", name):  # Some names are read from a record.
         return None
-    # Without this flag a pipe in place of the file would block.
+    # Without this flag the call would block if the file were a pipe.
     open_without_blocking = lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
     try:
         with open(path, "rb", opener=open_without_blocking) as file:
-            status = os.fstat(file.fileno())
-            is_file = stat.S_ISREG(status.st_mode)
-            reason = _describe_distrust(status) if is_file else "is no file"
-            file_content = b"" if reason else file.read()
+            file_status = os.fstat(file.fileno())
+            is_file = stat.S_ISREG(file_status.st_mode)
+            distrust_reason = _describe_distrust(file_status) if is_file else "is no file"
+            file_bytes = b"" if distrust_reason else file.read()
     except FileNotFoundError:
         return None
     except OSError as error:
-        reason, file_content = f"can't be read ({error.strerror})", b""
+        distrust_reason, file_bytes = f"can't be read ({error.strerror})", b""
     n_digest = hashlib.sha256().digest_size
-    digest, content = file_content[:n_digest], file_content[n_digest:]
-    if not reason and _record_digest(name, content) != digest:
-        reason = "is damaged"
-    if reason:
-        warn_unusable(f"{path} {reason}")
+    digest, content = file_bytes[:n_digest], file_bytes[n_digest:]
+    if not distrust_reason and _record_digest(name, content) != digest:
+        distrust_reason = "is damaged"
+    if distrust_reason:
+        warn_unusable(f"{path} {distrust_reason}")
         return None
     return content
 
 
 def warn_unusable(description: str) -> None:
-    """Warn, once per process, that a record of the cache is not used."""
+    """Issue a warning, once per process, that a record of the cache is not used."""
     _warn_once(
         "record", f"the cached code {description}: it is compiled again, as is any other such file."
     )
 
 
 def save_bytes(name: str, content: bytes) -> None:
-    """Write a record to a temporary file, sync it and rename it.
+    """Write a record atomically: to a temporary file, which is synced and renamed.
 
-    Nothing is raised if the cache cannot be written.
+    No error is raised if the cache cannot be written.
     """
     if not cache_folder():
         return
     path, temporary_path = Path(cache_folder()) / f"{name}{RECORD_SUFFIX}", None
     try:
         make_folder(path.parent)
-        handle, temporary_path = tempfile.mkstemp(dir=path.parent, prefix="unfinished_")
-        with os.fdopen(handle, "wb") as file:
+        file_descriptor, temporary_path = tempfile.mkstemp(dir=path.parent, prefix="unfinished_")
+        with os.fdopen(file_descriptor, "wb") as file:
             file.write(_record_digest(name, content) + content)
             file.flush()
             os.fsync(file.fileno())
@@ -170,19 +172,23 @@ def _record_digest(name: str, content: bytes) -> bytes:
     return hashlib.sha256(name.encode() + b"\n" + content).digest()
 
 
-def _describe_distrust(status: os.stat_result) -> str:
-    """Return why another user may have written this, or "" if nobody may or all are trusted."""
+def _describe_distrust(file_status: os.stat_result) -> str:
+    """Return why another user may have written this file, or "" if nobody may or all are
+    trusted.
+    """
     if os.name != "posix" or trusts_shared():
         return ""
-    if status.st_uid != os.geteuid():
+    if file_status.st_uid != os.geteuid():
         return "belongs to another user"
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return f"can be written by other users (its mode is {stat.S_IMODE(status.st_mode):04o})"
+    if file_status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return (
+            f"can be written by other users (its mode is {stat.S_IMODE(file_status.st_mode):04o})"
+        )
     return ""
 
 
 def _warn_once(kind: str, sentence: str) -> None:
-    """Warn with `sentence` unless this process has given a warning of this kind."""
-    if kind not in _warned:
-        _warned.add(kind)
+    """Issue the warning `sentence` unless this process has issued one of this kind."""
+    if kind not in _warned_kinds:
+        _warned_kinds.add(kind)
         warnings.warn(sentence, stacklevel=3)

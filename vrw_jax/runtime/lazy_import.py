@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 
 class _LazyLibrary:
-    """Library that is imported on the first access to an attribute."""
+    """A library that is imported on the first access to one of its attributes."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -15,11 +15,11 @@ class _LazyLibrary:
 
 
 def lazy_import(name: str) -> Any:
-    """Return the library `name`, imported on the first access to an attribute."""
+    """Return the library `name`, which is imported on the first access to an attribute."""
     return _LazyLibrary(name)
 
 
 if TYPE_CHECKING:
     import xarray as xarray
 else:
-    xarray = lazy_import("xarray")  # All labeled results are its datasets.
+    xarray = lazy_import("xarray")  # All labeled results are datasets of this library.

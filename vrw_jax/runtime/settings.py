@@ -12,14 +12,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def with_default_settings(function: Function) -> Function:
     """Return `function` computed with the default settings of JAX, if the process has others.
 
-    `jax_disable_jit` and strict promotion of ranks and dtypes are aids to find faults in the
-    caller's own code. This library calls machine code from compiled programs only, and one text of
-    the physics serves numbers, batches and derivatives of any rank. The settings of the caller are
-    restored when `function` returns.
+    `jax_disable_jit` and strict promotion of ranks and dtypes help to find faults in the caller's
+    own code. This library calls machine code from compiled programs only, and the same formulas
+    serve numbers, batches and derivatives of any rank. The settings of the caller are restored when
+    `function` returns.
     """
 
     @functools.wraps(function)
-    def call(*args: Any, **keywords: Any) -> Any:
+    def call_with_defaults(*args: Any, **keywords: Any) -> Any:
         if _has_default_settings():
             return function(*args, **keywords)
         with (
@@ -29,7 +29,7 @@ def with_default_settings(function: Function) -> Function:
         ):
             return function(*args, **keywords)
 
-    return call  # type: ignore[return-value]
+    return call_with_defaults  # type: ignore[return-value]
 
 
 def _has_default_settings() -> bool:

@@ -42,12 +42,12 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
                 f"cache is {cache}, a file, but compiled code is kept in a folder: give a folder."
             )
     if check_bool("trust_shared", trust_shared):
-        os.environ[store.TRUST_SHARED_VARIABLE] = "1"  # It holds for child processes too.
+        os.environ[store.TRUST_SHARED_VARIABLE] = "1"  # The setting also holds for child processes.
     jax.config.update("jax_enable_x64", True)
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = _user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    _require_own_cache()
+    _require_private_cache()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     flags = os.environ.get("XLA_FLAGS", "")
     # XLA reads the flags when the first array is created.
@@ -55,25 +55,25 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
         os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS_FLAG}=false".strip()
 
 
-def _require_own_cache() -> None:
-    """Create the cache's folder for the user alone, or raise if others can write it."""
+def _require_private_cache() -> None:
+    """Create the cache's folder for the user alone, or raise an error if others can write it."""
     folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not folder or "://" in folder:
         return
-    refusal = store.describe_untrusted_folder(Path(folder))
-    if refusal:
+    distrust_reason = store.describe_untrusted_folder(Path(folder))
+    if distrust_reason:
         jax.config.update("jax_compilation_cache_dir", None)
-        raise PermissionError(f"{refusal}.")
-    with contextlib.suppress(OSError):  # Without the folder nothing is kept.
+        raise PermissionError(f"{distrust_reason}.")
+    with contextlib.suppress(OSError):  # Without the folder nothing is cached.
         store.make_folder(Path(folder))
 
 
 def fusion_emitter_options(is_enabled: bool) -> dict[str, str | bool]:
     """Return the options of `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
 
-    Without them, XLA compiles in half to two thirds of the time. The code is as fast or, for events
-    with unilateral contact, slower by a seventh. Programs whose digits must not depend on the
-    process always set the option.
+    Without these emitters, XLA compiles in half to two thirds of the time. The code is as fast or,
+    for events with unilateral contact, slower by a seventh. Programs whose digits must not depend
+    on the process always set the option.
     """
     has_emitters = _accepts_emitters_flag() and jax.default_backend() == "cpu"
     return {_EMITTERS_FLAG: is_enabled} if has_emitters else {}
