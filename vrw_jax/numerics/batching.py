@@ -73,8 +73,8 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
         def evaluate_block(batched_leaves: list[Array]) -> PyTree:
             remaining_leaves = iter(batched_leaves)
             block_leaves = [
-                next(remaining_leaves) if has_lanes_axis else x
-                for x, has_lanes_axis in zip(leaves, has_lanes, strict=True)
+                next(remaining_leaves) if has_lane_axis else x
+                for x, has_lane_axis in zip(leaves, has_lanes, strict=True)
             ]
             return function(*jax.tree.unflatten(structure, block_leaves))
 
@@ -84,8 +84,8 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
 
         blocks = [
             split_blocks(x)
-            for x, has_lanes_axis in zip(leaves, has_lanes, strict=True)
-            if has_lanes_axis
+            for x, has_lane_axis in zip(leaves, has_lanes, strict=True)
+            if has_lane_axis
         ]
         return jax.tree.map(merge_blocks, lax.map(evaluate_block, blocks))
 
@@ -100,16 +100,15 @@ def is_inside_jit() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def run_if_any(
-    any_needs_it: Array, function: Callable[[PyTree], PyTree], fallback: PyTree
-) -> PyTree:
-    """Return `function(fallback)` if the flag, one for the whole batch, is set; otherwise return
-    `fallback`.
+def run_if_any(is_needed: Array, function: Callable[[PyTree], PyTree], fallback: PyTree) -> PyTree:
+    """Return `function(fallback)` if `is_needed` is set, otherwise `fallback`.
+
+    `is_needed` is one flag for the whole batch.
 
     The call is a loop of at most one iteration, which machine code skips if the flag is not set.
     """
     run_once = lambda carry: (jnp.zeros((), bool), function(carry[1]))
-    return lax.while_loop(lambda carry: carry[0], run_once, (any_needs_it, fallback))[1]
+    return lax.while_loop(lambda carry: carry[0], run_once, (is_needed, fallback))[1]
 
 
 def opaque_condition(condition: Array, count: Array) -> Array:
