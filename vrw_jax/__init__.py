@@ -36,7 +36,7 @@ from vrw_jax.models import (
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness import GaitSensitivity, gait_sensitivity
+from vrw_jax.robustness import FirstPassage, GaitSensitivity, first_passage, gait_sensitivity
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import (
     SpecialPointMap,
@@ -80,6 +80,7 @@ __all__ = (
     "CycleOptions",
     "DoubleSupportIndicators",
     "EnergyLoss",
+    "FirstPassage",
     "FixedPointResult",
     "GaitSensitivity",
     "LadderStep",
@@ -113,6 +114,7 @@ __all__ = (
     "continue_special_point",
     "default_margins",
     "explore",
+    "first_passage",
     "gait_sensitivity",
     "grid",
     "limit_cycle",

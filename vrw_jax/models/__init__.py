@@ -9,7 +9,7 @@ from vrw_jax.models.batch_step import (
     take_gait_step,
     take_step_after_landing,
 )
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel, StepGround
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.step_inputs import (

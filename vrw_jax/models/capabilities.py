@@ -18,6 +18,15 @@ class GaitMethod(enum.StrEnum):
     """Method of the model that is selected for each wheel."""
 
 
+class PassageMethod(enum.StrEnum):
+    """Ways to compute mean first-passage times of a model on uneven ground."""
+
+    QUADRATURE = enum.auto()
+    """Quadrature of the kernel that the model's `vertical_map` gives in closed form."""
+    SAMPLING = enum.auto()
+    """Importance sampling of many walks."""
+
+
 @dataclass(frozen=True)
 class ModelCapabilities:
     """Features of the library for one model."""
@@ -31,3 +40,5 @@ class ModelCapabilities:
     fixed_by_tolerance: tuple[str, ...] | None = None
     """Fields that need their default values if measures are requested to a tolerance. None means
     that the model does not support measures to a tolerance."""
+    passage_method: PassageMethod = PassageMethod.SAMPLING
+    """Method of `first_passage`."""

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.step_inputs import (
     SectionState,
@@ -85,6 +85,7 @@ class RigidWheel(AbstractWheel):
         config_name="rigid",
         gait_method=GaitMethod.RETURN_MAP,
         commands=frozenset({"branch", "explore"}),
+        passage_method=PassageMethod.QUADRATURE,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
@@ -127,6 +128,13 @@ class RigidWheel(AbstractWheel):
         ).motion
         M = dynamics.mass_matrix(s, motion.L1, motion.L2)
         return M.multiply((motion.dtheta, motion.dL1, motion.dL2))[0] / foot_inertia
+
+    def vertical_map(self, params: WheelParams) -> "VerticalMap":
+        """Return the map of the squared rate at the vertical of one stance leg to that of the
+        next."""
+        s = params.symbols()
+        half_angle, gravity = 0.5 * s.alpha, 2.0 * _gravity_stiffness(s)
+        return VerticalMap(self._rate_ratio(s) ** 2, gravity, half_angle)
 
     @eqx.filter_jit
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
@@ -268,6 +276,44 @@ class RigidWheel(AbstractWheel):
         )
         end_state = result.section_state, result.durations, result.outcome
         return Trajectory(rolling_motion.time_at_angle(angles), state, forces, energy, *end_state)
+
+
+class VerticalMap(NamedTuple):
+    """Map x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) over the next line's slope.
+
+    x is the squared rate with the stance leg vertical, 1/s^2. The wheel falls back if x' < 0, for a
+    slope below h. As a function of the slope, x' = offset(x) + amplitude cos(slope - peak).
+    """
+
+    retained_share: Elementwise  # r, of the squared rate in a landing
+    gravity: Elementwise  # G, twice the gravity stiffness, 1/s^2
+    half_angle: float  # h, between two legs, rad
+
+    @property
+    def _components(self) -> tuple[Elementwise, Elementwise]:
+        r, h = self.retained_share, self.half_angle
+        return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
+
+    @property
+    def peak(self) -> Elementwise:
+        """Return the slope at which x' is largest, rad; x' grows with the slope below it."""
+        cosine, sine = self._components
+        return jnp.arctan2(sine, cosine)
+
+    @property
+    def amplitude(self) -> Elementwise:
+        """Return the amplitude of x' over the slope, 1/s^2."""
+        cosine, sine = self._components
+        return self.gravity * jnp.sqrt(cosine**2 + sine**2)
+
+    def offset(self, x: Elementwise) -> Elementwise:
+        """Return the part of x' that does not depend on the slope, 1/s^2."""
+        return self.retained_share * x - self.gravity * (1.0 - self.retained_share)
+
+    def fixed_point(self, slope: Elementwise) -> Elementwise:
+        """Return the x that repeats on lines of this slope, 1/s^2."""
+        swing = self.amplitude * jnp.cos(slope - self.peak)
+        return swing / (1.0 - self.retained_share) - self.gravity
 
 
 class RollingMotion(eqx.Module):

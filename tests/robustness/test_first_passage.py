@@ -1,0 +1,175 @@
+"""First passage: published values, extended precision, counts, gradients, bad input."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import vrw_jax as vrw
+from vrw_jax.robustness.sampled_passage import SamplingOptions, WalkerGroups, sample_passage
+
+DEGREE = np.pi / 180.0
+BYL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=1.0, slope=8.0 * DEGREE)
+"""Point mass at the hub on a mean slope of 8 degrees, g/l = 1."""
+RIGID = vrw.RigidWheel(stop_at_lift_off=False)
+MEAN_STEPS = {
+    1.5: 654447.8, 1.75: 31492.18, 2.0: 4324.913, 2.5: 411.6028, 3.0: 113.5697, 4.0: 30.7486
+}  # fmt: skip
+"""By the standard deviation of the slope, degrees, from an independent quadrature."""
+
+
+def solve_in_extended_precision(slope_sd, n_nodes=200):
+    """Mean steps by the same kernel in 80-bit numbers, without the difference 1 - kappa_1."""
+    wide, half, mean = np.longdouble, np.longdouble(np.pi) / 8, np.longdouble(8.0 * DEGREE)
+    kept, gravity = wide(0.5), wide(2.0)
+    cosine, sine = (1 - kept) * np.cos(half), (1 + kept) * np.sin(half)
+    peak, amplitude = np.arctan2(sine, cosine), gravity * np.hypot(cosine, sine)
+    swing = amplitude * np.cos(np.minimum(mean + 9 * slope_sd, peak) - peak)
+    largest = swing / (1 - kept) - gravity
+    nodes, weights = (x.astype(wide) for x in np.polynomial.legendre.leggauss(n_nodes))
+    x, weights = largest * (1 + nodes) / 2, largest * weights / 2
+    offset = kept * x - gravity * (1 - kept)
+    ratio = (x - offset[:, None]) / amplitude
+    is_reached = np.abs(ratio) < 1
+    ratio = np.where(is_reached, ratio, 0)
+    deviation = (peak - np.arccos(ratio) - mean) / slope_sd
+    density = np.exp(-(deviation**2) / 2) / np.sqrt(2 * wide(np.pi)) / slope_sd / amplitude
+    matrix = np.where(is_reached, density / np.sqrt(1 - ratio**2), 0) * weights
+    flattest = peak - np.arccos(np.clip(-offset / amplitude, -1, 1))
+    failure = ndtr(((flattest - mean) / slope_sd).astype(float))
+    share = np.ones(n_nodes, wide) / n_nodes
+    for _ in range(120):
+        share = share @ matrix
+        share /= share.sum()
+    return float(1 / (share @ failure))
+
+
+@pytest.mark.parametrize("degrees", MEAN_STEPS)
+def test_rigid_wheels_have_the_published_mean_steps(degrees):
+    passage = vrw.first_passage(BYL, degrees * DEGREE, model=RIGID)
+    assert abs(float(passage.mean_steps) / MEAN_STEPS[degrees] - 1.0) < 1e-6
+    assert passage.ending == "The error estimate is within the tolerance."
+    assert float(passage.error) < 1e-8 * float(passage.mean_steps)
+
+
+def test_long_lives_keep_their_digits():
+    # 95,369,578 was published, from numbers of 64 bits: 1.8e-6 away from 80 bits.
+    passage = vrw.first_passage(BYL, 1.25 * DEGREE, model=RIGID)
+    exact = solve_in_extended_precision(1.25 * DEGREE)
+    assert abs(float(passage.mean_steps) / exact - 1.0) < 1e-9
+    assert abs(exact / 95369578.0 - 1.0) < 2e-6
+
+
+def test_the_start_at_the_gait_adds_the_published_steps():
+    for degrees, steps in ((2.0, 4326.185), (2.5, 412.534), (3.0, 114.207)):
+        passage = vrw.first_passage(BYL, degrees * DEGREE, model=RIGID)
+        assert abs(float(passage.mean_steps_from_gait) - steps) < 5.1e-4  # half of the last digit
+    assert abs(float(vrw.first_passage(BYL, 1.5 * DEGREE, model=RIGID).kappa_2) - 0.5) < 1e-4
+
+
+def test_the_derivative_of_a_long_life_is_a_central_difference():
+    def mean_steps(slope_sd):
+        return vrw.first_passage(BYL, slope_sd, model=RIGID).mean_steps
+
+    slope_sd, h = 2.0 * DEGREE, 1e-6
+    gradient = float(jax.grad(mean_steps)(slope_sd))
+    difference = float(mean_steps(slope_sd + h) - mean_steps(slope_sd - h)) / (2.0 * h)
+    assert abs(gradient / difference - 1.0) < 1e-6
+
+
+@pytest.mark.parametrize("degrees", [1.25, 2.0, 3.0])
+def test_samples_agree_with_quadrature_within_their_error(degrees):
+    gait = vrw.limit_cycle(BYL, model=RIGID)
+    start, slope_sd = np.asarray(gait.section_state), degrees * DEGREE
+    random, options = np.random.default_rng(0), vrw.StepOptions()
+    groups = WalkerGroups(BYL, start, slope_sd, RIGID, options, 4096, random)
+    sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 1_000_000)
+    exact = vrw.first_passage(BYL, slope_sd, model=RIGID)
+    assert sample.relative_error < 0.05
+    mean = 1.0 / sample.failure_probability
+    assert abs(mean / float(exact.mean_steps) - 1.0) < sample.relative_error
+    from_gait = sample.mean_steps_from_gait / float(exact.mean_steps_from_gait)
+    assert abs(from_gait - 1.0) < 1.5 * sample.relative_error
+    assert abs(sample.kappa_2 - float(exact.kappa_2)) < 0.01
+    assert tuple(sample.share_by_outcome) == ("FELL_BACK",)
+
+
+@pytest.mark.parametrize(("slope_sd", "steps", "error"), [(0.015, 13.23, 0.06), (0.02, 6.9, 0.05)])
+def test_the_papers_wheel_lasts_as_long_as_an_independent_code_counts(slope_sd, steps, error):
+    passage = vrw.first_passage(vrw.WheelParams(), slope_sd)
+    relative_error = 1.5 * float(passage.error / passage.mean_steps)
+    difference = float(passage.mean_steps_from_gait) - steps
+    assert abs(difference) < relative_error * steps + 2.58 * error
+    assert passage.ending == "The error estimate is within the tolerance."
+    assert passage.end_names == ("TOUCHDOWN_BEFORE_STOPPER",)
+    assert float(passage.weights.sum()) == pytest.approx(1.0)
+    assert "FirstPassage" in repr(passage)
+
+
+def count_failure_share(params, slope_sd, n_walkers, n_steps):
+    """Failures per step of the paper's wheel, and their standard error, without any bias."""
+    random, mean = np.random.default_rng(5), float(params.slope)
+    start = np.tile(np.asarray(vrw.limit_cycle(params).section_state), (n_walkers, 1))
+    states, slopes, ages = start, np.full(n_walkers, mean), np.zeros(n_walkers, int)
+    n_failures, n_counted = 0, 0
+    for _ in range(n_steps):
+        next_slopes = mean + slope_sd * random.standard_normal(n_walkers)
+        wheels = eqx.tree_at(lambda p: p.slope, params, np.stack([slopes, next_slopes], 1))
+        result = vrw.step_batch(wheels, states)
+        is_alive, is_old = result.outcome == 0, ages >= 12
+        n_failures, n_counted = n_failures + np.sum(~is_alive & is_old), n_counted + np.sum(is_old)
+        states = np.where(is_alive[:, None], result.section_state, start)
+        slopes, ages = np.where(is_alive, next_slopes, mean), np.where(is_alive, ages + 1, 0)
+    return n_failures / n_counted, np.sqrt(n_failures) / n_counted, n_counted
+
+
+@pytest.mark.parametrize(
+    ("slope_sd", "damping"), [(0.007, 200.0), (0.01, 200.0), (0.0125, 200.0), (0.015, 150.0)]
+)
+def test_samples_agree_with_a_million_counted_steps(slope_sd, damping):
+    params = vrw.WheelParams(damping=damping)
+    share, standard_error, n_counted = count_failure_share(params, slope_sd, 16384, 85)
+    assert n_counted > 1e6 or share > 0.01
+    passage = vrw.first_passage(params, slope_sd, tol=0.01)
+    error = float(passage.error / passage.mean_steps) * share + 2.58 * standard_error
+    assert abs(float(passage.failure_probability) - share) < error
+
+
+def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
+    # 8 million counted steps had no failure at this standard deviation.
+    params, slope_sd = vrw.WheelParams(), 0.004
+    passage = vrw.first_passage(params, slope_sd)
+    gait = vrw.limit_cycle(params)
+    start, random = np.asarray(gait.section_state), np.random.default_rng(11)
+    options = SamplingOptions(forgotten_effect=3e-4, min_forgetting_steps=14, n_groups=64)
+    groups = WalkerGroups(
+        params, start, slope_sd, vrw.ViscoelasticWheel(), vrw.StepOptions(), 8192, random, options
+    )
+    sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 2_000_000, options)
+    error = sample.relative_error + float(passage.error / passage.mean_steps)
+    mean = float(passage.mean_steps)
+    assert 5e7 < mean < 8e7
+    assert abs(sample.failure_probability * mean - 1.0) < error
+    assert float(passage.kappa_2) == pytest.approx(float(gait.spectral_radius), abs=0.02)
+
+
+def test_no_failure_is_an_ending_and_not_an_error():
+    passage = vrw.first_passage(vrw.WheelParams(), 1e-5, n_walkers=64)
+    assert float(passage.mean_steps) == np.inf
+    assert "No walk failed" in passage.ending
+
+
+@pytest.mark.parametrize(
+    ("changes", "choices", "sentence"),
+    [
+        ({}, {"slope_sd": 0.0}, "slope_sd is 0, but it must be positive"),
+        ({}, {"slope_sd": 5.0, "n_walkers": 64}, "with which hardly any step"),
+        ({"damping": 300.0}, {}, "this wheel has no gait"),
+        ({}, {"model": vrw.RigidWheel()}, "stop_at_lift_off=False"),
+        ({"slope": 0.0}, {"model": RIGID}, "on which this rigid wheel has no gait"),
+    ],
+)
+def test_bad_arguments_are_one_sentence(changes, choices, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        vrw.first_passage(vrw.WheelParams(**changes), **({"slope_sd": 0.01} | choices))
