@@ -630,7 +630,7 @@ def _least_violating(
     admissible ones.
 
     Several combinations are compared by one reduction. If they were read one by one, XLA on a CPU
-    would duplicate the code of `violation_of` for each use.
+    would duplicate the code of `evaluate_combination` for each use.
     """
     if len(combinations) == 1:
         violation = evaluate_combination(combinations[0])
