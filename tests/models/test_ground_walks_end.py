@@ -12,8 +12,8 @@ import vrw_jax as vrw
 from vrw_jax.contact.batch_integrator import (
     INTERVAL_OPTIONS,
     EventBracket,
-    _earliest_root,
-    _earliest_secant,
+    _find_earliest_root,
+    _find_earliest_secant_root,
 )
 from vrw_jax.contact.mechanics import leg_directions
 
@@ -105,9 +105,9 @@ def test_a_guard_that_is_already_negative_precedes_falling_guards():
     column = lambda *values: jnp.asarray(values)[:, None]
     start, end, crossing = column(1e-14, 1.0), column(-1e-7, -0.1), column(True, True)
     slope = column(-1e-7, -1.1)
-    first, _ = _earliest_root(start, slope, 0.0 * slope, crossing, column(True, False))
+    first, _ = _find_earliest_root(start, slope, 0.0 * slope, crossing, column(True, False))
     assert first[0] == -jnp.inf
     none = jnp.zeros(1)
     search = EventBracket(none > 0, crossing, *(none,) * 4, jnp.asarray([1.0]), 2.0 * end)
-    first, _ = _earliest_secant(search, end, jnp.asarray([1.1]), crossing)
+    first, _ = _find_earliest_secant_root(search, end, jnp.asarray([1.1]), crossing)
     assert first[0] == -jnp.inf

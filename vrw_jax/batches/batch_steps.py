@@ -93,15 +93,16 @@ def step_batch(
     requested.
 
     Engine "lanes" is the fast one, for the viscoelastic wheel and explicit solvers. "diffrax" maps
-    `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if it is possible;
-    `StepBatchResult.engine` gives the selected one. Both have the errors of `options`, which apply
-    to each solver step. The results of the two differ by some ten times the tolerance.
+    `model.advance` over the batch and accepts any solver. "auto" selects "lanes" if possible;
+    `StepBatchResult.engine` gives the selected engine. Both have the errors of `options`, which
+    apply to each solver step. The results of the two differ by some ten times the tolerance.
 
-    "auto" also selects another solver than the named one if the airborne leg is so stiff that
-    another is cheaper; `StepBatchResult.solver_index` gives the selected one. It is Tsit5 if
+    "auto" also replaces the named solver if the airborne leg is so stiff that another solver is
+    cheaper. `StepBatchResult.solver_index` gives the selected solver. Tsit5 is selected if
     stability limits the steps. At the default options this is the case from c/m = 1,900 1/s; at a
-    tolerance of 1e-6, from 300 1/s. It is Kvaerno5 by "diffrax" if explicit solvers need too many
-    steps (from 4e5, or from 1.4e5) or Tsit5 failed.
+    tolerance of 1e-6, from 300 1/s. Kvaerno5 by "diffrax" is selected if Tsit5 failed,
+    or if explicit solvers need too many steps. At the default options this is the case from c/m =
+    4e5 1/s; at a tolerance of 1e-6, from 1.4e5 1/s.
 
     Derivatives include all steps and their events. They are zero for an element that fell, and are
     not available by collocation. With unilateral contact (`UnilateralWheel`) the only engine is

@@ -155,7 +155,7 @@ def collocate_phase(
         q, v, correction, mismatch, min_guard, end_guards, nonlinear_part = carry
         h = interval_fraction * expected_duration
         solved_step = _solve_step(phase, q, v, h, nonlinear_part, options)
-        lowest_guard, end_guards = _min_guard(phase, q, v, solved_step, end_guards, 0)
+        lowest_guard, end_guards = _find_min_guard(phase, q, v, solved_step, end_guards, 0)
         carry = (
             *solved_step.end_state,
             jnp.maximum(correction, _estimate_correction(solved_step.sweep_state)),
@@ -183,7 +183,7 @@ def collocate_phase(
     q, v, correction, mismatch, min_guard, guards, nonlinear_part = carry
     h = float(interval_fractions[-1]) * expected_duration
     last_step = _solve_step(phase, q, v, h, nonlinear_part, options, ends_at_event=True)
-    lowest_guard, _ = _min_guard(phase, q, v, last_step, guards, 1)
+    lowest_guard, _ = _find_min_guard(phase, q, v, last_step, guards, 1)
     return CollocatedPhase(
         *last_step.end_state,
         duration=float(1.0 - interval_fractions[-1]) * expected_duration
@@ -212,7 +212,7 @@ def _weighted_sum(
     )
 
 
-def _end_state(
+def _compute_end_state(
     q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
 ) -> tuple[Vector, Vector]:
     """Return coordinates and rates at the end of a mesh interval."""
@@ -226,7 +226,7 @@ def _end_state(
     )
 
 
-def _node_state(
+def _compute_node_state(
     node_index: int, q: Vector, v: Vector, h: Array, node_accelerations: NodeAccelerations
 ) -> tuple:
     """Return coordinates and rates at a node of a mesh interval."""
@@ -288,18 +288,20 @@ def _solve_step(
         for inverse_matrix, projection in zip(inverse_stage_matrices, projections, strict=True):
             products = [
                 [
-                    _multiply(matrix_entry, x)
+                    _multiply_complex(matrix_entry, x)
                     for matrix_entry, x in zip(matrix_row, projection, strict=True)
                 ]
                 for matrix_row in inverse_matrix
             ]
-            corrections.append([_add_terms(matrix_row) for matrix_row in products])
+            corrections.append([_add_complex_numbers(matrix_row) for matrix_row in products])
         return _correct_nodes(node_accelerations, corrections, h)
 
     def run_sweep(sweep_state: _SweepState, _: None) -> tuple[_SweepState, None]:
         residuals = []
         for node_index in range(N_GAUSS_NODES):
-            Q, V = _node_state(node_index, q, v, sweep_state.h, sweep_state.node_accelerations)
+            Q, V = _compute_node_state(
+                node_index, q, v, sweep_state.h, sweep_state.node_accelerations
+            )
             residuals.append(
                 phase.dynamics_residual(
                     phase.motion_at(Q, V), sweep_state.node_accelerations[node_index]
@@ -321,7 +323,7 @@ def _solve_step(
 
     def shift_to_event(sweep_state: _SweepState) -> Array:
         """Return the time from the interval's end to the event, by Newton's method, s."""
-        end_q, end_v = _end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
+        end_q, end_v = _compute_end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
         _, acceleration = evaluate_event(end_q, end_v)
         (guard_value, _), (guard_rate, _) = jax.jvp(
             evaluate_event, (end_q, end_v), (end_v, acceleration)
@@ -369,7 +371,7 @@ def _solve_step(
     ]
     mismatch = sweep_state.h * functools.reduce(jnp.maximum, mismatches)
     # The end is extrapolated by the last shift, whose square is negligible.
-    Q, V = _end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
+    Q, V = _compute_end_state(q, v, sweep_state.h, sweep_state.node_accelerations)
     end_state = (
         tuple(Q[d] + event_shift * V[d] for d in coordinate_indices),
         tuple(
@@ -434,17 +436,17 @@ def _linearize_residual(phase: AbstractPhase, q: Vector, v: Vector, a: Vector) -
 ComplexPair = tuple[Array, Array]
 
 
-def _multiply(x: ComplexPair, y: ComplexPair) -> ComplexPair:
+def _multiply_complex(x: ComplexPair, y: ComplexPair) -> ComplexPair:
     """Return the product of two complex numbers."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
-def _subtract(x: ComplexPair, y: ComplexPair) -> ComplexPair:
+def _subtract_complex(x: ComplexPair, y: ComplexPair) -> ComplexPair:
     """Return the difference of two complex numbers."""
     return x[0] - y[0], x[1] - y[1]
 
 
-def _add_terms(complex_numbers: Sequence[ComplexPair]) -> ComplexPair:
+def _add_complex_numbers(complex_numbers: Sequence[ComplexPair]) -> ComplexPair:
     """Return the sum of complex numbers."""
     first_number, *other_numbers = complex_numbers
     real_part, imaginary_part = first_number
@@ -484,7 +486,7 @@ def _invert_stage_matrix(
     squared_modulus = determinant[0] * determinant[0] + determinant[1] * determinant[1]
     reciprocal = (determinant[0] / squared_modulus, -determinant[1] / squared_modulus)
     return [
-        [_multiply(reciprocal, matrix_entry) for matrix_entry in matrix_row]
+        [_multiply_complex(reciprocal, matrix_entry) for matrix_entry in matrix_row]
         for matrix_row in adjugate
     ]
 
@@ -498,19 +500,21 @@ def _adjugate_and_determinant(matrix: list[list[ComplexPair]]) -> tuple[Any, Com
     if n == 2:
         negate = lambda x: (-x[0], -x[1])
         adjugate_rows = [[matrix[1][1], negate(matrix[0][1])], [negate(matrix[1][0]), matrix[0][0]]]
-        return adjugate_rows, _subtract(
-            _multiply(matrix[0][0], matrix[1][1]), _multiply(matrix[0][1], matrix[1][0])
+        return adjugate_rows, _subtract_complex(
+            _multiply_complex(matrix[0][0], matrix[1][1]),
+            _multiply_complex(matrix[0][1], matrix[1][0]),
         )
 
     def cofactor(i: int, j: int) -> ComplexPair:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return _subtract(
-            _multiply(matrix[a][c], matrix[b][d]), _multiply(matrix[a][d], matrix[b][c])
+        return _subtract_complex(
+            _multiply_complex(matrix[a][c], matrix[b][d]),
+            _multiply_complex(matrix[a][d], matrix[b][c]),
         )
 
     adjugate_rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
-    products = [_multiply(matrix[0][k], adjugate_rows[k][0]) for k in range(3)]
-    return adjugate_rows, _add_terms(products)
+    products = [_multiply_complex(matrix[0][k], adjugate_rows[k][0]) for k in range(3)]
+    return adjugate_rows, _add_complex_numbers(products)
 
 
 def _project_residuals(weights: np.ndarray, residuals: NodeAccelerations) -> list[ComplexPair]:
@@ -585,7 +589,7 @@ def _correct_nodes(
     return tuple(corrected_nodes), h * largest_change
 
 
-def _min_guard(
+def _find_min_guard(
     phase: AbstractPhase,
     q: Vector,
     v: Vector,

@@ -70,7 +70,7 @@ def select_solver(
         n_decay_times = 1.03 * damping / leg_mass * 0.74 * np.sqrt(leg_length / gravity)
 
         def count_evaluations(solver: str) -> tuple[np.ndarray, np.ndarray]:
-            n_stages, stability_limit = _stages_and_limit(solver)
+            n_stages, stability_limit = _count_stages_and_stability_limit(solver)
             n_solver_steps = n_decay_times / stability_limit
             return n_solver_steps, np.where(
                 n_solver_steps > options.max_solver_steps, np.inf, n_solver_steps * n_stages
@@ -90,7 +90,7 @@ def select_solver(
 
 
 @functools.cache
-def _stages_and_limit(solver: str) -> tuple[int, float]:
+def _count_stages_and_stability_limit(solver: str) -> tuple[int, float]:
     """Return an explicit solver's evaluations per step, and its largest stable step size times
     decay rate.
     """

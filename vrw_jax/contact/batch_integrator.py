@@ -449,7 +449,7 @@ def complete_solver_step(
         float(w) * stage_rows[j, :n] for j, w in enumerate(weights) if w != 0.0
     )
     error_estimates = h * h * sum_stages(tableau.b_error_position), h * sum_stages(tableau.b_error)
-    squared_error = _squared_error(
+    squared_error = _compute_squared_error(
         dynamics.s, options, error_estimates, start_point, guard_points[-1], end_guard_values
     )
     middle_guard_values = (
@@ -460,7 +460,7 @@ def complete_solver_step(
     parabola_terms = fit_guard_parabola(
         tableau, state.guard_values, middle_guard_values, end_guard_values
     )
-    minimum_fraction = _earliest_minimum_fraction(
+    minimum_fraction = _find_earliest_minimum(
         tableau, [state.guard_values, *inner_guard_values, end_guard_values], _is_initiating(state)
     )
     return AttemptedSolverStep(
@@ -598,8 +598,10 @@ def _search_event(
     is_below_zero = attempt.guard_values <= 0.0
     is_crossing = jnp.where(bracket.is_active, bracket.is_crossing | is_below_zero, is_below_zero)
     parabolas = state.guard_values, attempt.parabola_linear_term, attempt.parabola_curvature
-    root_fraction, guard = _earliest_root(*parabolas, is_crossing, _is_initiating(state))
-    secant_h, secant_guard = _earliest_secant(bracket, attempt.guard_values, h, is_crossing)
+    root_fraction, guard = _find_earliest_root(*parabolas, is_crossing, _is_initiating(state))
+    secant_h, secant_guard = _find_earliest_secant_root(
+        bracket, attempt.guard_values, h, is_crossing
+    )
     uses_secant = bracket.is_active & (
         bracket.n_iterations >= interval_options.n_parabola_iterations
     )
@@ -625,7 +627,9 @@ def _search_event(
     next_h = jnp.where(needs_bisection, bisection_h, proposed_h)
     time_shift = next_h - h
     # If a guard is within its round-off, no other step size is better than this one.
-    lowest_guard, lowest_value = _lowest_guard(attempt.guard_values / guard_scales, is_crossing)
+    lowest_guard, lowest_value = _find_lowest_guard(
+        attempt.guard_values / guard_scales, is_crossing
+    )
     # An initiating guard is within twice its round-off. Without another event, the guard is the
     # event.
     guard_roundoff = (
@@ -649,7 +653,7 @@ def _search_event(
     )
 
 
-def _squared_error(
+def _compute_squared_error(
     s: Symbols,
     options: StepOptions,
     error_estimates: tuple[Array, Array],
@@ -679,7 +683,7 @@ def _is_initiating(state: IntervalState) -> Array:
     return (state.time == 0.0) & (state.guard_offset != 0.0)
 
 
-def _earliest_minimum_fraction(
+def _find_earliest_minimum(
     tableau: ButcherTableau, guard_values: list[Array], is_initiating: Array
 ) -> Array:
     """Return the fraction of the step to the earliest negative minimum of a guard; 1 without such a
@@ -695,7 +699,7 @@ def _earliest_minimum_fraction(
     )
 
 
-def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
+def _find_lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array]:
     """Return the index of the lowest guard that crosses zero, and its value; infinite if none
     crosses.
     """
@@ -710,7 +714,7 @@ def _lowest_guard(guard_values: Array, is_crossing: Array) -> tuple[Array, Array
     return guard, lowest_value
 
 
-def _earliest_secant(
+def _find_earliest_secant_root(
     bracket: EventBracket, guard_values: Array, h: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
     """Return the step size (s) at the earliest zero of the crossing guards' secants, and the
@@ -739,7 +743,7 @@ def _earliest_secant(
     return earliest_h, guard
 
 
-def _earliest_root(
+def _find_earliest_root(
     g0: Array, linear_term: Array, curvature: Array, is_crossing: Array, is_initiating: Array
 ) -> tuple[Array, Array]:
     """Return the earliest zero of the crossing guards' parabolas, as a fraction of the step, and

@@ -148,7 +148,7 @@ _LevelSolver = Callable[[ContactLaw, WheelMotion, Array, ChosenCombination | Non
 
 
 def _solve_stopper_lcp(
-    solve: _LevelSolver,
+    solve_level: _LevelSolver,
     contact_law: ContactLaw,
     motion: WheelMotion,
     is_at_stopper: Array,
@@ -178,7 +178,7 @@ def _solve_stopper_lcp(
 
     def pivot(state: tuple) -> tuple:
         is_held, combination_code, n_attempts, best_solution = state
-        level_solution = solve(constant_inputs[0], constant_inputs[1], is_held, None)
+        level_solution = solve_level(constant_inputs[0], constant_inputs[1], is_held, None)
         violation = jnp.where(
             is_held,
             -level_solution.stopper_push / tolerances.force_tolerance,
@@ -236,7 +236,7 @@ def _solve_stopper_lcp(
     chosen_combination = chosen_combination._replace(
         n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
     )
-    return solve(contact_law, motion, is_held, chosen_combination), is_held
+    return solve_level(contact_law, motion, is_held, chosen_combination), is_held
 
 
 class EventResult(NamedTuple):
@@ -376,7 +376,7 @@ def _solve_velocity_level(
         s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
     )
 
-    def solve(
+    def solve_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
@@ -421,13 +421,13 @@ def _solve_velocity_level(
     is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
     if not contact_law.is_one_sided:
         return (
-            solve(contact_law, motion, is_airborne_locked, None),
+            solve_level(contact_law, motion, is_airborne_locked, None),
             contact_slots,
             is_airborne_locked,
         )
     is_tested = is_airborne_locked & event.is_impact
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve, contact_law, motion, is_airborne_locked, is_tested, tolerances
+        solve_level, contact_law, motion, is_airborne_locked, is_tested, tolerances
     )
     return level_solution, contact_slots, is_held_airborne
 
@@ -510,7 +510,7 @@ def _solve_acceleration_level(
     may_leave_stopper = ~slot_locked | event.releases_stopper
     tolerances = SignTolerances(FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g)
 
-    def solve(
+    def solve_level(
         contact_law: ContactLaw,
         motion: WheelMotion,
         is_airborne_locked: Array,
@@ -558,13 +558,13 @@ def _solve_acceleration_level(
     is_airborne_locked = is_at_stopper & ~contact_slots.is_filled
     if not contact_law.is_one_sided:
         return (
-            solve(contact_law, motion, is_airborne_locked, None).chosen_combination,
+            solve_level(contact_law, motion, is_airborne_locked, None).chosen_combination,
             contact_slots,
             was_resting,
             is_airborne_locked,
         )
     level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve, contact_law, motion, is_airborne_locked, is_airborne_locked, tolerances
+        solve_level, contact_law, motion, is_airborne_locked, is_airborne_locked, tolerances
     )
     return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
 

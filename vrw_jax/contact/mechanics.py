@@ -90,7 +90,7 @@ def stop_gradients(tree: Any) -> Any:
 
 
 class ContactSlots(NamedTuple):
-    """Masks of the two legs whose feet may be loaded, fore first.
+    """Masks of the two legs whose feet may be loaded (the contact slots), fore first.
 
     The mask of an empty slot is False for all legs.
     """
@@ -100,7 +100,7 @@ class ContactSlots(NamedTuple):
 
     @property
     def is_filled(self) -> Bool[Array, "n_legs ..."]:
-        """Return whether each leg is in a slot."""
+        """Return whether each leg occupies one of the two contact slots, (n_legs, ...)."""
         return self.first_mask | self.second_mask
 
     def gather_codes(self, values: Array) -> Int[Array, "2 ..."]:
@@ -136,7 +136,7 @@ class ContactSlots(NamedTuple):
 
 
 def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
-    """Return the slots of the first two legs whose feet touch the ground."""
+    """Return the contact slots of the first two legs whose feet touch the ground."""
     touching_rank = jnp.cumsum(is_touching.astype(jnp.int32), axis=0)
     return ContactSlots(is_touching & (touching_rank == 1), is_touching & (touching_rank == 2))
 
@@ -144,7 +144,7 @@ def find_slots(is_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:
 def slot_friction(
     friction: Elementwise | SlotPair, contact_slots: ContactSlots
 ) -> Elementwise | SlotPair:
-    """Return the friction coefficient of each slot's foot, or the common one.
+    """Return the friction coefficient of the foot in each contact slot, or the common coefficient.
 
     A pair `friction` holds the coefficient of the foot that landed last, Leg 1's, and that of all
     others. A single number is the coefficient of all feet.

@@ -87,7 +87,7 @@ class ContactStepConfig(NamedTuple):
         )
 
     def compute_outputs(self, *leaves: Array) -> tuple:
-        """Return the floats and the other arrays of the result.
+        """Return the results of a step over lanes, split into floats and other arrays.
 
         The leaves have the lanes on their last axis.
         """
@@ -114,7 +114,7 @@ class ContactStepConfig(NamedTuple):
 
 
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
-    """Return the floats and the other arrays of a step.
+    """Return the results of a step, split into floats and other arrays.
 
     A detailed walk gives all results of the step. Any other walk gives section state, durations,
     outcome and number of solver steps.
@@ -131,10 +131,10 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
 
 
 def build_contact_step_function(argument_structure: Any, is_detailed: bool) -> ForwardFunction:
-    """Return a function from the leaves of (wheel, params, x, options) to the floats and others of
-    a step.
+    """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
 
-    The function is a forward rule from which all AD modes are built.
+    The results are split into floats and other arrays. The function is a forward rule from which
+    all AD modes are built.
     """
     config = ContactStepConfig(argument_structure, is_detailed)
     cache_key = "step on real ground", str(argument_structure), is_detailed
@@ -144,10 +144,10 @@ def build_contact_step_function(argument_structure: Any, is_detailed: bool) -> F
 def build_contact_step_jacobian(
     argument_structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobian of `build_contact_step_function`.
+    """Return a function that computes the Jacobian of the step of `build_contact_step_function`.
 
-    The function returns (Jacobian with respect to the leaves at `input_indices`, floats) and the
-    other outputs.
+    The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
+    the other results.
     """
     config = ContactStepConfig(argument_structure, is_detailed)
 

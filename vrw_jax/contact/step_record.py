@@ -168,7 +168,7 @@ def add_interval(
     )
 
 
-def interval_outcome(
+def determine_interval_outcome(
     counters: StepCounters,
     guard_layout: GuardLayout,
     has_reached_event: Array,

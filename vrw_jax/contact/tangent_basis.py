@@ -206,13 +206,13 @@ class _PointLinearization(NamedTuple):
         s, friction = self.configuration.s, self.configuration.friction
         slot_modes, is_held = self.configuration.slot_modes, self.configuration.is_held
 
-        def solve(free_motion: FreeMotion) -> tuple[HubVector, SlotPair, SlotPair]:
+        def solve_forces(free_motion: FreeMotion) -> tuple[HubVector, SlotPair, SlotPair]:
             solution = solve_combination(
                 s, self.inertia, free_motion, slot_modes, is_held, friction
             )
             return solution.hub_vector, solution.pull, solution.tangential
 
-        return jax.linearize(solve, self.free_motion)[1]
+        return jax.linearize(solve_forces, self.free_motion)[1]
 
 
 def _restrict_legs(configuration: ContactConfiguration, leg_slice: slice) -> ContactConfiguration:

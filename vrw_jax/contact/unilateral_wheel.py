@@ -54,10 +54,10 @@ from vrw_jax.contact.step_record import (
     UnilateralStep,
     add_interval,
     apply_friction_rule,
+    determine_interval_outcome,
     final_section_state,
     init_counters,
     init_details,
-    interval_outcome,
     make_contact_law,
     make_unilateral_step,
     process_event,
@@ -397,7 +397,7 @@ class UnilateralWheel(AbstractWheel):
             states = sample_in_units(*sampling_arguments)
             return states, *jax.vmap(compute_foot_forces)(states)
 
-        section_state, durations, *_ = _minimal_result(event_loop_state, tilt)
+        section_state, durations, *_ = _make_minimal_result(event_loop_state, tilt)
         landing_place = landing_position(s.n, unpack_state(event_loop_state.state)[0])
         step_length = jnp.where(outcome == Outcome.STEPPED, landing_place, 0.0)
         step_summary = StepSummary(section_state, durations, step_length)
@@ -520,7 +520,7 @@ def _advance_to_event(
     has_event = is_valid & (guard >= 0) & ~is_singular
     has_landed = has_event & (guard == guard_layout.foremost_landing)
     outcome_arguments = counters, guard_layout, has_event, guard, has_landed, failure_outcome
-    outcome = interval_outcome(*outcome_arguments, is_resting, max_events)
+    outcome = determine_interval_outcome(*outcome_arguments, is_resting, max_events)
     details, log = event_loop_state.details, event_loop_state.log
     if details is not None:
         details = record_event(
@@ -573,9 +573,9 @@ def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> Fo
         event_loop_state = _run_event_loop(wheel, params, x, options, is_detailed)
         tilt = None if wheel.uneven is None else wheel.uneven.tilt
         outputs = (
-            _full_result(event_loop_state, engine, tilt)
+            _make_full_result(event_loop_state, engine, tilt)
             if is_detailed
-            else _minimal_result(event_loop_state, tilt)
+            else _make_minimal_result(event_loop_state, tilt)
         )
         return eqx.partition(outputs, eqx.is_inexact_array)
 
@@ -590,7 +590,7 @@ def _compile_step(argument_structure: Any, is_detailed: bool, engine: str) -> Fo
     )
 
 
-def _minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
+def _make_minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None) -> tuple:
     """Return section state, durations, outcome and number of solver steps of a step."""
     counters = event_loop_state.counters
     final_state = unpack_state(event_loop_state.state)[0], event_loop_state.contact_state
@@ -598,7 +598,7 @@ def _minimal_result(event_loop_state: _EventLoopState, tilt: Elementwise | None)
     return section_state, counters.durations, event_loop_state.outcome, counters.n_solver_steps
 
 
-def _full_result(
+def _make_full_result(
     event_loop_state: _EventLoopState, engine: str, tilt: Elementwise | None
 ) -> UnilateralStep:
     """Return all results of a step."""

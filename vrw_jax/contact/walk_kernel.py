@@ -43,10 +43,10 @@ from vrw_jax.contact.step_record import (
     StepDetails,
     add_interval,
     apply_friction_rule,
+    determine_interval_outcome,
     final_section_state,
     init_counters,
     init_details,
-    interval_outcome,
     make_contact_law,
     make_unilateral_step,
     process_event,
@@ -285,9 +285,9 @@ class BatchWalkSettings(NamedTuple):
             has_landed,
             interval.status,
         )
-        outcome = interval_outcome(*outcome_arguments, is_resting, self.max_events).astype(
-            jnp.int32
-        )
+        outcome = determine_interval_outcome(
+            *outcome_arguments, is_resting, self.max_events
+        ).astype(jnp.int32)
         n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         ended_lane = LaneState(interval, counters, details, step_accumulators, n_stepped, outcome)

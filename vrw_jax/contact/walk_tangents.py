@@ -418,7 +418,7 @@ def _evaluate_stages(
         def propagate_tangent(k: Array, known_rows: Array) -> Array:
             tangent = _unpack_tangent(tangents.tangent_rows, k, tangent_template)
             previous_rows = known_rows.reshape(-1, *tangent_template.dynamics_rows.shape)
-            coordinate_tangent_fn = lambda leg_slice: _stage_tangent(
+            coordinate_tangent_fn = lambda leg_slice: _propagate_stage_coordinates(
                 tableau, i, tangent, previous_rows, h, leg_slice
             )
             column_response = run_if_any(
@@ -457,7 +457,7 @@ def _evaluate_stages(
     )[1:]
 
 
-def _stage_tangent(
+def _propagate_stage_coordinates(
     tableau: ButcherTableau,
     i: Array,
     tangent: _IntervalTangent,

@@ -421,9 +421,10 @@ def _fill_fields(record_type: Any, x: Array) -> Any:
 def build_step_function(
     argument_structure: Any, stop_at_lift_off: bool, friction: float | None
 ) -> ForwardFunction:
-    """Return a function from the leaves of (params, x, options) to the floats and others of a step.
+    """Return a function from the leaves of (params, x, options) to the results of a step.
 
-    The function is a forward rule from which all AD modes are built.
+    The results are split into floats and other arrays. The function is a forward rule from which
+    all AD modes are built.
     """
     config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *config.cache_key)
@@ -475,10 +476,10 @@ def build_step_jacobian(
     friction: float | None,
     input_indices: tuple[int, ...],
 ) -> ForwardFunction:
-    """Return a function that computes the Jacobian of `build_step_function`.
+    """Return a function that computes the Jacobian of the step of `build_step_function`.
 
-    The function returns (Jacobian with respect to the leaves at `input_indices`, floats) and the
-    other outputs.
+    The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
+    the other results.
     """
     config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
 

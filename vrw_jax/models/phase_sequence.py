@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.step_inputs import PAPER_START, StateValues, replace_invalid, select_line
+from vrw_jax.models.step_inputs import PAPER_START, StateValues, replace_invalid, select_stance_line
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -88,7 +88,7 @@ def run_phases(
     - `run_phase`: engine;
     - `land`: function of the landing that opens the step.
     """
-    params, is_valid, tilt = select_line(params, x)
+    params, is_valid, tilt = select_stance_line(params, x)
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
     s = params.symbols()
     landing = land(s, *x)

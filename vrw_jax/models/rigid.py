@@ -15,7 +15,7 @@ from vrw_jax.models.step_inputs import (
     SectionState,
     StateValues,
     replace_invalid,
-    select_line,
+    select_stance_line,
     split_slopes,
 )
 from vrw_jax.models.step_results import (
@@ -146,7 +146,7 @@ class RigidWheel(AbstractWheel):
         """Return the results of a step elementwise, for one wheel or a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
-        params, is_valid, tilt = select_line(params, x)
+        params, is_valid, tilt = select_stance_line(params, x)
         end_angle = half_angle if tilt is None else half_angle + tilt
         params, x = replace_invalid(is_valid, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()

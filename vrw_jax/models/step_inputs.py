@@ -99,7 +99,7 @@ def is_valid_slope(slope: Elementwise) -> Array:
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains(slope))
 
 
-def select_line(
+def select_stance_line(
     params: WheelParams, x: StateValues
 ) -> tuple[WheelParams, Array, Elementwise | None]:
     """Return the wheel on the line under both feet, whether a step may start, and the tilt of the

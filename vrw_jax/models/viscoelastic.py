@@ -209,7 +209,7 @@ def _compile_step(
     engine = "lanes" if can_use_lanes(static_options) else "diffrax"
 
     def compute_with_diffrax(tightens_tolerances: bool, *leaves: Array) -> tuple:
-        """Return the floats and the other outputs of a step by diffrax.
+        """Return the results of a step by diffrax, split into floats and other arrays.
 
         If the batch kernel is the engine, this function computes only derivatives of derivatives,
         under the name of that engine.

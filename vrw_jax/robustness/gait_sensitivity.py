@@ -1,4 +1,4 @@
-"""Gait sensitivity norm: how much a measure of a gait varies on slightly uneven ground."""
+"""Gait sensitivity norm: variation of a measure of a gait on slightly uneven ground."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,15 +30,15 @@ class GaitSensitivity(AbstractPrintable):
     """Gait sensitivity norms of several measures, each in the measure's unit per rad of slope.
 
     The norm is the standard deviation of a measure in a long walk over independent slopes, divided
-    by the standard deviation of the slopes, if that is small. It is infinite if the gait is not
-    stable. The squares of the three parts add up to the square of the norm.
+    by the standard deviation of the slopes. The slopes vary little. The norm is infinite if the gait
+    is not stable. The squares of the three parts add up to the square of the norm.
 
-    - `norm`: the norms, in the order of `measures`;
-    - `ending_step`: response to one line of the step that ends on it, with its sign;
-    - `beginning_step`: response of the step that begins on it, with its sign;
+    - `norm`: norms in the order of `measures`;
+    - `ending_step`: signed response to a line of the step that ends on this line;
+    - `beginning_step`: signed response to a line of the step that begins on this line;
     - `later_steps`: root of the sum of the squared responses of all later steps;
-    - `spectral_radius`: of the gait;
-    - `outcome`: Outcome.STEPPED, or why there is no gait; all numbers are then zero;
+    - `spectral_radius`: spectral radius of the gait's return map;
+    - `outcome`: Outcome.STEPPED, or the reason of a missing gait; all numbers are then zero;
     - `measures`: names of the measures.
 
     Examples:
@@ -58,7 +58,7 @@ class GaitSensitivity(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return whether the norms are finite, or why not, as a sentence."""
+        """Return whether the norms are finite, with the reason, as a sentence."""
         if self.outcome != Outcome.STEPPED:
             return describe_ending(self.outcome, Outcome)
         if self.spectral_radius < 1.0:
@@ -66,19 +66,19 @@ class GaitSensitivity(AbstractPrintable):
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
     def summary_rows(self) -> list[TextRow]:
-        """Return one row for each measure, with its parts."""
+        """Return label and text of each measure, with the parts of its norm."""
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         rows = []
         for i, name in enumerate(self.measures):
             measure = MEASURES[name]
             unit = f"{measure.display_unit} per rad".strip()
-            parts = (
+            parts_text = (
                 f"step that ends on a line: {float(self.ending_step[i]):.6g}, "
                 f"step that begins on it: {float(self.beginning_step[i]):.6g}, "
                 f"later steps: {float(self.later_steps[i]):.6g}"
             )
-            rows.append((measure.label, f"{float(self.norm[i]):.6g} {unit} ({parts})"))
+            rows.append((measure.label, f"{float(self.norm[i]):.6g} {unit} ({parts_text})"))
         return [*rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
 
 
@@ -126,8 +126,8 @@ def gait_sensitivity(
     names = check_names("measures", measures)
     model = resolve_model(params, model)
     finder = resolve_finder(params, model, options)
-    of_step = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
-    known_names = tuple(name for name in finder.differentiable_measures if name in of_step)
+    step_measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
+    known_names = tuple(name for name in finder.differentiable_measures if name in step_measures)
     for name in names or ("nothing",):
         check_known_name(
             name, known_names, f"measure of a step of {finder.model.model_name} wheels"
@@ -139,14 +139,14 @@ def gait_sensitivity(
             "for which vrw.limit_cycle finds a gait."
         )
     norms = compute_gait_sensitivity(finder.slope_response(params, cycle, names))
-    mask = lambda value: jnp.where(cycle.outcome == Outcome.STEPPED, value, 0.0)
+    zero_without_gait = lambda value: jnp.where(cycle.outcome == Outcome.STEPPED, value, 0.0)
     radius = floquet.compute_spectral_radius(lax.stop_gradient(cycle.monodromy_value))
     return GaitSensitivity(
-        norm=mask(norms.norm),
-        ending_step=mask(norms.ending_step),
-        beginning_step=mask(norms.beginning_step),
-        later_steps=mask(norms.later_steps),
-        spectral_radius=mask(radius),
+        norm=zero_without_gait(norms.norm),
+        ending_step=zero_without_gait(norms.ending_step),
+        beginning_step=zero_without_gait(norms.beginning_step),
+        later_steps=zero_without_gait(norms.later_steps),
+        spectral_radius=zero_without_gait(radius),
         outcome=cycle.outcome,
         measures=names,
     )

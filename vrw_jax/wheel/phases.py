@@ -62,7 +62,7 @@ class PhaseMargins(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class AbstractPhase(abc.ABC):
-    """Phase of a step of the wheel `s`."""
+    """Phase of a step of the wheel `s`: its equations of motion, guards, margins and reset."""
 
     s: Symbols
     constants: Vector  # constants of the phase: in double support the distance of the feet, m
@@ -137,16 +137,16 @@ class AbstractPhase(abc.ABC):
 
         That line begins at the foot of Leg 1. In its frame the height has the form of flat ground.
         """
-        return landing_foot_height(self.s, self._rotate(motion))
+        return landing_foot_height(self.s, self._rotate_to_next_line(motion))
 
     def landing_rate(self, motion: Motion) -> Elementwise:
         """Return the time derivative of `landing_height`, m/s."""
-        rotated_motion = self._rotate(motion)
+        rotated_motion = self._rotate_to_next_line(motion)
         landing_leg = landing_direction(self.s, rotated_motion.sin, rotated_motion.cos)
         lever_arm = self.s.L0 * landing_leg.sin - rotated_motion.L1 * rotated_motion.sin
         return rotated_motion.dL1 * rotated_motion.cos + lever_arm * rotated_motion.dtheta
 
-    def _rotate(self, motion: Motion) -> Motion:
+    def _rotate_to_next_line(self, motion: Motion) -> Motion:
         """Return the motion in the frame of the next line."""
         if not self.tilt_sin_cos:
             return motion
@@ -280,16 +280,16 @@ class DoubleSupport(AbstractPhase):
         Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
     )  # fmt: skip
 
-    def _circle(self, sin: Elementwise, cos: Elementwise) -> DoubleSupportCircle:
+    def _compute_circle(self, sin: Elementwise, cos: Elementwise) -> DoubleSupportCircle:
         """Return leg lengths and derivatives on the hub's circle at an angle of Leg 1."""
         return double_support_circle(self.s, self.constants[0], sin, cos)
 
-    def _equation(self, motion: Motion) -> dynamics.SingleDofEquation:
+    def _make_equation(self, motion: Motion) -> dynamics.SingleDofEquation:
         """Return the equation of motion on the hub's circle."""
         return dynamics.double_support_equation(self.s, self.constants[0], motion)
 
     def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
-        circle, (dtheta,) = self._circle(sin, cos), v
+        circle, (dtheta,) = self._compute_circle(sin, cos), v
         rates = (dtheta, circle.G1 * dtheta, circle.G2 * dtheta)
         return Motion(sin, cos, circle.L1, circle.L2, *rates)
 
@@ -298,15 +298,15 @@ class DoubleSupport(AbstractPhase):
 
     def complete_acceleration(self, motion: Motion, phase_acceleration: Vector) -> Acceleration:
         return dynamics.accelerations_on_circle(
-            self._circle(motion.sin, motion.cos), motion.dtheta, phase_acceleration[0]
+            self._compute_circle(motion.sin, motion.cos), motion.dtheta, phase_acceleration[0]
         )
 
     def dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
-        inertia, force = self._equation(motion)
+        inertia, force = self._make_equation(motion)
         return (inertia * phase_acceleration[0] - force,)
 
     def solve_dynamics(self, motion: Motion, right_hand_side: Vector) -> Vector:
-        return (right_hand_side[0] / self._equation(motion).inertia,)
+        return (right_hand_side[0] / self._make_equation(motion).inertia,)
 
     def rear_force(self, motion: Motion, acceleration: Acceleration) -> FootForce:
         return dynamics.rear_foot_force(self.s, motion, acceleration)
@@ -376,8 +376,8 @@ class SingleSupport2(AbstractPhase):
     counts_contraction_at_start, counts_specific_margins_at_start = True, (True, True)
 
     def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
-        zero = jnp.zeros_like(q[1])
-        return Motion(sin, cos, q[1], self.s.L0 + zero, v[0], v[1], zero)
+        zero_rate = jnp.zeros_like(q[1])
+        return Motion(sin, cos, q[1], self.s.L0 + zero_rate, v[0], v[1], zero_rate)
 
     def acceleration(self, motion: Motion) -> Acceleration:
         return dynamics.single_support_2_acceleration(self.s, motion)

@@ -23,7 +23,7 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers of the gait of Table 1."""
+    """Return the numbers for the claims on the gait of Table 1, by name."""
     first_step = select_first_step(e.table_1_trajectory)
     phases = dls, sls1, sls2 = split_by_phase(first_step)
     state_changes = e.settling_walk.change.values[1:]
@@ -66,7 +66,9 @@ def _compute_typical_gait_numbers(e: Evidence) -> NumbersByName:
 
 
 def _compute_damping_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers of foot height and rear force at three values of damping."""
+    """Return the numbers for the claims on foot height and rear force at three values of damping,
+    by name.
+    """
     gaits_by_damping = {g.attrs["parameter_damping"]: g for g in e.gaits_by_damping}
     lowest_heights = {
         c: float(gaits_by_damping[c].foot_2_z.min()) for c in sorted(gaits_by_damping)
@@ -156,7 +158,7 @@ DAMPING_CLAIMS = ClaimGroup("Foot 2 and rear force for three dampings", _compute
 
 
 def _compute_indicator_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers of the double-support indicators along the damping."""
+    """Return the numbers for the claims on double-support indicators along the damping, by name."""
     branch = e.damping_branch
     lower_branch = branch.sel(damping=slice(1.0, 219.0))
     upper_branch = branch.sel(damping=slice(220.0, None))
@@ -241,7 +243,7 @@ INDICATOR_CLAIMS = ClaimGroup("DLS indicators over c, slope 0.30 rad", _compute_
 
 
 def _compute_assumption_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers that test assumptions of the model at Table 1."""
+    """Return the numbers for the claims on the model's assumptions at Table 1, by name."""
     gait, first_step = e.table_1_gait, select_first_step(e.table_1_trajectory)
     dls, *_ = split_by_phase(first_step)
     natural_length, locked_length = float(e.params.natural_length), float(e.params.locked_length)

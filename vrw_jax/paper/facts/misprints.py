@@ -17,7 +17,9 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers that compare the equations as printed with the corrected ones."""
+    """Return the numbers for the claims on misprints: equations as printed and as corrected, by
+    name.
+    """
     section_state, library_impulse = (
         e.table_1_gait.section_state.values,
         float(e.table_1_gait.lambda_I4),
