@@ -30,8 +30,8 @@ class GaitSensitivity(AbstractPrintable):
     """Gait sensitivity norms of several measures, each in the measure's unit per rad of slope.
 
     The norm is the standard deviation of a measure in a long walk over independent slopes, divided
-    by the standard deviation of the slopes. The slopes vary little. The norm is infinite if the gait
-    is not stable. The squares of the three parts add up to the square of the norm.
+    by the standard deviation of the slopes. The slopes vary little. The norm is infinite if the
+    gait is not stable. The squares of the three parts add up to the square of the norm.
 
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response to a line of the step that ends on this line;
