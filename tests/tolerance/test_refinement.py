@@ -33,8 +33,8 @@ def test_the_error_bound_holds_if_differences_span_a_jump(side):
         options=vrw.StepOptions(rtol=1e-10, atol=1e-10),
         take_steps=step,
         complete_states=lambda x: x,
-        free_coordinates=lambda x: np.ones((len(x), 2), bool),
-        min_dip_duration=lambda indices: np.zeros(len(indices)),
+        find_free_coordinates=lambda x: np.ones((len(x), 2), bool),
+        min_resolved_contact_duration=lambda indices: np.zeros(len(indices)),
     )
     begin = np.array([[POINT + side * 2e-6, 4e-6, 0.0]])
     chord = BroydenIteration.from_states(ground, np.arange(1), begin, None)

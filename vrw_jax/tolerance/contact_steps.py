@@ -20,15 +20,15 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 @dataclasses.dataclass(frozen=True)
 class StepTolerances:
-    """Tolerances of steps with unilateral contact.
+    """Tolerances of the solver in steps with unilateral contact.
 
     - `tight`: tolerance of most steps, chosen because looser ones save a seventh of the time but
       miss events;
     - `very_tight`: tolerance for measures with a small error, which costs a third more;
     - `walk`: tolerance of walks by Tsit5, whose steps cost a quarter. It is chosen because at 1e-5
-      three gaits in 118 are missed;
+      three of 118 gaits are missed;
     - `tight_comparisons`, `very_tight_comparisons`: other tolerances, with which steps are compared
-      if feet may dip.
+      if feet may graze the ground.
     """
 
     tight: float = 1e-10
@@ -39,23 +39,24 @@ class StepTolerances:
 
 
 STEP_TOLERANCES = StepTolerances()
-"""Tolerances of all measures."""
+"""Tolerances of steps for all measures."""
 
 
 class StepQuantities(NamedTuple):
-    """Result of a step of some elements."""
+    """Result of a step of some elements of a batch."""
 
-    section_states: np.ndarray  # (elements, 4 + 3 n): section state after it; zeros if it failed
-    quantities: np.ndarray  # (elements, 7)
+    # (elements, 4 + 3 n): section state after the step; zeros if the step failed
+    section_states: np.ndarray
+    quantities: np.ndarray  # (elements, 7): quantities of `step_quantities`
     outcome: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
 class GroundBatch:
-    """Batch of wheels with unilateral contact, each with its own friction."""
+    """Batch of wheels with unilateral contact, each with its own friction coefficient."""
 
     parameter_columns: np.ndarray  # (10, elements): parameters and friction
-    n_legs: int  # number of legs
+    n_legs: int  # number of legs of each wheel
     model: UnilateralWheel
     options: StepOptions
     tolerances: StepTolerances = STEP_TOLERANCES
@@ -64,7 +65,7 @@ class GroundBatch:
     def from_params(
         cls, params: WheelParams, friction: np.ndarray, stoppers: str, options: StepOptions
     ) -> "GroundBatch":
-        """Return the batch of wheels with one axis on ground of this friction."""
+        """Return the batch of wheels with one batch axis on ground of this friction."""
         parameter_columns = [
             *(np.asarray(getattr(params, name)) for name in PARAMETER_NAMES),
             friction,
@@ -75,7 +76,7 @@ class GroundBatch:
     def embed_states(
         self, indices: np.ndarray, section_states: np.ndarray, is_rigid: Any = False
     ) -> np.ndarray:
-        """Return full section states from the paper's, (elements, 3).
+        """Return full section states from those of the paper's model, shape (elements, 3).
 
         Leg 1 is on its stopper if `is_rigid`.
         """
@@ -88,7 +89,7 @@ class GroundBatch:
     def take_steps(
         self, indices: np.ndarray, section_states: np.ndarray, n_steps: int = 1
     ) -> StepQuantities:
-        """Take steps from full section states."""
+        """Return the result of `n_steps` steps from full section states."""
         parameter_columns = self.parameter_columns[:, indices]
         end_states, durations, outcome, *_, step_length = walk_batch(
             parameter_columns, section_states, n_steps, self.model, self.options, self.n_legs
@@ -97,34 +98,40 @@ class GroundBatch:
         return StepQuantities(end_states, quantities, outcome)
 
     def with_loose_steps(self) -> "GroundBatch":
-        """Return the batch with steps for walks."""
+        """Return the batch with looser step tolerances, for walks."""
         tolerance = self.tolerances.walk
         options = StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
         return dataclasses.replace(self, options=options)
 
-    def with_other_tolerances(self) -> list["GroundBatch"]:
-        """Return the batch with steps at other tolerances."""
+    def list_with_other_tolerances(self) -> list["GroundBatch"]:
+        """Return copies of the batch with other step tolerances, for comparison."""
         is_very_tight = float(self.options.rtol) < 0.5 * self.tolerances.tight
-        comparisons = (
+        comparison_tolerances = (
             self.tolerances.very_tight_comparisons
             if is_very_tight
             else self.tolerances.tight_comparisons
         )
-        options = [StepOptions(rtol=tolerance, atol=tolerance) for tolerance in comparisons]
+        options = [
+            StepOptions(rtol=tolerance, atol=tolerance) for tolerance in comparison_tolerances
+        ]
         return [dataclasses.replace(self, options=step_options) for step_options in options]
 
-    def min_dip_duration(self, indices: np.ndarray) -> np.ndarray:
-        """Return the time that a foot is off the ground in the smallest resolved dip, s."""
-        parameter = lambda name: self.parameter_columns[PARAMETER_NAMES.index(name)]
-        leg_length = jnp.asarray(parameter("locked_length"))
+    def min_resolved_contact_duration(self, indices: np.ndarray) -> np.ndarray:
+        """Return the shortest duration of a contact that the solver resolves, s, for each selected
+        element.
+
+        It follows from the height of the smallest bounce that the solver resolves.
+        """
+        get_parameter = lambda name: self.parameter_columns[PARAMETER_NAMES.index(name)]
+        leg_length = jnp.asarray(get_parameter("locked_length"))
         bounce_height = np.asarray(min_bounce_height(leg_length, self.options))
-        return np.sqrt(8.0 * bounce_height / parameter("gravity"))[indices]
+        return np.sqrt(8.0 * bounce_height / get_parameter("gravity"))[indices]
 
-    def free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
-        """Return for each number of section states whether it is free, (elements, 4 + 2 n).
+    def find_free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
+        """Return whether each number of the section states is free, shape (elements, 4 + 2 n).
 
-        The other numbers are determined by them. The hub's rates follow from a sticking foot, Leg
-        1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
+        The other numbers follow from the free ones. The hub's rates follow from a sticking foot,
+        Leg 1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
         """
         n_legs = self.n_legs
         contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
@@ -137,9 +144,8 @@ class GroundBatch:
         return is_free
 
     def complete_states(self, section_states: np.ndarray) -> np.ndarray:
-        """Return section states with the numbers that the free ones determine.
-
-        See `free_coordinates`.
+        """Return section states in which the numbers that are not free are recomputed; see
+        `find_free_coordinates`.
         """
         n_legs, section_states = self.n_legs, section_states.copy()
         theta, hub_rate = section_states[:, 0], section_states[:, 1]
@@ -163,5 +169,5 @@ class GroundBatch:
         return section_states
 
     def plane_indices(self) -> np.ndarray:
-        """Return the indices of the paper's section state in a full one."""
+        """Return the indices of the paper's section state in a full section state."""
         return np.array([0, 1, 4 + self.n_legs])

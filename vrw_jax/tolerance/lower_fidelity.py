@@ -34,24 +34,26 @@ MODEL_NAMES = (
 SECTION_STATE_NAME = "section_state"
 
 FINAL_OUTCOMES = (Outcome.STEPPED, Outcome.EVENT_ORDER_MISMATCH)
-"""Outcomes of a search after which no walk is tried. Of 210 wheels with 6 to 12 legs whose solution
-has another order of phases, walks lead 3 to a gait."""
+"""Outcomes of a search after which no walk is tried. Of 210 wheels with 6 to 12 legs whose
+solution has another order of phases, only 3 reach a gait by a walk.
+"""
 
 
 class LowerFidelityGait(NamedTuple):
-    """One gait per element, of a model with the paper's section state; the batch axis is first."""
+    """Gait of each element, of a model with the paper's section state; the batch axis is first."""
 
-    model_index: np.ndarray  # ModelIndex.NONE if there is no gait
+    model_index: np.ndarray  # a ModelIndex, NONE if there is no gait
     section_state: np.ndarray  # (elements, 3)
-    quantities: np.ndarray  # (elements, 7): quantities of the step from it
+    quantities: np.ndarray  # (elements, 7): quantities of the step from the section state
     newton_matrix: np.ndarray  # (elements, 3, 3): (I - DP)^-1
-    quantity_jacobian: np.ndarray  # (elements, 7, 3): derivatives of the quantities
+    # (elements, 7, 3): derivatives of the quantities with respect to the section state
+    quantity_jacobian: np.ndarray
     defect: np.ndarray  # (elements, 3): numerical defect of the gait times `newton_matrix`
     outcome: np.ndarray
 
 
 def empty_gaits(n_elements: int) -> LowerFidelityGait:
-    """Return empty gaits for a batch."""
+    """Return gaits without content for a batch of `n_elements`."""
     return LowerFidelityGait(
         np.full(n_elements, ModelIndex.NONE),
         np.zeros((n_elements, 3)),
@@ -66,21 +68,28 @@ def empty_gaits(n_elements: int) -> LowerFidelityGait:
 def replace_gaits(
     gaits: LowerFidelityGait, indices: np.ndarray, new_gaits: LowerFidelityGait
 ) -> None:
-    """Replace the gaits at these indices."""
+    """Replace the gaits at these indices by new ones, in place."""
     for all_values, new_values in zip(gaits, new_gaits, strict=True):
         all_values[indices] = new_values
 
 
 def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelityGait:
-    """Return gaits by collocation, with derivatives from one step by machine code."""
+    """Return the gaits of the paper's model by collocation, with derivatives from one step by
+    machine code.
+    """
 
     finder = make_finder(None, params.n_legs)
     cycles = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
     section_states, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
-    (missing,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
-    if len(missing):  # One mesh for all keeps digits independent of the batch.
-        cycles = retry_from_walks(finder, *jax.device_put(take_rows((params, cycles), missing)))
-        section_states[missing], outcome[missing] = cycles.section_state, cycles.outcome
+    (missing_indices,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
+    if len(missing_indices):  # One mesh for all elements makes the digits independent of the batch.
+        cycles = retry_from_walks(
+            finder, *jax.device_put(take_rows((params, cycles), missing_indices))
+        )
+        section_states[missing_indices], outcome[missing_indices] = (
+            cycles.section_state,
+            cycles.outcome,
+        )
     all_gaits = empty_gaits(len(section_states))
     all_gaits.outcome[:] = outcome
     (found_indices,) = np.nonzero(outcome == Outcome.STEPPED)
@@ -107,8 +116,13 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
         :, None
     ] * step_jacobian.section_state[:, 0]
     dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
-    rows = [dls_jacobian, sls1_jacobian + sls2_jacobian, 0.0 * dls_jacobian, length_jacobian]
-    quantity_jacobian = np.concatenate([np.stack(rows, 1), step_jacobian.section_state], 1)
+    jacobian_rows = [
+        dls_jacobian,
+        sls1_jacobian + sls2_jacobian,
+        0.0 * dls_jacobian,
+        length_jacobian,
+    ]
+    quantity_jacobian = np.concatenate([np.stack(jacobian_rows, 1), step_jacobian.section_state], 1)
     gaits = _make_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_indices],
@@ -120,23 +134,24 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
     replace_gaits(
         all_gaits,
         found_indices[has_stepped],
-        LowerFidelityGait(*(part[has_stepped] for part in gaits)),
+        LowerFidelityGait(*(gait_array[has_stepped] for gait_array in gaits)),
     )
     all_gaits.outcome[found_indices[~has_stepped]] = np.asarray(step.outcome)[~has_stepped]
     return all_gaits
 
 
 def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
-    """Return the rigid gaits in closed form: the classic landing, in which the rear foot leaves.
+    """Return the rigid gaits in closed form, with the classic landing, in which the rear foot
+    leaves.
 
     Stiff legs with unilateral contact approach this gait. The paper's landing, whose rear foot is
     held, has a gait half as fast again.
     """
-    section_states, end_states, length, duration, jacobian, duration_jacobian = map(
-        np.asarray, map_in_batches(_rolling_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
+    section_states, end_states, step_length, duration, jacobian, duration_jacobian = map(
+        np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
     )
     zeros = np.zeros_like(duration)
-    quantities = np.column_stack([zeros, duration, zeros, length, end_states])
+    quantities = np.column_stack([zeros, duration, zeros, step_length, end_states])
     zero_row = 0.0 * duration_jacobian
     quantity_jacobian = np.concatenate(
         [np.stack([zero_row, duration_jacobian, zero_row, zero_row], 1), jacobian], 1
@@ -146,8 +161,10 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
     )
 
 
-def static_contraction(params: WheelParams) -> np.ndarray:
-    """Return the relative static contraction of a leg, the order of the rigid model's error."""
+def compute_static_contraction(params: WheelParams) -> np.ndarray:
+    """Return the relative static contraction of a leg, the order of magnitude of the rigid
+    model's error.
+    """
     s = jax.tree.map(np.asarray, params.symbols())
     return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
 
@@ -177,19 +194,21 @@ def _make_gaits(
 
 
 @jax.jit
-def _rolling_gaits(params: WheelParams) -> tuple:
-    """Return states, length, duration and their Jacobians of the rigid gaits of a batch."""
+def _compute_rigid_gaits(params: WheelParams) -> tuple:
+    """Return states, step length, m, duration, s, and their Jacobians of the rigid gaits of a
+    batch.
+    """
     model, options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
-    def rolling_gait(params: WheelParams) -> tuple:
+    def compute_rigid_gait(params: WheelParams) -> tuple:
         def evaluate_step(x: jax.Array) -> tuple:
             step = model.take_step(params, x, options)
             return step.section_state, step.step_length, jnp.sum(step.durations)
 
-        x = model.default_start(params)
-        (y, length, duration), (jacobian, _, duration_jacobian) = value_and_jacobian(
-            evaluate_step, x
+        section_state = model.default_start(params)
+        (next_section_state, step_length, duration), (jacobian, _, duration_jacobian) = (
+            value_and_jacobian(evaluate_step, section_state)
         )
-        return x, y, length, duration, jacobian, duration_jacobian
+        return section_state, next_section_state, step_length, duration, jacobian, duration_jacobian
 
-    return jax.vmap(rolling_gait)(params)
+    return jax.vmap(compute_rigid_gait)(params)

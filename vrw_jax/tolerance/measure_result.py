@@ -70,18 +70,23 @@ class MeasureResult(AbstractPrintable):
     states: np.ndarray  # (*batch, 4 + 3 n)
     models: np.ndarray  # (*batch,), indices in MODEL_NAMES
     statuses: np.ndarray
-    n_steps: np.ndarray  # with unilateral contact
+    n_steps: np.ndarray  # number of steps with unilateral contact
     outcomes: np.ndarray
     n_gaits: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)
-    seconds: float = eqx.field(static=True)  # of the whole call, s
+    seconds: float = eqx.field(static=True)  # time of the whole call, s
 
     def _by_name(self, values: np.ndarray) -> Any:
-        """Return the values by measure, or the values of the only measure."""
-        values_by_name = {name: values[..., i] for i, name in enumerate(self.names)}
+        """Return the values by name of the measure, or the values of the only measure."""
+        values_by_name = {
+            name: values[..., measure_index] for measure_index, name in enumerate(self.names)
+        }
         if not self.models.ndim:
-            values_by_name = {name: float(x) for name, x in values_by_name.items()}  # type: ignore[misc]
+            values_by_name = {
+                name: float(number)  # type: ignore[misc]
+                for name, number in values_by_name.items()
+            }
         return values_by_name[self.names[0]] if self.is_single else values_by_name
 
     @property
@@ -91,21 +96,23 @@ class MeasureResult(AbstractPrintable):
 
     @property
     def error(self) -> Any:
-        """Return a bound of the error of the value, from all sources."""
+        """Return a bound of the error of the value, from all sources, in the measure's unit."""
         return self._by_name(self.errors)
 
     @property
     def model_error(self) -> Any:
         """Return the lower model's error, with sign, relative to unilateral contact.
 
-        It is contained in the value if the lower model is selected. It has been removed if
-        unilateral contact is. It is NaN if the lower model has no gait.
+        The value contains this error if the lower model is selected, and not if unilateral contact
+        is. The error is NaN if the lower model has no gait.
         """
         return self._by_name(self.model_errors)
 
     @property
     def numerical_error(self) -> Any:
-        """Return a bound of the error from tolerances, meshes and iterations."""
+        """Return a bound of the error due to tolerances, meshes and iterations, in the measure's
+        unit.
+        """
         return self._by_name(self.numerical_errors)
 
     @property
@@ -116,19 +123,26 @@ class MeasureResult(AbstractPrintable):
 
     @property
     def found(self) -> Any:
-        """Return whether there is a gait."""
+        """Return whether a gait was found."""
         return (self.outcomes == Outcome.STEPPED)[()]
 
     @property
     def ending(self) -> Any:
-        """Return how the search for the gait ended, as a sentence; a batch has an array of them."""
+        """Return how the search for the gait ended, as a sentence; for a batch, an array of
+        sentences.
+        """
         return describe_ending(self.outcomes, Outcome)
 
     @property
     def why(self) -> Any:
-        """Return why that model is selected, as a sentence. A batch has an array of them."""
+        """Return why the model was selected, as a sentence; for a batch, an array of sentences."""
         return describe_elements(
-            _explain, self.models, self.statuses, self.n_steps, self.outcomes, self.n_gaits
+            _describe_selection,
+            self.models,
+            self.statuses,
+            self.n_steps,
+            self.outcomes,
+            self.n_gaits,
         )
 
     @property
@@ -163,17 +177,19 @@ class MeasureResult(AbstractPrintable):
             return f"no {measure.name}"
         value, error = float(self.values[measure_index]), float(self.errors[measure_index])
         digits = max(0, math.ceil(-math.log10(max(error, 1e-15))))
-        shown = f"{value:.{digits}f} {measure.display_unit}".strip()
+        value_text = f"{value:.{digits}f} {measure.display_unit}".strip()
         parts_text = f"numerical {_format_short(self.numerical_errors[measure_index])}"
         if MODEL_NAMES[int(self.models)] != MODEL_NAMES[-1]:
             parts_text = (
                 f"model {_format_short(abs(self.model_errors[measure_index]))}, {parts_text}"
             )
-        return f"{shown} ± {_format_short(error)} ({parts_text})"
+        return f"{value_text} ± {_format_short(error)} ({parts_text})"
 
 
-def _explain(model_index: int, status: int, n_steps: int, outcome: int, n_gaits: int) -> str:
-    """Return the sentence about the selected model of one element."""
+def _describe_selection(
+    model_index: int, status: int, n_steps: int, outcome: int, n_gaits: int
+) -> str:
+    """Return a sentence on the selected model of one element."""
     meaning = MeasureStatus(int(status)).meaning
     if status == MeasureStatus.NO_GAIT:
         gaits_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""

@@ -1,13 +1,13 @@
 """Means over many wheels with unilateral contact, with a lower model as a control variate.
 
-The lower model is a control variate. Its values are known for all wheels, and only the difference
-from unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
-and M. Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines the weight, the
-control that is worth its cost, and the number of further wheels. The pilot's own wheels count as
-known, and the others are drawn from the remaining ones. Nothing is therefore estimated from the
-numbers that it is applied to, and the mean is unbiased. If some wheels have no gait, the mean is a
-ratio of sums over all wheels. Its bias is then of the order of one over the number of sampled
-wheels.
+The values of the lower model are known for all wheels, and only the difference from unilateral
+contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox and M.
+Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines the weight of the control
+variate, the control that is worth its cost, and the number of further wheels. The pilot's wheels
+count as known, and the others are drawn from the remaining wheels. No estimate is therefore applied
+to the numbers from which it was computed, and the mean is unbiased. If some wheels have no gait,
+the mean is a ratio of sums over all wheels. Its bias is then of the order of one over the number of
+sampled wheels.
 """
 
 import math
@@ -41,13 +41,13 @@ from vrw_jax.wheel import WheelParams, convert_friction
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """Numbers of the sampling of a mean.
+    """Options of the sampling of a mean.
 
     - `n_standard_errors`: number of standard errors in the stated error of a mean;
-    - `gait_error_share`: share of the mean's error that is allowed for each gait;
+    - `gait_error_share`: fraction of the mean's error that is allowed for each gait;
     - `min_pilot_gaits`: smallest number of wheels with a gait for an estimate of the variance;
-    - `singular_value_tolerance`: share of the largest singular value below which the pilot does not
-      determine a direction.
+    - `singular_value_tolerance`: fraction of the largest singular value below which the pilot does
+      not determine a direction.
     """
 
     n_standard_errors: float = 2.0
@@ -61,7 +61,7 @@ SAMPLING_OPTIONS = SamplingOptions()
 
 
 class _Control(NamedTuple):
-    """Control variate with its cost in steps with unilateral contact."""
+    """Control variate: its name, and its cost in steps with unilateral contact."""
 
     name: str
     cost: float
@@ -72,8 +72,9 @@ CONTROLS = (
     _Control("the paper's gaits", 1.0),
     _Control("the paper's gaits with one contact step", 2.0),
 )
-"""Control variates, of which the cheapest is used. In batches the paper's gait costs as much as one
-step."""
+"""Control variates, of which the cheapest is used. In batches the paper's gait costs as much as
+one step.
+"""
 
 
 class MultifidelityMean(AbstractPrintable):
@@ -128,11 +129,11 @@ class MultifidelityMean(AbstractPrintable):
 
 
 class _SamplingPlan(NamedTuple):
-    """Sampling plan for a mean with one of the controls."""
+    """Sampling plan for a mean with one of the control variates."""
 
-    expected_cost: float  # in steps with unilateral contact
-    n_wheels: int  # to draw
-    weights: np.ndarray  # of the control's value, and of the flag that it has one
+    expected_cost: float  # expected cost in steps with unilateral contact
+    n_wheels: int  # number of wheels to draw
+    weights: np.ndarray  # weights of the control's value, and of the flag that it has one
     control_index: int
 
 
@@ -183,14 +184,14 @@ def multifidelity_mean(
     tol = check_positive("tol", tol)
     pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
-    params, mu, shape = check_batch(params, convert_friction(friction))
-    n_wheels = len(mu)
+    params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
+    n_wheels = len(friction_by_wheel)
     if not shape or n_wheels <= pilot:
         raise ValueError(
             f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
             "than its pilot: give a batch, params.damping of shape (1000,), say."
         )
-    wheels = _WheelSample(measure, params, mu, stoppers)
+    wheels = _WheelSample(measure, params, friction_by_wheel, stoppers)
     permutation = np.random.default_rng(seed).permutation(n_wheels)
     pilot_indices, other_indices = permutation[:pilot], permutation[pilot:]
     gait_tol = options.gait_error_share * tol
@@ -203,20 +204,20 @@ def multifidelity_mean(
         )
     pilot_sample = _SampledMeasures.from_results(pilot_results)
     control_columns = [
-        _control_columns(wheels.evaluate_control(pilot_indices, control))
+        _stack_control_columns(wheels.evaluate_control(pilot_indices, control))
         for control in range(len(CONTROLS))
     ]
-    plans = [
-        _plan_sampling(i, pilot_sample, x, tol, len(other_indices), options)
-        for i, x in enumerate(control_columns)
+    sampling_plans = [
+        _plan_sampling(control_index, pilot_sample, x, tol, len(other_indices), options)
+        for control_index, x in enumerate(control_columns)
     ]
-    plan = min(plans, key=lambda plan: plan.expected_cost)
+    plan = min(sampling_plans, key=lambda plan: plan.expected_cost)
     drawn_results = wheels.measure_wheels(other_indices[: plan.n_wheels], gait_tol)
     value, standard_error = _estimate_mean(
         plan,
         pilot_sample,
         _SampledMeasures.from_results(drawn_results),
-        _control_columns(wheels.evaluate_control(other_indices, plan.control_index)),
+        _stack_control_columns(wheels.evaluate_control(other_indices, plan.control_index)),
     )
     gait_errors = np.concatenate(
         [pilot_results.error[is_found], drawn_results.error[drawn_results.found]]
@@ -229,22 +230,22 @@ def multifidelity_mean(
         weight=float(plan.weights[0]),
         cost=float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
         + CONTROLS[plan.control_index].cost * n_wheels,
-        cost_high_fidelity_only=pilot_sample.mean_cost * pilot + plans[0].expected_cost,
+        cost_high_fidelity_only=pilot_sample.mean_cost * pilot + sampling_plans[0].expected_cost,
         measure=measure,
         control=CONTROLS[plan.control_index].name,
     )
 
 
 class _SampledMeasures(NamedTuple):
-    """Measures of sampled wheels."""
+    """Measures of the wheels of a sample."""
 
-    values: np.ndarray  # the measure, zero if there is no gait
-    has_gait: np.ndarray  # whether there is a gait
+    values: np.ndarray  # values of the measure, zero if there is no gait
+    has_gait: np.ndarray  # whether the wheel has a gait
     mean_cost: float  # mean number of steps per wheel
 
     @classmethod
     def from_results(cls, results: MeasureResult) -> "_SampledMeasures":
-        """Return the measures of these results."""
+        """Return the sampled measures of these results."""
         has_gait = results.found.astype(float)
         return cls(
             np.where(results.found, results.value, 0.0), has_gait, float(np.mean(results.n_steps))
@@ -252,7 +253,7 @@ class _SampledMeasures(NamedTuple):
 
 
 class _WheelSample(NamedTuple):
-    """Wheels of a sample and the measure to evaluate."""
+    """Wheels of a sample, and the measure that is evaluated."""
 
     measure_name: str
     params: WheelParams
@@ -260,25 +261,25 @@ class _WheelSample(NamedTuple):
     stoppers: str
 
     def take_wheels(self, indices: np.ndarray) -> WheelParams:
-        """Return some of the wheels."""
+        """Return the wheels at these indices."""
         return jax.device_put(take_rows(self.params, indices))
 
     def measure_wheels(self, indices: np.ndarray, tol: float) -> MeasureResult:
-        """Return the measure with unilateral contact."""
+        """Return the measure with unilateral contact of these wheels, to within `tol`."""
         arguments = self.measure_name, self.take_wheels(indices), tol
         return measure_to_tolerance(
             *arguments, friction=self.friction[indices], stoppers=self.stoppers
         )
 
     def evaluate_control(self, indices: np.ndarray, control_index: int) -> np.ndarray:
-        """Return the values of a control, NaN for wheels without one."""
+        """Return the values of a control variate, NaN for wheels without one."""
         control_values = np.full(len(indices), np.nan)
         if not control_index:
             return control_values
         options = StepOptions()
         lower_gaits = find_paper_gaits(self.take_wheels(indices), options)
         (has_gait,) = np.nonzero(lower_gaits.model_index != ModelIndex.NONE)
-        lower_gaits = LowerFidelityGait(*(part[has_gait] for part in lower_gaits))
+        lower_gaits = LowerFidelityGait(*(gait_array[has_gait] for gait_array in lower_gaits))
         values = evaluate_measures([self.measure_name], lower_gaits.quantities)[:, 0]
         if control_index == len(CONTROLS) - 1:
             gait_indices = indices[has_gait]
@@ -290,7 +291,7 @@ class _WheelSample(NamedTuple):
             iteration = BroydenIteration.from_states(
                 ground, all_positions, section_states, lower_gaits
             )
-            estimate = iteration.observe(
+            estimate = iteration.update_and_estimate(
                 all_positions, ground.take_steps(all_positions, section_states), [self.measure_name]
             )
             values = np.where(estimate.same_codes, estimate.values[:, 0], values)
@@ -298,8 +299,10 @@ class _WheelSample(NamedTuple):
         return control_values
 
 
-def _control_columns(control_values: np.ndarray) -> np.ndarray:
-    """Return for each wheel the control's value, and whether it has one."""
+def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
+    """Return the control's value of each wheel, zero if it has none, and whether it has one,
+    (wheels, 2).
+    """
     has_value = np.isfinite(control_values)
     return np.column_stack([np.where(has_value, control_values, 0.0), has_value])
 
@@ -314,8 +317,8 @@ def _plan_sampling(
 ) -> _SamplingPlan:
     """Return weights and number of wheels from the pilot, for a mean to within `tol`.
 
-    The mean M is over the wheels with a gait, a ratio. The controlled quantity is each wheel's
-    measure minus M, zero for a wheel without a gait; its sum is zero.
+    The mean M is over the wheels with a gait, which is a ratio. The controlled quantity is each
+    wheel's measure minus M, and zero for a wheel without a gait. Its sum over all wheels is zero.
     """
     gait_share = float(np.mean(pilot_sample.has_gait))
     centered_values = (
@@ -325,10 +328,10 @@ def _plan_sampling(
     weights, _, rank, _ = np.linalg.lstsq(
         centered_columns, centered_values, rcond=options.singular_value_tolerance
     )
-    squares = float(np.sum((centered_values - centered_columns @ weights) ** 2)) + _unseen_variance(
-        pilot_sample, centered_values
-    )
-    residual_variance = squares / (len(centered_values) - 1 - int(rank))
+    sum_of_squares = float(
+        np.sum((centered_values - centered_columns @ weights) ** 2)
+    ) + _variance_of_unseen_wheel(pilot_sample, centered_values)
+    residual_variance = sum_of_squares / (len(centered_values) - 1 - int(rank))
     sampling_tol = (1.0 - options.gait_error_share) * tol
     n_required = residual_variance * (options.n_standard_errors / (sampling_tol * gait_share)) ** 2
     n_wheels = min(
@@ -350,7 +353,8 @@ def _estimate_mean(
 ) -> tuple[float, float]:
     """Return the mean and its standard error.
 
-    `control_columns` are of all wheels but the pilot's; the first ones are of the drawn wheels.
+    `control_columns` are those of all wheels except the pilot's, of which the first belong to the
+    drawn wheels.
     """
     n_wheels, control_values = len(control_columns), control_columns @ plan.weights
     gait_count = np.sum(pilot_sample.has_gait) + n_wheels * np.mean(drawn_sample.has_gait)
@@ -358,16 +362,21 @@ def _estimate_mean(
     mean = (
         np.sum(pilot_sample.values) + n_wheels * (np.mean(control_values) + np.mean(differences))
     ) / gait_count
-    squares = plan.n_wheels * np.var(differences - mean * drawn_sample.has_gait)
-    squares += _unseen_variance(pilot_sample, pilot_sample.values - mean * pilot_sample.has_gait)
-    variance = squares / (plan.n_wheels - 1) / plan.n_wheels * (1.0 - plan.n_wheels / n_wheels)
+    sum_of_squares = plan.n_wheels * np.var(differences - mean * drawn_sample.has_gait)
+    sum_of_squares += _variance_of_unseen_wheel(
+        pilot_sample, pilot_sample.values - mean * pilot_sample.has_gait
+    )
+    variance = (
+        sum_of_squares / (plan.n_wheels - 1) / plan.n_wheels * (1.0 - plan.n_wheels / n_wheels)
+    )
     return float(mean), float(n_wheels / gait_count * math.sqrt(variance))
 
 
-def _unseen_variance(pilot_sample: _SampledMeasures, centered_values: np.ndarray) -> float:
-    """Return the variance of one extra wheel that the control predicts wrongly, if gaits are lost.
+def _variance_of_unseen_wheel(pilot_sample: _SampledMeasures, centered_values: np.ndarray) -> float:
+    """Return the variance due to one additional wheel that the control predicts wrongly, if gaits
+    are lost.
 
-    A small sample may contain no wheel with a gait of the paper's model and without one of
+    A small sample may contain no wheel that has a gait of the paper's model and none with
     unilateral contact.
     """
     return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))

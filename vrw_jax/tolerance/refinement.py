@@ -1,13 +1,15 @@
 """Refinement of gaits of the highest model by quasi-Newton steps that need only its values.
 
 One step of the highest model from a state x gives the defect r = P(x) - x. Multiplied by the
-inverse of I - DP it is Newton's correction d. The gait's quantities are near those of this step
+inverse of I - DP, it is Newton's correction d. The gait's quantities are near those of this step
 plus their change along d. At first both matrices are the lower model's, if it has a gait. Each
-further step updates them by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965). If
-the convergence is slow, and if the legs' codes have changed, finite differences of a few more steps
-replace the matrices. The matrices of another motion predict a small correction in a slow direction,
-and an error bound that follows from them is invalid. The contraction q of d from one step to the
-next is measured, and the larger of the last two bounds the remaining error. As for a contraction
+further step updates them by Broyden's update of rank one (C. G. Broyden, Math. Comp. 19, 1965).
+Finite differences of a few more steps replace the matrices if the convergence is slow, or if the
+legs' codes have changed.
+
+The matrices of another motion predict a small correction in a slow direction, and an error bound
+that follows from them is invalid. The contraction q of d from one step to the next is therefore
+measured, and the larger of its last two values bounds the remaining error. As for a contraction
 (Kantorovich), with a factor of two, the bound is 2q/(1 - q) times the last change but one.
 """
 
@@ -23,8 +25,8 @@ from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait
 from vrw_jax.tolerance.step_quantities import (
     N_DURATIONS,
     N_STEP_QUANTITIES,
+    compute_measure_derivatives,
     evaluate_measures,
-    measure_derivatives,
 )
 from vrw_jax.wheel import Outcome
 
@@ -34,34 +36,35 @@ ErrorGoal = Callable[[np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class BroydenOptions:
-    """Numbers of the quasi-Newton iteration; section states are in rad, rad/s, m, m/s.
+    """Options of the quasi-Newton iteration; section states are in rad, rad/s, m, m/s.
 
     - `refresh_above`: contraction rate above which matrices are recomputed;
-    - `max_trusted_rate`: largest contraction rate that is trusted to bound the remaining error;
-    - `min_rate`: smallest contraction rate that is assumed. It is chosen because slow directions
-      are hidden behind quick ones: corrections of one gait decreased by a third each, and it was
+    - `max_trusted_rate`: largest contraction rate that bounds the remaining error reliably;
+    - `min_rate`: smallest contraction rate that is assumed. It is chosen because fast directions
+      may hide slow ones. The corrections of one gait decreased by a third each, and the gait was
       four times as far away as its bound;
     - `curvature_per_length`: smallest assumed contraction rate over the length of a correction,
       which measures the curvature of the maps;
     - `max_correction`: longest accepted correction, chosen because the linearization is unknown
-      beyond;
+      beyond it;
     - `max_failures`: number of corrections that do not contract, or of changes of the legs' codes,
-      before an element fails;
+      after which an element fails;
     - `max_iterations`: largest number of corrections;
     - `refresh_interval`: number of corrections after which matrices are recomputed;
     - `step_error_factor`: error of a step over the tolerance of its solver steps, chosen because 99
       of 100 errors are within a third of it;
-    - `min_update_share`: smallest share of a direction that must remain after a step for an update
-      of the inverse;
+    - `min_update_share`: smallest fraction of a direction that must remain after a step for an
+      update of the inverse;
     - `difference_step`: step of finite differences in a coordinate of the section state;
     - `max_difference`: derivative by differences above which these may cross a jump. It is chosen
-      because of 1,042 derivatives at gaits one in a hundred is steeper. Across a jump a correction
+      because one in a hundred of 1,042 derivatives at gaits is steeper. Across a jump a correction
       gives no information about the remaining error;
     - `roundoff_level`, `stall_level`: lengths of corrections, in tolerances, at the level of the
       integrator's errors, and below which corrections may stall;
-    - `n_presumed_dips`: number of shortest dips of a foot that a step may miss or add;
-    - `max_presumed_share`: largest share of the allowed error that is assumed for such dips;
-      otherwise their error is measured;
+    - `n_presumed_missed_contacts`: number of shortest contacts of a foot that a step may miss or
+      add;
+    - `max_presumed_error_fraction`: largest fraction of the allowed error that is assumed for such
+      contacts; otherwise their error is measured;
     - `stall_safety_factor`: safety factor of stalled corrections, relative to their own effect, and
       of the difference between steps at two tolerances. It is chosen because a factor of four was
       too small for 4 of 10,365 results;
@@ -84,8 +87,8 @@ class BroydenOptions:
     max_difference: float = 10.0
     roundoff_level: float = 1e2
     stall_level: float = 1e4
-    n_presumed_dips: float = 3.0
-    max_presumed_share: float = 0.1
+    n_presumed_missed_contacts: float = 3.0
+    max_presumed_error_fraction: float = 0.1
     stall_safety_factor: float = 6.0
     max_gait_distance: float = 1e-3
     max_walk_drift: float = 1e-3
@@ -93,7 +96,7 @@ class BroydenOptions:
 
 
 BROYDEN_OPTIONS = BroydenOptions()
-"""Options of all measures."""
+"""Options of the iteration for all measures."""
 
 
 class StepEstimate(NamedTuple):
@@ -101,10 +104,11 @@ class StepEstimate(NamedTuple):
 
     - `same_codes`: whether the step does not change the legs' codes;
     - `values`: estimated measures of the gait, (elements, measures), as are the errors below;
-    - `correction_effect`: sum of the absolute effects of the correction;
-    - `quantity_jacobian`: derivatives by the step's quantities, (elements, measures, 7);
+    - `correction_effect`: sum of the absolute effects of the correction on the measures;
+    - `quantity_jacobian`: derivatives with respect to the step's quantities, (elements, measures,
+      7);
     - `numerical_error`: bound of the integrator's error;
-    - `dip_error`: bound of the error from unresolved short dips.
+    - `missed_contact_error`: bound of the error due to contacts that are too short to be resolved.
     """
 
     same_codes: np.ndarray
@@ -112,19 +116,19 @@ class StepEstimate(NamedTuple):
     correction_effect: np.ndarray
     quantity_jacobian: np.ndarray
     numerical_error: np.ndarray
-    dip_error: np.ndarray
+    missed_contact_error: np.ndarray
 
 
 class RefinementResult(NamedTuple):
-    """Result of the refinement."""
+    """Result of the refinement, for each element."""
 
     is_done: np.ndarray
     values: np.ndarray
     remaining_error: np.ndarray  # (elements, measures): bound of the iteration's error
     numerical_error: np.ndarray
-    n_steps: np.ndarray  # of the highest model
+    n_steps: np.ndarray  # number of steps of the highest model
     section_states: np.ndarray  # (elements, 4 + 3 n)
-    speed: np.ndarray  # of the last step, m/s
+    speed: np.ndarray  # speed in the last step, m/s
 
 
 @dataclasses.dataclass
@@ -136,11 +140,12 @@ class BroydenIteration:
     indices: np.ndarray
     section_states: np.ndarray
     newton_matrix: np.ndarray  # (elements, m, m): inverse of I - DP
-    quantity_jacobian: np.ndarray  # (elements, 7, m): derivatives of the quantities by the state
+    # (elements, 7, m): derivatives of the quantities with respect to the state
+    quantity_jacobian: np.ndarray
     has_current_matrices: np.ndarray  # whether the matrices are those of this motion
     is_free: np.ndarray
     has_previous: np.ndarray  # whether the previous step had the same codes
-    previous: tuple[np.ndarray, ...]  # its start, defect and quantities
+    previous: tuple[np.ndarray, ...]  # start, defect and quantities of the previous step
     correction: np.ndarray
 
     @classmethod
@@ -152,7 +157,9 @@ class BroydenIteration:
         lower_gaits: LowerFidelityGait | None,
         options: BroydenOptions = BROYDEN_OPTIONS,
     ) -> "BroydenIteration":
-        """Return the iteration from states, with the matrices of lower gaits if they are given."""
+        """Return the iteration from these states, with the matrices of lower gaits if they are
+        given.
+        """
         n_elements, n_numbers = len(indices), section_states.shape[1] - ground.n_legs
         newton_matrix = np.tile(np.eye(n_numbers), (n_elements, 1, 1))
         quantity_jacobian = np.zeros((n_elements, N_STEP_QUANTITIES, n_numbers))
@@ -173,7 +180,7 @@ class BroydenIteration:
             newton_matrix,
             quantity_jacobian,
             has_current_matrices=np.full(n_elements, lower_gaits is not None),
-            is_free=ground.free_coordinates(section_states),
+            is_free=ground.find_free_coordinates(section_states),
             has_previous=np.zeros(n_elements, bool),
             previous=previous,
             correction=np.zeros((n_elements, n_numbers)),
@@ -181,10 +188,12 @@ class BroydenIteration:
 
     def select(self, selected: np.ndarray) -> "BroydenIteration":
         """Return the iteration of the selected elements."""
-        ground, options, *arrays = (getattr(self, field.name) for field in dataclasses.fields(self))
+        ground, options, *arrays = (
+            getattr(self, field_value.name) for field_value in dataclasses.fields(self)
+        )
         return BroydenIteration(ground, options, *jax.tree.map(lambda x: x[selected], arrays))
 
-    def observe(
+    def update_and_estimate(
         self, positions: np.ndarray, step: StepQuantities, names: Sequence[str]
     ) -> StepEstimate:
         """Update the matrices from a step of some elements, and return estimates of their gaits."""
@@ -211,19 +220,19 @@ class BroydenIteration:
             previous_values[positions] = current_values
         with np.errstate(all="ignore"):
             estimate = step.quantities + np.einsum("ijk,ik->ij", quantity_jacobian, correction)
-            measure_jacobian = measure_derivatives(names, estimate)
+            measure_jacobian = compute_measure_derivatives(names, estimate)
             state_sensitivity = np.abs(measure_jacobian @ quantity_jacobian)
             correction_effect = np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction))
             tolerance = self.options.step_error_factor * float(self.ground.options.rtol)
             total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
                 state_sensitivity @ np.abs(newton_matrix), axis=-1
             )
-            # A dip moves time from one duration to another.
-            spread = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
-            dip_error = (
-                self.options.n_presumed_dips
-                * self.ground.min_dip_duration(self.indices[positions])[:, None]
-                * spread
+            # A contact that is not resolved moves time from one duration to another.
+            duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
+            missed_contact_error = (
+                self.options.n_presumed_missed_contacts
+                * self.ground.min_resolved_contact_duration(self.indices[positions])[:, None]
+                * duration_sensitivity_range
             )
             values = evaluate_measures(names, estimate)
             return StepEstimate(
@@ -232,22 +241,24 @@ class BroydenIteration:
                 correction_effect,
                 measure_jacobian,
                 tolerance * total_sensitivity,
-                dip_error,
+                missed_contact_error,
             )
 
     def _update_matrices(
         self,
         positions: np.ndarray,
-        x: np.ndarray,
+        states: np.ndarray,
         defect: np.ndarray,
         quantities: np.ndarray,
         same_codes: np.ndarray,
     ) -> None:
-        """Apply Broyden's updates to both matrices if the previous step is comparable."""
-        previous_x, previous_defect, previous_quantities = (
+        """Apply Broyden's updates to both matrices of those elements whose previous step is
+        comparable.
+        """
+        previous_states, previous_defect, previous_quantities = (
             previous_values[positions] for previous_values in self.previous
         )
-        state_change = np.where(self.is_free[positions], x - previous_x, 0.0)
+        state_change = np.where(self.is_free[positions], states - previous_states, 0.0)
         defect_change = previous_defect - defect
         newton_matrix = self.newton_matrix[positions]
         quantity_jacobian = self.quantity_jacobian[positions]
@@ -266,11 +277,11 @@ class BroydenIteration:
             np.einsum("ij,ijk->ik", state_change, newton_matrix)
             / np.where(is_well_conditioned, projection, 1.0)[:, None]
         )
-        updated = (
+        updated_matrix = (
             newton_matrix + (state_change - predicted_change)[:, :, None] * update_row[:, None, :]
         )
         self.newton_matrix[positions] = np.where(
-            is_well_conditioned[:, None, None], updated, newton_matrix
+            is_well_conditioned[:, None, None], updated_matrix, newton_matrix
         )
         prediction_error = (
             quantities
@@ -278,40 +289,41 @@ class BroydenIteration:
             - np.einsum("ijk,ik->ij", quantity_jacobian, state_change)
         )
         update_row = state_change / np.where(can_update, squared_length, 1.0)[:, None]
-        updated = quantity_jacobian + prediction_error[:, :, None] * update_row[:, None, :]
+        updated_matrix = quantity_jacobian + prediction_error[:, :, None] * update_row[:, None, :]
         self.quantity_jacobian[positions] = np.where(
-            can_update[:, None, None], updated, quantity_jacobian
+            can_update[:, None, None], updated_matrix, quantity_jacobian
         )
         self.has_previous[positions] = same_codes
 
     def step_elements(self, positions: np.ndarray) -> StepQuantities:
-        """Take one step from the current states of some elements."""
+        """Return the result of one step from the current states of some elements."""
         return self.ground.take_steps(self.indices[positions], self.section_states[positions])
 
     def has_same_codes(self, positions: np.ndarray, step: StepQuantities) -> np.ndarray:
-        """Return whether the step of these elements ended with the codes at its start."""
+        """Return whether the step of these elements ended with the legs' codes at its start."""
         n_numbers = self.is_free.shape[1]
         same_codes = np.all(
             self.section_states[positions, n_numbers:] == step.section_states[:, n_numbers:], axis=1
         )
         return same_codes & (step.outcome == Outcome.STEPPED)
 
-    def dip_errors_by_comparison(
+    def compute_errors_by_comparison(
         self, positions: np.ndarray, names: Sequence[str], refinement: "RefinementResult"
     ) -> np.ndarray:
-        """Return numerical errors from steps at other tolerances, which include those of dips.
+        """Return numerical errors from steps at other tolerances, which include those of unresolved
+        contacts.
 
-        At another tolerance the shortest resolved dips are shorter or longer. The error is infinite
-        if one of these steps has another motion.
+        At another tolerance the shortest resolved contact is shorter or longer. The error is
+        infinite if one of these steps has another motion.
         """
-        worst_error = np.zeros_like(refinement.numerical_error[positions])
-        for other_ground in self.ground.with_other_tolerances():
+        largest_error = np.zeros_like(refinement.numerical_error[positions])
+        for other_ground in self.ground.list_with_other_tolerances():
             other_iteration = dataclasses.replace(
                 self.select(positions),
                 ground=other_ground,
                 has_previous=np.zeros(len(positions), bool),
             )
-            estimate = other_iteration.observe(
+            estimate = other_iteration.update_and_estimate(
                 np.arange(len(positions)),
                 other_iteration.step_elements(np.arange(len(positions))),
                 names,
@@ -322,10 +334,10 @@ class BroydenIteration:
             error = difference_bound + np.minimum(
                 estimate.numerical_error, refinement.numerical_error[positions]
             )
-            worst_error = np.maximum(
-                worst_error, np.where(estimate.same_codes[:, None], error, np.inf)
+            largest_error = np.maximum(
+                largest_error, np.where(estimate.same_codes[:, None], error, np.inf)
             )
-        return worst_error
+        return largest_error
 
     def is_attracting(self) -> np.ndarray:
         """Return whether nearby walks converge to the current states.
@@ -335,33 +347,35 @@ class BroydenIteration:
         """
         return np.linalg.eigvals(self.newton_matrix).real.min(-1) > 0.5
 
-    def distance_to(self, section_states: np.ndarray) -> np.ndarray:
+    def max_distance_to(self, section_states: np.ndarray) -> np.ndarray:
         """Return the largest distance of the current states from `section_states`."""
         return np.abs(self.section_states - section_states)[:, : self.is_free.shape[1]].max(-1)
 
-    def stays_near(self, n_steps: int) -> np.ndarray:
-        """Return whether a walk stays at the current states.
+    def walk_stays_near(self, n_steps: int) -> np.ndarray:
+        """Return whether a walk of `n_steps` stays near the current states.
 
-        It is a check of `is_attracting`, because finite differences across a dip give wrong
-        multipliers.
+        The walk checks `is_attracting`, because finite differences across a change of contacts give
+        wrong multipliers.
         """
         end = self.ground.take_steps(self.indices, self.section_states, n_steps)
         return (end.outcome == Outcome.STEPPED) & (
-            self.distance_to(end.section_states) <= self.options.max_walk_drift
+            self.max_distance_to(end.section_states) <= self.options.max_walk_drift
         )
 
     def apply_correction(
         self, positions: np.ndarray, end_states: np.ndarray, same_codes: np.ndarray
     ) -> None:
-        """Move to the corrected states, or to the end of the step if codes have changed."""
+        """Replace the states by the corrected ones, or by the end of the step if codes have
+        changed.
+        """
         n_numbers = self.is_free.shape[1]
-        corrected = np.where(
+        corrected_states = np.where(
             self.is_free[positions],
             self.section_states[positions, :n_numbers] + self.correction[positions],
             end_states[:, :n_numbers],
         )
         self.section_states[positions] = end_states
-        self.section_states[positions[same_codes], :n_numbers] = corrected[same_codes]
+        self.section_states[positions[same_codes], :n_numbers] = corrected_states[same_codes]
         self.section_states[positions[same_codes]] = self.ground.complete_states(
             self.section_states[positions[same_codes]]
         )
@@ -369,15 +383,18 @@ class BroydenIteration:
         self.newton_matrix[changed_positions] = np.eye(n_numbers)
         self.quantity_jacobian[changed_positions] = 0.0
         self.has_current_matrices[changed_positions] = False
-        self.is_free[changed_positions] = self.ground.free_coordinates(
+        self.is_free[changed_positions] = self.ground.find_free_coordinates(
             self.section_states[changed_positions]
         )
 
-    def difference_matrices(self, positions: np.ndarray, step: StepQuantities) -> np.ndarray:
-        """Recompute both matrices by finite differences, one more step for each free coordinate.
+    def compute_difference_matrices(
+        self, positions: np.ndarray, step: StepQuantities
+    ) -> np.ndarray:
+        """Recompute both matrices by finite differences, with one more step for each free
+        coordinate.
 
-        `step` is the one from the current states. Return the number of steps taken for each
-        element. A difference above `max_difference` is also taken on the other side, and the
+        `step` is the step from the current states. Return the number of steps taken for each
+        element. A difference above `max_difference` is also computed on the other side, and the
         smaller one is used.
         """
         n_numbers = self.is_free.shape[1]
@@ -425,10 +442,11 @@ class BroydenIteration:
         coordinate_indices: np.ndarray,
         difference_step: float,
     ) -> np.ndarray:
-        """Return derivatives of section state and quantities by single coordinates, (pairs, m + 7).
+        """Return derivatives of section state and quantities with respect to single coordinates,
+        (pairs, m + 7).
 
-        A pair is an element position and a coordinate. The derivatives are zero if the step ends
-        with other codes.
+        A pair is the position of an element and a coordinate. The derivatives are zero if the step
+        ends with other codes.
         """
         n_numbers = self.is_free.shape[1]
         section_states = self.section_states[positions][element_positions]
@@ -465,14 +483,15 @@ class _ErrorBound:
         self.measures = np.full((n_elements, n_measures), np.nan)
 
     def reset(self, positions: np.ndarray, contraction_rate: float) -> None:
-        """Reset these elements after their matrices have been replaced."""
+        """Reset the contraction of these elements after their matrices have been replaced."""
         self.correction_length[positions] = np.inf
         self.contraction_rate[positions] = contraction_rate
 
-    def remaining_error(
+    def bound_remaining_error(
         self, positions: np.ndarray, estimate: StepEstimate, correction_length: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Return the bound of the remaining error, the contraction rate, and whether it stalls.
+        """Return the bound of the remaining error, the contraction rate, and whether the
+        corrections stall.
 
         The bound has the shape (elements, measures). Corrections stall if they stop decreasing and
         are as small as the integrator's errors allow.
@@ -480,8 +499,11 @@ class _ErrorBound:
         options = self.options
         previous_length = self.correction_length[positions]
         with np.errstate(all="ignore"):
-            rate = np.where(estimate.same_codes, correction_length / previous_length, np.inf)
-            # With differences across a dip, shorter corrections change measures as much as before.
+            contraction_rate = np.where(
+                estimate.same_codes, correction_length / previous_length, np.inf
+            )
+            # With differences across a change of contacts, shorter corrections change measures as
+            # much as before.
             effect_rate = np.max(
                 estimate.correction_effect
                 / np.maximum(self.correction_effect[positions], options.min_resolved_change),
@@ -489,51 +511,59 @@ class _ErrorBound:
             )
             is_stalled = (
                 estimate.same_codes
-                & (np.maximum(rate, effect_rate) > options.refresh_above)
+                & (np.maximum(contraction_rate, effect_rate) > options.refresh_above)
                 & np.isfinite(previous_length)
             )
             is_stalled &= (
                 np.maximum(correction_length, previous_length)
                 <= options.stall_level * self.tolerance
             )
-            rate = np.where(
+            contraction_rate = np.where(
                 estimate.same_codes
                 & (correction_length <= options.roundoff_level * self.tolerance),
                 0.0,
-                rate,
+                contraction_rate,
             )
-            # No rate is trusted before there is a previous correction.
+            # No rate is reliable until there is a previous correction.
             min_rate = np.clip(
                 options.curvature_per_length * previous_length,
                 options.min_rate,
                 options.max_trusted_rate,
             )
             min_rate = np.where(np.isfinite(previous_length), min_rate, np.inf)
-            worst_rate = np.maximum(np.maximum(rate, self.contraction_rate[positions]), min_rate)
-            worst_rate = np.maximum(worst_rate, np.where(rate > 0.0, effect_rate, 0.0))
-            change = np.abs(estimate.values - self.measures[positions])
-            effect = np.fmax(
-                np.fmax(estimate.correction_effect, self.correction_effect[positions]), change
+            pessimistic_rate = np.maximum(
+                np.maximum(contraction_rate, self.contraction_rate[positions]), min_rate
             )
-            error_share = np.where(
-                worst_rate <= options.max_trusted_rate,
-                2.0 * worst_rate / (1.0 - worst_rate),
+            pessimistic_rate = np.maximum(
+                pessimistic_rate, np.where(contraction_rate > 0.0, effect_rate, 0.0)
+            )
+            value_change = np.abs(estimate.values - self.measures[positions])
+            largest_effect = np.fmax(
+                np.fmax(estimate.correction_effect, self.correction_effect[positions]), value_change
+            )
+            error_per_effect = np.where(
+                pessimistic_rate <= options.max_trusted_rate,
+                2.0 * pessimistic_rate / (1.0 - pessimistic_rate),
                 np.inf,
             )
-            error_share = np.where(
-                is_stalled, np.minimum(error_share, options.stall_safety_factor), error_share
+            error_per_effect = np.where(
+                is_stalled,
+                np.minimum(error_per_effect, options.stall_safety_factor),
+                error_per_effect,
             )
             remaining_error = np.nan_to_num(
-                error_share[:, None] * effect, nan=np.inf, posinf=np.inf
+                error_per_effect[:, None] * largest_effect, nan=np.inf, posinf=np.inf
             )
         has_previous = np.isfinite(previous_length)
         self.contraction_rate[positions] = np.where(
-            has_previous, np.where(estimate.same_codes, rate, 0.0), self.contraction_rate[positions]
+            has_previous,
+            np.where(estimate.same_codes, contraction_rate, 0.0),
+            self.contraction_rate[positions],
         )
         self.correction_length[positions] = np.where(estimate.same_codes, correction_length, np.inf)
         self.correction_effect[positions] = estimate.correction_effect
         self.measures[positions] = estimate.values
-        return remaining_error, rate, is_stalled
+        return remaining_error, contraction_rate, is_stalled
 
 
 def refine(
@@ -547,7 +577,7 @@ def refine(
 
     Finite differences replace the matrices after `n_steps_before_differences` steps, and
     immediately if the matrices are those of another motion. `first_step_and_estimate` is the step
-    from the current states with its estimate, if it has been taken.
+    from the current states with its estimate, if that step has been taken.
     """
     n_elements, n_measures = len(iteration.indices), len(names)
     result = RefinementResult(
@@ -561,33 +591,33 @@ def refine(
     )
     options, tolerance = iteration.options, float(iteration.ground.options.rtol)
     error_bound = _ErrorBound(n_elements, n_measures, tolerance, options)
-    n_failures, active = np.zeros(n_elements, int), np.arange(n_elements)
+    n_failures, active_positions = np.zeros(n_elements, int), np.arange(n_elements)
     n_steps_since_refresh = np.full(
         n_elements, options.refresh_interval - n_steps_before_differences
     )
     needs_comparison = np.zeros(n_elements, bool)
     for iteration_index in range(options.max_iterations):
-        if not len(active):
+        if not len(active_positions):
             break
         if first_step_and_estimate is not None and iteration_index == 0:
             step, estimate = first_step_and_estimate
         else:
-            step = iteration.step_elements(active)
-            result.n_steps[active] += 1
-            needs_refresh = iteration.has_same_codes(active, step) & (
-                (n_steps_since_refresh[active] >= options.refresh_interval)
-                | ~iteration.has_current_matrices[active]
+            step = iteration.step_elements(active_positions)
+            result.n_steps[active_positions] += 1
+            needs_refresh = iteration.has_same_codes(active_positions, step) & (
+                (n_steps_since_refresh[active_positions] >= options.refresh_interval)
+                | ~iteration.has_current_matrices[active_positions]
             )
-            positions = active[needs_refresh]
-            result.n_steps[positions] += iteration.difference_matrices(
-                positions, StepQuantities(*(x[needs_refresh] for x in step))
+            positions = active_positions[needs_refresh]
+            result.n_steps[positions] += iteration.compute_difference_matrices(
+                positions, StepQuantities(*(step_array[needs_refresh] for step_array in step))
             )
             error_bound.reset(positions, 0.0 if n_steps_before_differences else np.inf)
             n_steps_since_refresh[positions] = 0
-            estimate = iteration.observe(active, step, names)
-        correction_length = np.linalg.norm(iteration.correction[active], axis=1)
-        remaining_error, rate, is_stalled = error_bound.remaining_error(
-            active, estimate, correction_length
+            estimate = iteration.update_and_estimate(active_positions, step, names)
+        correction_length = np.linalg.norm(iteration.correction[active_positions], axis=1)
+        remaining_error, contraction_rate, is_stalled = error_bound.bound_remaining_error(
+            active_positions, estimate, correction_length
         )
         error_goals = error_goal(estimate.values)
         is_done = is_stalled | np.all(
@@ -595,35 +625,44 @@ def refine(
             <= np.maximum(error_goals - estimate.numerical_error, estimate.numerical_error),
             axis=1,
         )
-        result.values[active], result.is_done[active] = estimate.values, is_done
-        result.remaining_error[active] = remaining_error
-        result.numerical_error[active] = estimate.numerical_error + estimate.dip_error
-        result.speed[active] = evaluate_measures(("speed",), step.quantities)[:, 0]
-        # A walk may end at a gait whose feet dip more often than assumed.
-        needs_comparison[active] = is_done & (
-            np.any(estimate.dip_error > options.max_presumed_share * error_goals, axis=1)
+        result.values[active_positions], result.is_done[active_positions] = estimate.values, is_done
+        result.remaining_error[active_positions] = remaining_error
+        result.numerical_error[active_positions] = (
+            estimate.numerical_error + estimate.missed_contact_error
+        )
+        result.speed[active_positions] = evaluate_measures(("speed",), step.quantities)[:, 0]
+        # A walk may end at a gait with more short contacts than assumed.
+        needs_comparison[active_positions] = is_done & (
+            np.any(
+                estimate.missed_contact_error > options.max_presumed_error_fraction * error_goals,
+                axis=1,
+            )
             | (n_steps_before_differences == 0)
         )
-        is_slow = np.isfinite(rate) & (rate > options.refresh_above)
-        n_failures[active] += ~estimate.same_codes | is_slow
-        n_steps_since_refresh[active] = np.where(
-            is_slow, options.refresh_interval, n_steps_since_refresh[active] + 1
+        converges_slowly = np.isfinite(contraction_rate) & (
+            contraction_rate > options.refresh_above
         )
-        continues = (
+        n_failures[active_positions] += ~estimate.same_codes | converges_slowly
+        n_steps_since_refresh[active_positions] = np.where(
+            converges_slowly, options.refresh_interval, n_steps_since_refresh[active_positions] + 1
+        )
+        is_continued = (
             ~is_done
             & (step.outcome == Outcome.STEPPED)
             & (correction_length <= options.max_correction)
         )
-        continues &= n_failures[active] < options.max_failures
+        is_continued &= n_failures[active_positions] < options.max_failures
         iteration.apply_correction(
-            active[continues], step.section_states[continues], estimate.same_codes[continues]
+            active_positions[is_continued],
+            step.section_states[is_continued],
+            estimate.same_codes[is_continued],
         )
-        active = active[continues]
+        active_positions = active_positions[is_continued]
     positions = np.flatnonzero(needs_comparison)
     if len(positions):
-        result.numerical_error[positions] = iteration.dip_errors_by_comparison(
+        result.numerical_error[positions] = iteration.compute_errors_by_comparison(
             positions, names, result
         )
-        result.n_steps[positions] += len(iteration.ground.with_other_tolerances())
+        result.n_steps[positions] += len(iteration.ground.list_with_other_tolerances())
     result.is_done[positions] &= np.isfinite(result.numerical_error[positions]).all(1)
     return result

@@ -1,4 +1,4 @@
-"""Walks with unilateral contact until they settle, by loose steps with leaps between them.
+"""Walks with unilateral contact until they settle, by loose steps with extrapolation between them.
 
 On a fast wheel the states of the legs decay within a few steps, and the remaining motion drifts
 slowly along one curve, for hundreds of steps. A few steps determine the drift and its decay. A leap
@@ -18,16 +18,16 @@ from vrw_jax.wheel import Outcome
 
 @dataclass(frozen=True)
 class LeapOptions:
-    """Numbers of walks with leaps; states are in rad, rad/s, m, m/s.
+    """Options of walks with leaps; states are in rad, rad/s, m, m/s.
 
     - `n_warmup_steps`: number of steps before the first leap;
     - `max_leaps`: largest number of leaps;
-    - `steps_per_leap`: number of steps after a leap, chosen because with five three gaits in 118
-      are missed, among 451 wheels without a gait of the paper's model;
+    - `steps_per_leap`: number of steps after a leap. It is chosen because five steps miss three of
+      118 gaits, among 451 wheels without a gait of the paper's model;
     - `max_leap`: longest leap, chosen because longer ones pass over pairs of close gaits;
     - `give_up_factor`, `give_up_leaps_left`: a walk ends if its drift would fade beyond this factor
-      times the remaining leaps, and at most so many leaps are left. They are chosen because before
-      that a drift may grow for a while and yet fade;
+      times the remaining leaps, and at most so many leaps are left. They are chosen because a drift
+      may first grow for a while and then fade;
     - `settled_drift`: drift per step, and distance to its predicted limit, below which a walk has
       settled;
     - `noise_drift`: drift at the level of the steps' own error.
@@ -44,11 +44,11 @@ class LeapOptions:
 
 
 LEAP_OPTIONS = LeapOptions()
-"""Options of all walks."""
+"""Options of all walks with leaps."""
 
 
 class WalkEnd(NamedTuple):
-    """Ends of walks."""
+    """Ends of walks, for each element."""
 
     is_settled: np.ndarray  # whether the walk has settled, probably near a gait
     section_states: np.ndarray  # (elements, 4 + 3 n)
@@ -71,25 +71,30 @@ def walk_until_settled(
         np.full(n_elements, int(Outcome.STEPPED)),
         np.zeros(n_elements, int),
     )
-    active, start = np.arange(n_elements), section_states
+    active_positions, start_states = np.arange(n_elements), section_states
     steps_of_rounds = (options.n_warmup_steps, *options.max_leaps * (options.steps_per_leap,))
     for round_index, n_steps in enumerate(steps_of_rounds):
-        if not len(active):
+        if not len(active_positions):
             break
-        walk_end.n_steps[active] += n_steps
-        active_indices, current_states = indices[active], walk_end.section_states[active]
-        earlier_step = loose_ground.take_steps(active_indices, start, n_steps - 2)
-        failed = np.flatnonzero(earlier_step.outcome != Outcome.STEPPED)
-        if len(failed):  # A leap failed, or the tolerance of the first steps is too loose.
-            retry = (loose_ground if round_index else ground).take_steps(
-                active_indices[failed], current_states[failed], n_steps - 2
+        walk_end.n_steps[active_positions] += n_steps
+        active_indices, current_states = (
+            indices[active_positions],
+            walk_end.section_states[active_positions],
+        )
+        earlier_step = loose_ground.take_steps(active_indices, start_states, n_steps - 2)
+        failed_positions = np.flatnonzero(earlier_step.outcome != Outcome.STEPPED)
+        if len(
+            failed_positions
+        ):  # A leap failed, or the tolerance of the first steps is too loose.
+            retried_step = (loose_ground if round_index else ground).take_steps(
+                active_indices[failed_positions], current_states[failed_positions], n_steps - 2
             )
-            retried = []
-            for part, retried_part in zip(earlier_step, retry, strict=True):
-                part = np.array(part)
-                part[failed] = retried_part
-                retried.append(part)
-            earlier_step = StepQuantities(*retried)
+            merged_arrays = []
+            for step_array, retried_part in zip(earlier_step, retried_step, strict=True):
+                step_array = np.array(step_array)
+                step_array[failed_positions] = retried_part
+                merged_arrays.append(step_array)
+            earlier_step = StepQuantities(*merged_arrays)
         previous_step = loose_ground.take_steps(active_indices, earlier_step.section_states)
         current_step = loose_ground.take_steps(active_indices, previous_step.section_states)
         step_outcomes = np.stack(
@@ -97,10 +102,12 @@ def walk_until_settled(
         )
         is_stepping = np.all(step_outcomes == Outcome.STEPPED, axis=0)
         first_failure = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
-        walk_end.outcome[active] = step_outcomes[first_failure, np.arange(len(active))]
-        active = active[is_stepping]
-        walk_end.section_states[active] = current_step.section_states[is_stepping]
-        walk_end.is_settled[active], leap_vectors, fade_distance = _analyze_drift(
+        walk_end.outcome[active_positions] = step_outcomes[
+            first_failure, np.arange(len(active_positions))
+        ]
+        active_positions = active_positions[is_stepping]
+        walk_end.section_states[active_positions] = current_step.section_states[is_stepping]
+        walk_end.is_settled[active_positions], leap_vectors, fade_distance = _analyze_drift(
             earlier_step.section_states[is_stepping],
             previous_step.section_states[is_stepping],
             current_step.section_states[is_stepping],
@@ -108,51 +115,59 @@ def walk_until_settled(
             options,
         )
         n_leaps_left = options.max_leaps - round_index
-        continues = ~walk_end.is_settled[active] & (
+        is_continued = ~walk_end.is_settled[active_positions] & (
             (n_leaps_left > options.give_up_leaps_left)
             | (fade_distance <= options.give_up_factor * options.max_leap * n_leaps_left)
         )
-        active, leap_vectors = (part[continues] for part in (active, leap_vectors))
-        start = walk_end.section_states[active]
+        active_positions, leap_vectors = (
+            step_array[is_continued] for step_array in (active_positions, leap_vectors)
+        )
+        start_states = walk_end.section_states[active_positions]
         has_leap = np.any(leap_vectors != 0.0, axis=1)
-        start[has_leap, :n_numbers] += leap_vectors[has_leap]
-        start[has_leap] = ground.complete_states(start[has_leap])
+        start_states[has_leap, :n_numbers] += leap_vectors[has_leap]
+        start_states[has_leap] = ground.complete_states(start_states[has_leap])
     return walk_end
 
 
 def _analyze_drift(
-    earlier: np.ndarray,
-    previous: np.ndarray,
-    current: np.ndarray,
+    earlier_states: np.ndarray,
+    previous_states: np.ndarray,
+    current_states: np.ndarray,
     n_numbers: int,
     options: LeapOptions,
 ) -> tuple[np.ndarray, ...]:
-    """Analyze the drift of three successive section states.
+    """Return whether walks have settled, the leap, and the distance at which the drift fades.
 
-    Return whether they have settled, the leap from the last one, and the distance at which the
-    drift would fade. Leap and distance are zero if the legs' codes change.
+    The arguments are three successive section states of each walk. The leap starts from the last
+    one. Leap and distance are zero if the legs' codes change.
     """
     same_codes = np.all(
-        (earlier[:, n_numbers:] == current[:, n_numbers:])
-        & (previous[:, n_numbers:] == current[:, n_numbers:]),
+        (earlier_states[:, n_numbers:] == current_states[:, n_numbers:])
+        & (previous_states[:, n_numbers:] == current_states[:, n_numbers:]),
         axis=1,
     )
-    earlier_change = (previous - earlier)[:, :n_numbers]
-    last_change = (current - previous)[:, :n_numbers]
-    speed = np.abs(last_change).max(1)
+    earlier_change = (previous_states - earlier_states)[:, :n_numbers]
+    last_change = (current_states - previous_states)[:, :n_numbers]
+    drift_per_step = np.abs(last_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(
             np.sum(earlier_change * last_change, axis=1)
             / np.sum(earlier_change * earlier_change, axis=1)
         )
         n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
-        fade_distance = np.where(speed < options.noise_drift, 0.0, np.abs(n_steps_to_fade) * speed)
+        fade_distance = np.where(
+            drift_per_step < options.noise_drift, 0.0, np.abs(n_steps_to_fade) * drift_per_step
+        )
         n_leap_steps = np.where(
-            speed > 0.0, np.minimum(n_steps_to_fade, options.max_leap / speed), 0.0
+            drift_per_step > 0.0,
+            np.minimum(n_steps_to_fade, options.max_leap / drift_per_step),
+            0.0,
         )
     # A drift that changes sign at each step leads to a gait of two steps.
     is_settled = (
-        same_codes & (fade_distance < options.settled_drift) & (speed < options.settled_drift)
+        same_codes
+        & (fade_distance < options.settled_drift)
+        & (drift_per_step < options.settled_drift)
     )
     has_leap = same_codes & ~is_settled & (decay_rate > 0.0)
     return (

@@ -13,18 +13,19 @@ QUANTITY_NAMES = (
     "dtheta_touchdown",
     "dL1_touchdown",
 )
-"""Names of the quantities: times on two feet, on one foot and in flight, s; step length, m; and the
-paper's section state."""
+"""Names of the quantities: durations with two feet, one foot and no foot on the ground, s; step
+length, m; and the paper's section state.
+"""
 
 N_STEP_QUANTITIES = len(QUANTITY_NAMES)
-"""Number of quantities."""
+"""Number of quantities of a step."""
 
 N_DURATIONS = 3
 """Number of durations, which are the first quantities."""
 
 
 def _period_of_quantities(quantities: np.ndarray) -> np.ndarray:
-    """Return the period of a step, the sum of its durations, s."""
+    """Return the duration of a step, the sum of its durations in each support, s."""
     return quantities[..., 0] + quantities[..., 1] + quantities[..., 2]
 
 
@@ -40,20 +41,22 @@ MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dtheta_touchdown": lambda t: t[..., 5],
     "dL1_touchdown": lambda t: t[..., 6],
 }
-"""Measures that every model has, by their names in `measures.MEASURES`."""
+"""Functions that compute the measures every model has, by their names in `measures.MEASURES`."""
 
 COMPLEX_STEP = 1e-30
-"""Imaginary step of derivatives, chosen so small that its square has no effect."""
+"""Imaginary step of complex-step derivatives, chosen so small that its square has no effect."""
 
 
 def evaluate_measures(names: Sequence[str], quantities: np.ndarray) -> np.ndarray:
-    """Return measures (elements, measures) from quantities (elements, 7), NaN if a step failed."""
+    """Return measures (elements, measures) from quantities (elements, 7); NaN if a step failed."""
     with np.errstate(invalid="ignore"):
         return np.stack([MEASURE_FUNCTIONS[name](quantities) for name in names], -1)
 
 
-def measure_derivatives(names: Sequence[str], quantities: np.ndarray) -> np.ndarray:
-    """Return derivatives of measures by quantities, (elements, measures, 7), by complex steps."""
+def compute_measure_derivatives(names: Sequence[str], quantities: np.ndarray) -> np.ndarray:
+    """Return derivatives of measures with respect to quantities, (elements, measures, 7), by
+    complex steps.
+    """
     complex_quantities = quantities[:, None, :] + 1j * COMPLEX_STEP * np.eye(N_STEP_QUANTITIES)
     return np.stack(
         [MEASURE_FUNCTIONS[name](complex_quantities).imag / COMPLEX_STEP for name in names], 1

@@ -4,8 +4,8 @@ The lower model's gait takes one step with unilateral contact. The defect, propa
 by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
 residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
 finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise the
-same step is the first of an iteration to the gait with unilateral contact. If the iteration does
-not contract, the gait is another one, and a walk leads to it.
+same step is the first one of an iteration to the gait with unilateral contact. If the iteration
+does not contract, the gait is another one, and a walk leads to it.
 """
 
 import time
@@ -24,11 +24,11 @@ from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, GroundBatch
 from vrw_jax.tolerance.lower_fidelity import (
     LowerFidelityGait,
     ModelIndex,
+    compute_static_contraction,
     empty_gaits,
     find_paper_gaits,
     find_rigid_gaits,
     replace_gaits,
-    static_contraction,
 )
 from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
 from vrw_jax.tolerance.refinement import (
@@ -52,7 +52,7 @@ from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
 @dataclass(frozen=True)
 class RequestOptions:
-    """Numbers of the search for a model and a gait that give measures to a tolerance.
+    """Options of the search for a model and a gait that give measures to a tolerance.
 
     - `error_safety_factor`: factor from the error estimate of one step to its bound, chosen because
       the bound holds as long as corrections contract by 3/4;
@@ -62,8 +62,8 @@ class RequestOptions:
     - `n_stability_steps`: number of steps of a walk that must stay near a gait if the gait is far
       from the end of the previous walk;
     - `n_cold_starts`: number of starts, slow ones first, for wheels without a lower gait. It is
-      chosen because of 232 wheels the first two starts led 100 to a gait, and the other starts none
-      of the rest;
+      chosen because the first two starts lead 100 of 232 wheels to a gait, and the other starts
+      none of the rest;
     - `max_distance_ratio`: largest distance of the gait with unilateral contact from the lower gait
       that it continues, in first corrections. It is chosen because a contraction by a half moves at
       most so far;
@@ -138,13 +138,17 @@ def measure_to_tolerance(
         raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
     tol, relative = check_positive("tol", tol), check_bool("relative", relative)
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    params, mu, shape = check_batch(params, convert_friction(friction))
+    params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
     rank = None if which is None else parse_gait_choice(which)
     is_tight = tol >= REQUEST_OPTIONS.very_tight_below
     tolerance = STEP_TOLERANCES.tight if is_tight else STEP_TOLERANCES.very_tight
     options = StepOptions(rtol=tolerance, atol=tolerance)
     request = _MeasureRequest(
-        names, tol, relative, GroundBatch.from_params(params, mu, stoppers, options), params
+        names,
+        tol,
+        relative,
+        GroundBatch.from_params(params, friction_by_wheel, stoppers, options),
+        params,
     )
     if rank is None:
         request.try_rigid_model()
@@ -167,7 +171,7 @@ def check_batch(
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
     """Return wheels and friction broadcast to one batch axis, and their original batch shape."""
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    shapes = {np.shape(x) for x in (*jax.tree.leaves(params), friction)}
+    shapes = {np.shape(argument_array) for argument_array in (*jax.tree.leaves(params), friction)}
     shape = max(shapes, key=len)
     if len(shape) > 1 or shapes - {(), shape}:
         shapes_text = ", ".join(map(str, sorted(shapes - {()})))
@@ -176,8 +180,16 @@ def check_batch(
             "axis, the same for all: give one value for all, or one for each element."
         )
     n_elements = shape[0] if shape else 1
-    broadcast = lambda x: np.broadcast_to(np.asarray(x, float), (n_elements,))
-    return jax.tree.map(lambda x: jnp.asarray(broadcast(x)), params), broadcast(friction), shape
+    broadcast_parameters = lambda argument_array: np.broadcast_to(
+        np.asarray(argument_array, float), (n_elements,)
+    )
+    return (
+        jax.tree.map(
+            lambda argument_array: jnp.asarray(broadcast_parameters(argument_array)), params
+        ),
+        broadcast_parameters(friction),
+        shape,
+    )
 
 
 class _MeasureRequest:
@@ -195,12 +207,12 @@ class _MeasureRequest:
         n_elements, n_measures = len(ground.parameter_columns.T), len(names)
         self.names, self.tol, self.relative, self.options = names, tol, relative, options
         self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
-        full = lambda fill: np.full((n_elements, n_measures), fill)
+        make_full_array = lambda fill_value: np.full((n_elements, n_measures), fill_value)
         self.results = {
-            "values": full(np.nan),
-            "errors": full(np.inf),
-            "model_errors": full(np.nan),
-            "numerical_errors": full(np.inf),
+            "values": make_full_array(np.nan),
+            "errors": make_full_array(np.inf),
+            "model_errors": make_full_array(np.nan),
+            "numerical_errors": make_full_array(np.inf),
             "models": np.full(n_elements, ModelIndex.NONE),
             "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)),
             "n_steps": np.zeros(n_elements, int),
@@ -210,30 +222,35 @@ class _MeasureRequest:
             "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
         }
 
-    def error_goal(self, values: np.ndarray) -> np.ndarray:
+    def compute_error_goal(self, values: np.ndarray) -> np.ndarray:
         """Return the absolute tolerance of measures with about these values."""
         return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
 
     @property
-    def unanswered_indices(self) -> np.ndarray:
+    def find_unanswered_indices(self) -> np.ndarray:
         """Return the indices of the elements without a result."""
         return np.flatnonzero(self.results["models"] == ModelIndex.NONE)
 
     def try_rigid_model(self) -> None:
-        """Try the rigid gait for wheels whose legs are stiff enough."""
+        """Try the rigid gait for wheels whose legs are stiff enough, and record accepted
+        results.
+        """
         with np.errstate(all="ignore"):
             indices = np.flatnonzero(
-                self.options.error_safety_factor * static_contraction(self.params) <= self.tol
+                self.options.error_safety_factor * compute_static_contraction(self.params)
+                <= self.tol
             )
         if not len(indices):
             return
         replace_gaits(self.lower_gaits, indices, find_rigid_gaits(self._take_wheels(indices)))
         indices = indices[np.isfinite(self.lower_gaits.quantities[indices]).all(1)]
-        self._correct_from_gaits(indices, continues=False)
+        self._correct_from_gaits(indices, continues_iteration=False)
 
     def try_paper_model(self) -> None:
-        """Try the paper's gaits, or else the gaits with unilateral contact near them."""
-        indices = self.unanswered_indices
+        """Try the paper's gaits, or else the gaits with unilateral contact near them, and record
+        accepted results.
+        """
+        indices = self.find_unanswered_indices
         if not len(indices):
             return
         replace_gaits(
@@ -242,12 +259,13 @@ class _MeasureRequest:
             find_paper_gaits(self._take_wheels(indices), self.ground.options),
         )
         self._correct_from_gaits(
-            indices[self.lower_gaits.model_index[indices] != ModelIndex.NONE], continues=True
+            indices[self.lower_gaits.model_index[indices] != ModelIndex.NONE],
+            continues_iteration=True,
         )
 
     def walk_to_gaits(self) -> None:
-        """Walk to the gaits with unilateral contact of wheels without a result."""
-        indices = self.unanswered_indices
+        """Walk to the gaits with unilateral contact of wheels without a result, and record them."""
+        indices = self.find_unanswered_indices
         if not len(indices):
             return
         has_lower_gait = self.lower_gaits.model_index[indices] != ModelIndex.NONE
@@ -268,10 +286,12 @@ class _MeasureRequest:
             )
 
     def select_by_rank(self, rank: int) -> None:
-        """Select the gait of this rank, slowest first, among the ends of walks from all starts."""
-        indices, empty_results, results_of_starts = self.unanswered_indices, self.results, []
+        """Record the gait of this rank, slowest first, among the ends of walks from all starts."""
+        indices, empty_results, results_of_starts = self.find_unanswered_indices, self.results, []
         for start in compute_walk_starts(self.params):
-            self.results = {name: x.copy() for name, x in empty_results.items()}
+            self.results = {
+                name: starts_array.copy() for name, starts_array in empty_results.items()
+            }
             self._walk_and_correct(
                 indices, self.ground.embed_states(indices, start), MeasureStatus.SELECTED_BY_RANK
             )
@@ -282,7 +302,10 @@ class _MeasureRequest:
         )
         for index in indices:
             distinct_gaits = _find_distinct_gaits(
-                [{name: x[index] for name, x in results.items()} for results in results_of_starts]
+                [
+                    {name: starts_array[index] for name, starts_array in results.items()}
+                    for results in results_of_starts
+                ]
             )
             empty_results["n_gaits"][index] = len(distinct_gaits)
             if -len(distinct_gaits) <= rank < len(distinct_gaits):
@@ -290,21 +313,23 @@ class _MeasureRequest:
                     empty_results[name][index] = distinct_gaits[rank][name]
 
     def _take_wheels(self, indices: np.ndarray) -> WheelParams:
-        """Return some of the wheels."""
+        """Return the wheels at these indices."""
         return jax.device_put(take_rows(self.params, indices))
 
-    def _correct_from_gaits(self, indices: np.ndarray, continues: bool) -> None:
-        """Take one step with unilateral contact from the lower gaits, and more if `continues`."""
+    def _correct_from_gaits(self, indices: np.ndarray, continues_iteration: bool) -> None:
+        """Take one step with unilateral contact from the lower gaits, and correct further if
+        `continues_iteration`.
+        """
         if not len(indices):
             return
-        lower_gaits = LowerFidelityGait(*(part[indices] for part in self.lower_gaits))
+        lower_gaits = LowerFidelityGait(*(gait_array[indices] for gait_array in self.lower_gaits))
         section_states = self.ground.embed_states(
             indices, lower_gaits.section_state, lower_gaits.model_index == ModelIndex.RIGID
         )
         iteration = BroydenIteration.from_states(self.ground, indices, section_states, lower_gaits)
         all_positions = np.arange(len(indices))
         first_step = iteration.step_elements(all_positions)
-        estimate = iteration.observe(all_positions, first_step, self.names)
+        estimate = iteration.update_and_estimate(all_positions, first_step, self.names)
         values = evaluate_measures(self.names, lower_gaits.quantities)
         with np.errstate(all="ignore"):
             correction_effect = (
@@ -317,13 +342,17 @@ class _MeasureRequest:
                 estimate.quantity_jacobian @ iteration.quantity_jacobian[:, :, plane_indices]
             )
             lower_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
-            numerical = lower_defect_effect + estimate.numerical_error + estimate.dip_error
-            bound = (
+            numerical_error = (
+                lower_defect_effect + estimate.numerical_error + estimate.missed_contact_error
+            )
+            error_bound = (
                 np.abs(error)
                 + (self.options.error_safety_factor - 1.0) * correction_effect
-                + numerical
+                + numerical_error
             )
-            is_accepted = estimate.same_codes & np.all(bound <= self.error_goal(values), axis=1)
+            is_accepted = estimate.same_codes & np.all(
+                error_bound <= self.compute_error_goal(values), axis=1
+            )
         self.results["n_steps"][indices] += 1
         self._record(
             indices[is_accepted],
@@ -331,34 +360,37 @@ class _MeasureRequest:
             MeasureStatus.CHECKED_BY_ONE_STEP,
             {
                 "values": values[is_accepted],
-                "errors": bound[is_accepted],
+                "errors": error_bound[is_accepted],
                 "model_errors": error[is_accepted],
-                "numerical_errors": numerical[is_accepted],
+                "numerical_errors": numerical_error[is_accepted],
                 "states": section_states[is_accepted],
             },
         )
-        rejected = np.flatnonzero(~is_accepted & estimate.same_codes)
-        if not continues or not len(rejected):
+        rejected_positions = np.flatnonzero(~is_accepted & estimate.same_codes)
+        if not continues_iteration or not len(rejected_positions):
             return
         max_distance = self.options.max_distance_ratio * np.linalg.norm(
-            iteration.correction[rejected][:, plane_indices], axis=1
+            iteration.correction[rejected_positions][:, plane_indices], axis=1
         )
-        first_step_and_estimate = jax.tree.map(lambda part: part[rejected], (first_step, estimate))
+        first_step_and_estimate = jax.tree.map(
+            lambda gait_array: gait_array[rejected_positions], (first_step, estimate)
+        )
         refinement = refine(
-            iteration.select(rejected),
+            iteration.select(rejected_positions),
             self.names,
-            self.error_goal,
+            self.compute_error_goal,
             self.options.n_steps_before_differences,
             first_step_and_estimate,
         )
         is_near = (
             np.linalg.norm(
-                (refinement.section_states - section_states[rejected])[:, plane_indices], axis=1
+                (refinement.section_states - section_states[rejected_positions])[:, plane_indices],
+                axis=1,
             )
             <= max_distance
         )
         self._record_gaits(
-            indices[rejected],
+            indices[rejected_positions],
             refinement._replace(is_done=refinement.is_done & is_near),
             MeasureStatus.CONTINUES_LOWER_GAIT,
         )
@@ -366,7 +398,7 @@ class _MeasureRequest:
     def _walk_and_correct(
         self, indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
     ) -> None:
-        """Walk from the states, and correct the ends of the walks."""
+        """Walk from the states, correct the ends of the walks, and record the gaits."""
         walk_end = walk_until_settled(self.ground, indices, section_states)
         self.results["n_steps"][indices] += walk_end.n_steps
         # A step cannot begin if a wheel has turned more than once in flight.
@@ -381,19 +413,19 @@ class _MeasureRequest:
         n_exact_steps = self.options.n_exact_steps
         step = self.ground.take_steps(indices, section_states, n_exact_steps)
         self.results["n_steps"][indices] += n_exact_steps
-        continues = step.outcome == Outcome.STEPPED
-        indices, section_states = indices[continues], step.section_states[continues]
+        is_continued = step.outcome == Outcome.STEPPED
+        indices, section_states = indices[is_continued], step.section_states[is_continued]
         iteration = BroydenIteration.from_states(self.ground, indices, section_states, None)
-        refinement = refine(iteration, self.names, self.error_goal, 0)
+        refinement = refine(iteration, self.names, self.compute_error_goal, 0)
         refinement.is_done[refinement.is_done] = iteration.select(
             refinement.is_done
         ).is_attracting()
         max_distance = iteration.options.max_gait_distance
         far_positions = np.flatnonzero(
-            refinement.is_done & (iteration.distance_to(section_states) > max_distance)
+            refinement.is_done & (iteration.max_distance_to(section_states) > max_distance)
         )
         n_stability_steps = self.options.n_stability_steps
-        refinement.is_done[far_positions] = iteration.select(far_positions).stays_near(
+        refinement.is_done[far_positions] = iteration.select(far_positions).walk_stays_near(
             n_stability_steps
         )
         refinement.n_steps[far_positions] += n_stability_steps
@@ -442,15 +474,15 @@ def _find_distinct_gaits(
     results_of_starts: list[dict[str, np.ndarray]],
 ) -> list[dict[str, np.ndarray]]:
     """Return the gaits of one wheel that differ by more than their errors, slowest first."""
-    distinct: list[dict[str, np.ndarray]] = []
+    distinct_gaits: list[dict[str, np.ndarray]] = []
     for candidate in results_of_starts:
-        differs = (
+        is_distinct = (
             np.any(
-                np.abs(candidate["values"] - other["values"])
-                > candidate["errors"] + other["errors"]
+                np.abs(candidate["values"] - other_gait["values"])
+                > candidate["errors"] + other_gait["errors"]
             )
-            for other in distinct
+            for other_gait in distinct_gaits
         )
-        if candidate["models"] != ModelIndex.NONE and all(differs):
-            distinct.append(candidate)
-    return sorted(distinct, key=lambda candidate: candidate["speeds"])
+        if candidate["models"] != ModelIndex.NONE and all(is_distinct):
+            distinct_gaits.append(candidate)
+    return sorted(distinct_gaits, key=lambda candidate: candidate["speeds"])
