@@ -1,4 +1,4 @@
-"""Optimization of gaits under margins as constraints."""
+"""Optimization of gaits with margins as constraints."""
 
 from vrw_jax.tuning.maximization import MAXIMIZATION_OPTIONS, TrialKind
 from vrw_jax.tuning.tune_problem import tune

@@ -1,7 +1,7 @@
 """Exploration of many starts: an augmented Lagrangian, maximized by optax's Adam in one batch.
 
-First-order steps bring every start near a local optimum; one of them is then selected for the
-maximization. If a trial loses its gait, its start stays in place and takes half the step size from
+First-order steps bring every start near a local optimum, and the best one is selected for the
+maximization. If a trial loses its gait, its start keeps its place and takes half the step size from
 then on.
 """
 
@@ -24,13 +24,14 @@ optax = lazy_import("optax")
 
 @dataclass(frozen=True)
 class ExplorationOptions:
-    """Numbers of the exploration.
+    """Options of the exploration of many starts.
 
     - `n_steps`: number of first-order steps;
-    - `learning_rate`: Adam's first step, in widths of the bounds;
+    - `learning_rate`: length of Adam's first step, in widths of the bounds;
     - `gradient_decay`, `square_decay`: decay rates of Adam's averages of the gradient and of its
       square;
-    - `penalty_weight`: penalty on a breach of one width of the bounds, in units of the objective.
+    - `penalty_weight`: penalty on a violation of one width of the bounds, in units of the
+      objective.
     """
 
     n_steps: int = 25
@@ -41,26 +42,30 @@ class ExplorationOptions:
 
 
 EXPLORATION_OPTIONS = ExplorationOptions()
-"""Options of `vrw.tune`."""
+"""Options of the exploration by `vrw.tune`."""
 
 EvaluateBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
-"""Function that returns gaits at u, one row per start, searched for from neighbors' gaits."""
+"""Function that returns the gaits at the rows of u, one per start, searched for from neighboring
+gaits.
+"""
 
 
 class Exploration(NamedTuple):
     """Results of the exploration, one row per start."""
 
-    normalized_starts: np.ndarray  # (n_starts, n_free), in widths of the bounds
+    normalized_starts: np.ndarray  # (n_starts, n_free): starts in widths of the bounds
     normalized_parameters: np.ndarray
-    objective: np.ndarray  # NaN if no gait was found
-    max_breach: np.ndarray  # in widths of the bounds
-    merit: np.ndarray  # objective minus the penalty on the breach
+    objective: np.ndarray  # objective at the end; NaN if no gait was found
+    max_breach: np.ndarray  # largest violation of a constraint, in widths of the bounds
+    merit: np.ndarray  # objective minus the penalty on the violation
     n_lost: np.ndarray  # number of trials that lost the gait or its branch
     n_evaluations: int  # number of evaluated gaits
 
     @property
     def best_index(self) -> int:
-        """Return the index of the start to continue from, which has the highest merit."""
+        """Return the index of the start with the highest merit, from which the maximization
+        continues.
+        """
         return int(np.nanargmax(self.merit))
 
 
@@ -133,11 +138,11 @@ def explore_starts(
         evaluation = jax.tree.map(select_accepted, trial_evaluation, evaluation)
     slacks, _ = _slack_and_jacobian(evaluation, free_indices, widths, min_constraint_values)
     objective = np.where(is_active, np.asarray(evaluation.values)[:, 0], np.nan)
-    breach = max_breach(slacks, scales)
-    merit = objective - options.penalty_weight * np.abs(objective) * breach
+    largest_breach = max_breach(slacks, scales)
+    merit = objective - options.penalty_weight * np.abs(objective) * largest_breach
     n_evaluations = n_starts * (options.n_steps + 1)
     return Exploration(
-        starts, normalized_parameters, objective, breach, merit, n_lost, n_evaluations
+        starts, normalized_parameters, objective, largest_breach, merit, n_lost, n_evaluations
     )
 
 
@@ -147,7 +152,9 @@ def has_gait(evaluation: GaitEvaluation) -> np.ndarray:
 
 
 def _is_finite(evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
-    """Return for each start whether values and derivatives by the free parameters are finite."""
+    """Return whether all values, and derivatives with respect to the free parameters, of each
+    start are finite.
+    """
     jacobian = np.asarray(evaluation.jacobian)[:, free_indices]
     return np.isfinite(evaluation.values).all(-1) & np.isfinite(jacobian).all((-1, -2))
 
@@ -155,7 +162,7 @@ def _is_finite(evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarra
 def _objective_gradient(
     evaluation: GaitEvaluation, free_indices: list[int], widths: np.ndarray
 ) -> np.ndarray:
-    """Return the gradient of the objective with respect to u, (start, free)."""
+    """Return the gradient of the objective with respect to u, shape (starts, free)."""
     return np.asarray(evaluation.jacobian)[:, free_indices, 0] * widths
 
 
@@ -165,7 +172,9 @@ def _slack_and_jacobian(
     widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slacks (start, constraint), and derivatives by u (start, constraint, free)."""
+    """Return slacks (starts, constraints), and their derivatives with respect to u (starts,
+    constraints, free).
+    """
     jacobian = np.swapaxes(np.asarray(evaluation.jacobian)[:, free_indices, 1:], 1, 2) * widths
     return np.asarray(evaluation.values)[:, 1:] - min_constraint_values, jacobian
 
@@ -173,10 +182,10 @@ def _slack_and_jacobian(
 def _stays_on_branch(
     previous: GaitEvaluation, trial: GaitEvaluation, parameter_changes: np.ndarray
 ) -> np.ndarray:
-    """Return for each start whether the trial's gait is on the branch of the previous gait."""
+    """Return whether each trial's gait is on the branch of the previous gait of its start."""
     previous_points, trial_points = previous.gait.branch_point, trial.gait.branch_point
-    pairs = (
-        (*take_rows((previous_points, trial_points), i), row)
-        for i, row in enumerate(parameter_changes)
+    point_pairs = (
+        (*take_rows((previous_points, trial_points), start_index), parameter_change)
+        for start_index, parameter_change in enumerate(parameter_changes)
     )
-    return np.array([is_same_branch(*pair) for pair in pairs])
+    return np.array([is_same_branch(*point_pair) for point_pair in point_pairs])

@@ -1,4 +1,4 @@
-"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks at lost gaits.
+"""Maximization along a branch of gaits by SciPy's SLSQP, in a box that shrinks after lost gaits.
 
 SLSQP is sequential quadratic programming with exact gradients. It does not handle trial wheels
 without a gait, or with a gait of another branch. After such a trial the maximization continues from
@@ -25,7 +25,7 @@ from vrw_jax.wheel import Outcome
 
 
 class TuneStatus(StatusCode):
-    """Status of a maximization at its end."""
+    """Reason why a maximization ended."""
 
     CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
     BRANCH_ENDED = 1, "The branch ends here: every smaller step on lost the gait or a finite value."
@@ -44,13 +44,13 @@ class TrialKind(enum.IntEnum):
 
 
 class EvaluatedTrial(NamedTuple):
-    """Evaluated wheel. If its gait is lost, the numbers are NaN."""
+    """Wheel with its evaluated gait; if the gait is lost, the numbers are NaN."""
 
     normalized_parameters: np.ndarray  # free parameters in widths of their bounds
     outcome: Outcome
     is_on_branch: bool
     objective: float
-    gradient: np.ndarray  # with respect to u
+    gradient: np.ndarray  # gradient of the objective with respect to u
     slack: np.ndarray  # constraint values minus their margins, in their own units
     slack_jacobian: np.ndarray  # (n_constraints, n_free)
     evaluation: GaitEvaluation | None
@@ -63,8 +63,8 @@ class EvaluatedTrial(NamedTuple):
     @property
     def is_finite(self) -> bool:
         """Return whether objective, constraints and their derivatives are finite numbers."""
-        parts = (self.objective, self.gradient, self.slack, self.slack_jacobian)
-        return all(bool(np.isfinite(part).all()) for part in parts)
+        arrays = (self.objective, self.gradient, self.slack, self.slack_jacobian)
+        return all(bool(np.isfinite(array).all()) for array in arrays)
 
     @property
     def is_usable(self) -> bool:
@@ -74,7 +74,9 @@ class EvaluatedTrial(NamedTuple):
     def describe_nonfinite(
         self, label: str, constraints: tuple[str, ...], min_constraint_values: np.ndarray
     ) -> str:
-        """Return which number is not finite: the objective, or else the first such constraint."""
+        """Return a text on the first number that is not finite: the objective, or else a
+        constraint.
+        """
         values = self.objective, *map(float, self.slack + min_constraint_values)
         gradients = self.gradient, *self.slack_jacobian
         for name, value, gradient in zip((label, *constraints), values, gradients, strict=True):
@@ -96,18 +98,18 @@ class MaximizationResult(NamedTuple):
 
 
 class _LostBranchError(Exception):
-    """Raised if a trial has no usable gait."""
+    """Exception raised if a trial has no usable gait."""
 
     def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
 
 
 class _BudgetSpentError(Exception):
-    """Raised if the allowed number of gaits is evaluated."""
+    """Exception raised if the allowed number of gaits is evaluated."""
 
 
 class _OptimumReachedError(Exception):
-    """Raised if a trial satisfies the first-order condition and the constraints."""
+    """Exception raised if a trial satisfies the first-order condition and the constraints."""
 
     def __init__(self, trial: EvaluatedTrial) -> None:
         self.trial = trial
@@ -115,16 +117,16 @@ class _OptimumReachedError(Exception):
 
 @dataclass(frozen=True)
 class MaximizationOptions:
-    """Numbers of the maximization; lengths are in widths of the bounds.
+    """Options of the maximization; lengths are in widths of the bounds.
 
     - `full_radius`: half the side of the largest box, chosen because it contains all bounds from
       any center;
     - `min_radius`: half the side of the box at which the end of a branch counts as reached;
     - `coarse_objective_tolerance`: relative change of the objective at which SLSQP stops in a
-      smaller box, chosen because the optimum in it is only a point to continue from;
-    - `fine_objective_tolerance`: the same in the whole box, chosen because gaits are not more
+      smaller box, chosen because the optimum in it is only a point from which the search continues;
+    - `fine_objective_tolerance`: that change in the whole box, chosen because gaits are not more
       accurate;
-    - `active_bound_tolerance`: slack at which a constraint counts as active.
+    - `active_bound_tolerance`: slack below which a constraint counts as active.
     """
 
     full_radius: float = 1.0
@@ -135,14 +137,14 @@ class MaximizationOptions:
 
 
 MAXIMIZATION_OPTIONS = MaximizationOptions()
-"""Options of `vrw.tune`."""
+"""Options of the maximization by `vrw.tune`."""
 
 EvaluateTrial = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
-"""Function that returns the gait at u, searched for from a neighbor's gait."""
+"""Function that returns the trial at u, searched for from a neighbor's gait."""
 
 
 class _TrialRecord:
-    """Trials in order; each point is evaluated once."""
+    """Record of trials in order, in which each point is evaluated once."""
 
     def __init__(
         self, evaluate: EvaluateTrial, start: EvaluatedTrial, max_evaluations: int
@@ -152,7 +154,9 @@ class _TrialRecord:
         self._indices = {start.normalized_parameters.tobytes(): 0}
 
     def evaluate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at u, from the record if it was evaluated; raise if it is unusable."""
+        """Return the trial at u, from the record if it was evaluated; raise an exception if it
+        is unusable.
+        """
         trial_index = self._indices.get(normalized_parameters.tobytes())
         if trial_index is None:
             if len(self.trials) >= self._max_evaluations:
@@ -198,16 +202,18 @@ def maximize_objective(
     max_evaluations: int,
     options: MaximizationOptions = MAXIMIZATION_OPTIONS,
 ) -> MaximizationResult:
-    """Maximize the objective locally from `start`, with every slack at least zero."""
+    """Maximize the objective locally from `start` with every slack at least zero, and return the
+    result.
+    """
     from scipy.optimize import minimize  # This import is slow.
 
     record = _TrialRecord(evaluate, start, max_evaluations)
     gradient_norm = max(float(np.linalg.norm(start.gradient)), 1e-12)
-    scales = scale_slacks(start.slack, start.slack_jacobian)
+    slack_scales = scale_slacks(start.slack, start.slack_jacobian)
 
     def stop_at_optimum(trial: EvaluatedTrial) -> EvaluatedTrial:
         if (
-            max_breach(trial.slack, scales) <= options.active_bound_tolerance
+            max_breach(trial.slack, slack_scales) <= options.active_bound_tolerance
             and compute_optimality(trial, options).residual <= tolerance
         ):
             raise _OptimumReachedError(trial)
@@ -216,7 +222,8 @@ def maximize_objective(
     center, radius, max_radius = start, options.full_radius, options.full_radius
     status, n_known_trials = TuneStatus.CONVERGED, 0
     while True:
-        # The next box is smaller if this one had no new evaluation, because it would be repeated.
+        # If this box had no new evaluation, the next box is smaller, because the search would be
+        # repeated.
         max_radius = max_radius if len(record.trials) > n_known_trials else 0.5 * max_radius
         n_known_trials, radius = len(record.trials), min(radius, max_radius)
         if radius < options.min_radius:
@@ -233,8 +240,8 @@ def maximize_objective(
                 bounds=list(zip(lower, upper, strict=True)),
                 constraints={
                     "type": "ineq",
-                    "fun": lambda u: record.evaluate_once(u).slack / scales,
-                    "jac": lambda u: record.evaluate_once(u).slack_jacobian / scales[:, None],
+                    "fun": lambda u: record.evaluate_once(u).slack / slack_scales,
+                    "jac": lambda u: record.evaluate_once(u).slack_jacobian / slack_scales[:, None],
                 },
                 method="SLSQP",
                 options={
@@ -270,43 +277,47 @@ def maximize_objective(
         )
     best_trial = center
     if status != TuneStatus.CONVERGED:
-        best_trial = _best_trial(record, scales, center, options)
-    elif max_breach(center.slack, scales) > 10.0 * options.active_bound_tolerance:
-        best_trial = _best_trial(record, scales, center, options)
+        best_trial = _find_best_trial(record, slack_scales, center, options)
+    elif max_breach(center.slack, slack_scales) > 10.0 * options.active_bound_tolerance:
+        best_trial = _find_best_trial(record, slack_scales, center, options)
         status = TuneStatus.NO_FEASIBLE_GAIT
     return MaximizationResult(best_trial, status, record.trials, record.kinds)
 
 
-def _best_trial(
+def _find_best_trial(
     record: _TrialRecord,
     scales: np.ndarray,
     last_trial: EvaluatedTrial,
     options: MaximizationOptions,
 ) -> EvaluatedTrial:
-    """Return the best gait that satisfies all constraints, or else the one with least breach."""
+    """Return the best gait that satisfies all constraints, or else the one with the least
+    violation.
+    """
     gaits = [trial for trial in record.trials if trial.is_usable]
     is_feasible = lambda trial: max_breach(trial.slack, scales) <= options.active_bound_tolerance
-    feasible = [trial for trial in gaits if is_feasible(trial)]
-    if not feasible:
+    feasible_gaits = [trial for trial in gaits if is_feasible(trial)]
+    if not feasible_gaits:
         return min(gaits, key=lambda trial: max_breach(trial.slack, scales))
     if is_feasible(last_trial):
-        feasible.append(last_trial)
-    return max(feasible, key=lambda trial: trial.objective)
+        feasible_gaits.append(last_trial)
+    return max(feasible_gaits, key=lambda trial: trial.objective)
 
 
 class OptimalityConditions(NamedTuple):
-    """Multipliers of the constraints and bounds that hold a gait in place."""
+    """Multipliers of the constraints and bounds that are active at an optimum."""
 
     prices: np.ndarray  # gain of the objective per unit of a relaxed margin
-    lower_bound_prices: np.ndarray  # loss of the objective per width of a relaxed lower bound
+    lower_bound_prices: np.ndarray  # gain of the objective per width of a relaxed lower bound
     upper_bound_prices: np.ndarray
-    residual: float  # of the first-order condition, relative to the objective's gradient
+    residual: float  # residual of the first-order condition, relative to the objective's gradient
 
 
 def compute_optimality(
     trial: EvaluatedTrial, options: MaximizationOptions = MAXIMIZATION_OPTIONS
 ) -> OptimalityConditions:
-    """Solve the Karush-Kuhn-Tucker conditions at a gait by non-negative least squares."""
+    """Return the multipliers of the Karush-Kuhn-Tucker conditions at a gait, by non-negative
+    least squares.
+    """
     from scipy.optimize import nnls  # This import is slow.
 
     n_free, tolerance = trial.normalized_parameters.size, options.active_bound_tolerance
@@ -315,7 +326,7 @@ def compute_optimality(
     lower_indices = np.flatnonzero(trial.normalized_parameters <= tolerance)
     upper_indices = np.flatnonzero(trial.normalized_parameters >= 1.0 - tolerance)
     identity = np.eye(n_free)
-    columns = np.concatenate(
+    constraint_normals = np.concatenate(
         [
             trial.slack_jacobian[active_indices] / scales[active_indices, None],
             identity[lower_indices],
@@ -325,9 +336,9 @@ def compute_optimality(
     gradient_norm = max(float(np.linalg.norm(trial.gradient)), 1e-300)
     prices = np.zeros(trial.slack.size)
     lower_prices, upper_prices = np.zeros(n_free), np.zeros(n_free)
-    if not columns.shape[1]:
+    if not constraint_normals.shape[1]:
         return OptimalityConditions(prices, lower_prices, upper_prices, 1.0)
-    weights, residual = nnls(columns, -trial.gradient)
+    weights, residual = nnls(constraint_normals, -trial.gradient)
     lower_start, upper_start = len(active_indices), len(active_indices) + len(lower_indices)
     prices[active_indices] = weights[:lower_start] / scales[active_indices]
     lower_prices[lower_indices] = weights[lower_start:upper_start]

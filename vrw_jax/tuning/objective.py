@@ -18,12 +18,12 @@ MarginSpec = Mapping[str, float | tuple[float | None, float | None]] | Sequence[
 ReadMeasure = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
-"""Prefix of a measure that is bounded from above: its negative is bounded from below."""
+"""Prefix of a measure with an upper bound, which is a lower bound of its negative."""
 
 
 @dataclass(frozen=True)
 class WeightedSum:
-    """Weighted sum of measures, as an objective."""
+    """Weighted sum of measures of cycle and step, as an objective."""
 
     read: ReadMeasure
     weights: tuple[tuple[str, float], ...]
@@ -35,7 +35,7 @@ class WeightedSum:
 
 @dataclass(frozen=True)
 class CycleObjective:
-    """A user's function of the cycle alone, as an objective."""
+    """A user's function of the cycle alone, as an objective of cycle and step."""
 
     function: Callable[[Any], Array]
 
@@ -45,7 +45,7 @@ class CycleObjective:
 
 @dataclass(frozen=True)
 class ObjectiveAndConstraints:
-    """Objective and constraints of a gait as one array.
+    """Objective and constraints of a gait as one array, the objective first.
 
     A constraint is a measure with a lower bound, or with the prefix a measure with an upper bound.
     """
@@ -74,7 +74,7 @@ class ObjectiveAndConstraints:
 
 
 class GaitEvaluation(NamedTuple):
-    """Gait with its objective and constraints. The axis of a batch is the first one."""
+    """Gait with its objective and constraints; in a batch, the batch axis comes first."""
 
     gait: Gait
     values: Array  # (1 + n_constraints,): the objective, then the constraints
@@ -99,7 +99,7 @@ def parse_margins(
     else:
         margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
     if "clearance_sls1" in margins:
-        # It has a nonzero derivative if the clearance has none.
+        # The take-off acceleration has a nonzero derivative if the clearance has none.
         margins.setdefault("takeoff_acceleration", 0.0)
     for name in margins:
         check_known_name(
@@ -111,15 +111,15 @@ def parse_margins(
 
 
 def _parse_margin(name: str, bound: float | tuple[float | None, float | None]) -> dict[str, float]:
-    """Return the smallest allowed values of one measure and of its negative.
+    """Return the smallest allowed values of one measure and of its negative, by name.
 
     `bound` is a lower bound, or a pair of bounds of which one may be None.
     """
     if not isinstance(bound, tuple):
         return {name: check_real(f"the margin of {name}", bound)}
     if len(bound) != 2 or None not in bound:
-        low, high = check_range(f"the range of {name}", bound)
-        return {UPPER_BOUND_PREFIX + name: -high, name: low}
+        lower_bound, upper_bound = check_range(f"the range of {name}", bound)
+        return {UPPER_BOUND_PREFIX + name: -upper_bound, name: lower_bound}
     if bound == (None, None):
         raise ValueError(
             f"the range of {name} is (None, None), which bounds nothing: give a lower or an upper "
@@ -137,12 +137,12 @@ def signed_bound(name: str, lower: float) -> float:
 
 
 def scale_slacks(slack: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
-    """Return the scale of each slack: its change over one width of the bounds."""
+    """Return the scale of each slack, which is its change over one width of the bounds."""
     return np.maximum(np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
 
 
 def max_breach(slack: np.ndarray, scales: np.ndarray) -> Any:
-    """Return the largest breach of a constraint in widths of the bounds, 0 if there is none.
+    """Return the largest violation of a constraint in widths of the bounds, 0 if there is none.
 
     It is NaN if the gait is lost.
     """

@@ -1,6 +1,7 @@
-"""Tuning a wheel: maximization of a gait's objective under margins, with exact gradients.
+"""Tuning of a wheel: maximization of a gait's objective with margins as constraints, with exact
+gradients.
 
-Without margins as constraints, the maximization gains double support by scuffing.
+Without margins as constraints, the maximization increases double support by letting the foot scuff.
 """
 
 from __future__ import annotations
@@ -86,14 +87,15 @@ ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
 
 @dataclasses.dataclass(frozen=True)
 class ValidationOptions:
-    """Numbers of the walk that validates a tuned wheel.
+    """Options of the walk that validates a tuned wheel.
 
     - `n_steps`: number of steps;
-    - `start_displacement`: displacement of the start from the limit cycle, relative;
-    - `value_tolerance`: accepted violation of a constraint, as a share of its value. It and the
-      next are chosen because the optimum satisfies a constraint within 1e-6 of its change over the
-      bounds, and the start is displaced: each is some thousandths of a take-off margin;
-    - `margin_tolerance`: the same, as a share of the constraint's default margin.
+    - `start_displacement`: relative displacement of the start from the limit cycle;
+    - `value_tolerance`: accepted violation of a constraint, as a fraction of its value. This and
+      the next tolerance are chosen because the optimum satisfies a constraint within 1e-6 of its
+      change over the bounds, and because the start is displaced. Each effect is some thousandths of
+      a take-off margin;
+    - `margin_tolerance`: accepted violation, as a fraction of the constraint's default margin.
     """
 
     n_steps: int = 10
@@ -205,7 +207,7 @@ class TuneProblem:
 
     @property
     def widths(self) -> np.ndarray:
-        """Return the widths of the bounds."""
+        """Return the widths of the bounds, shape (free,)."""
         return self.upper - self.lower
 
     @property
@@ -215,7 +217,9 @@ class TuneProblem:
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return one name per constrained number; a margin of the locked legs has one per leg."""
+        """Return the name of each constrained number; a margin of the locked legs has one per
+        leg.
+        """
         names: list[str] = []
         for name in self.margins:
             if get_measure(name).dimension:
@@ -226,11 +230,11 @@ class TuneProblem:
 
     @property
     def min_constraint_values(self) -> np.ndarray:
-        """Return the margins, one for each of `constraint_names`."""
+        """Return the least values of the constraints, in the order of `constraint_names`."""
         return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
 
     def denormalize(self, normalized_parameters: np.ndarray) -> np.ndarray:
-        """Return all float parameters for free ones `u` widths above their lower bounds."""
+        """Return all float parameters if the free ones are `u` widths above their lower bounds."""
         values = np.array(self.finder.model.parameter_values(self.params))
         values[self.free_indices] = self.lower + normalized_parameters * self.widths
         return values
@@ -243,7 +247,7 @@ class TuneProblem:
 
     @property
     def normalized_start(self) -> np.ndarray:
-        """Return u of the start."""
+        """Return the value of u at the start."""
         values = np.array([float(getattr(self.params, name)) for name in self.free])
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
@@ -297,7 +301,7 @@ class TuneProblem:
         outcome: Outcome,
         is_on_branch: bool,
     ) -> EvaluatedTrial:
-        """Return a trial with objective and constraints of a gait."""
+        """Return a trial from the objective and constraints of a gait."""
         values = np.array(evaluation.values)
         jacobian = np.array(evaluation.jacobian)[self.free_indices].T * self.widths
         if outcome != Outcome.STEPPED:
@@ -314,7 +318,9 @@ class TuneProblem:
         )
 
     def explore_starts(self, n_starts: int, seed: int) -> Exploration:
-        """Take first-order steps from this wheel and random ones in one batch."""
+        """Take first-order steps from this wheel and random ones in one batch, and return the
+        exploration.
+        """
         random_starts = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
         exploration = explore_starts(
             self._evaluate_batch,
@@ -335,7 +341,9 @@ class TuneProblem:
         self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
     ) -> GaitEvaluation:
         """Return the gaits at the rows of u, searched for from neighbors if they are given."""
-        parameters = jnp.asarray([self.denormalize(row) for row in normalized_parameters])
+        parameters = jnp.asarray(
+            [self.denormalize(parameter_row) for parameter_row in normalized_parameters]
+        )
         guesses = self.finder.initial_guesses(parameters)
         guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
         gait = self.finder.find_gaits(parameters, guess)
@@ -375,13 +383,13 @@ class TuneProblem:
             )
             if price > 0.0
         ]
-        sides = (
+        bound_sides = (
             (self.lower, conditions.lower_bound_prices),
             (self.upper, conditions.upper_bound_prices),
         )
-        for limits, prices in sides:
+        for bound_values, prices in bound_sides:
             for name, limit, price, width in zip(
-                self.free, limits, prices, self.widths, strict=True
+                self.free, bound_values, prices, self.widths, strict=True
             ):
                 if price > 0.0:
                     unit, cost = get_measure(name).unit, float(price / width)
@@ -389,7 +397,7 @@ class TuneProblem:
         end_seconds = time.perf_counter()
         validation = self._validate_by_walking(params, gait)
         measures = gait.step.measures()
-        violated = [
+        violated_names = [
             name for name in MARGIN_MEASURES if name in measures and np.min(measures[name]) < 0.0
         ]
         return TuneResult(
@@ -402,7 +410,7 @@ class TuneProblem:
             step=gait.step,
             active=tuple(active),
             kkt_residual=conditions.residual,
-            violated_margins=tuple(name for name in violated if name not in self.margins),
+            violated_margins=tuple(name for name in violated_names if name not in self.margins),
             validation=validation,
             path=self._make_path(maximization),
             n_evaluations=len(maximization.trials)
@@ -429,13 +437,13 @@ class TuneProblem:
                 break
             n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
             measures = {name: np.asarray(value) for name, value in step_result.measures().items()}
-            for name, lower in self.margins.items():
+            for name, min_value in self.margins.items():
                 if (measure := name.removeprefix(UPPER_BOUND_PREFIX)) in measures:
                     value = measures[measure] if measure == name else -measures[measure]
                     default_margin = abs(margins_by_default.get(name, 0.0))
                     tolerance = options.value_tolerance * np.max(np.abs(value))
                     tolerance += options.margin_tolerance * default_margin
-                    is_feasible &= bool(np.all(value >= lower - tolerance - 1e-9))
+                    is_feasible &= bool(np.all(value >= min_value - tolerance - 1e-9))
         distance = float(np.max(np.abs(section_state - cycle_state)))
         return WalkValidation(
             n_walked, outcome, distance, is_feasible and outcome == Outcome.STEPPED
@@ -457,12 +465,13 @@ class TuneProblem:
             for trial in maximization.trials
         ]
         data: dict[str, Any] = {
-            name: (dimension, values[:, i], measure_attrs(name)) for i, name in enumerate(self.free)
+            name: (dimension, values[:, parameter_index], measure_attrs(name))
+            for parameter_index, name in enumerate(self.free)
         }
         data |= {
             "objective": (
                 dimension,
-                [t.objective for t in maximization.trials],
+                [trial.objective for trial in maximization.trials],
                 {"long_name": self.objective_label},
             ),
             "constraint_value": (
@@ -481,7 +490,10 @@ class TuneProblem:
                 flag_attrs(kind.name for kind in TrialKind),
             ),
             "outcome": (dimension, np.array(outcomes, int), measure_attrs("outcome")),
-            "on_branch": (dimension, np.array([t.is_on_branch for t in maximization.trials])),
+            "on_branch": (
+                dimension,
+                np.array([trial.is_on_branch for trial in maximization.trials]),
+            ),
         }
         units = [get_measure(name).unit for name in self.constraint_names]
         labels = {
@@ -491,9 +503,9 @@ class TuneProblem:
         }
         attrs = {
             "title": f"Path of tuning {self.objective_label} over {', '.join(self.free)}",
-            "free": " ".join(self.free),  # It is text because netCDF has no lists of names.
-            "lower": [float(v) for v in self.lower],
-            "upper": [float(v) for v in self.upper],
+            "free": " ".join(self.free),  # It is a text because netCDF has no lists of names.
+            "lower": [float(bound) for bound in self.lower],
+            "upper": [float(bound) for bound in self.upper],
             "ending": maximization.status.name,
         }
         origin = provenance(self.params, self.finder.model, self.finder.step_options)
@@ -542,7 +554,7 @@ def make_tune_problem(
     objective_and_constraints = ObjectiveAndConstraints(
         reader, type(finder).read_measure, tuple(margins)
     )
-    if callable(objective):  # Its errors are raised here, before compilation.
+    if callable(objective):  # Errors of the objective are raised here, before compilation.
         cycle = jax.eval_shape(finder.find_cycle, params)
         x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
         step = jax.eval_shape(finder.model.take_step, params, x, finder.step_options)
@@ -585,7 +597,10 @@ def _parse_objective(
                 f"{name} has one value for each locked leg, but an objective is one number: "
                 "give a function of the cycle and the step that reduces it."
             )
-    label = " + ".join(n if w == 1.0 else f"{w:g} {n}" for n, w in weights.items())
+    label = " + ".join(
+        measure_name if measure_weight == 1.0 else f"{measure_weight:g} {measure_name}"
+        for measure_name, measure_weight in weights.items()
+    )
     return WeightedSum(type(finder).read_measure, tuple(weights.items())), label.replace(
         "+ -", "- "
     )
@@ -612,19 +627,19 @@ def _check_bounds(
     for name in names:
         if name not in bounds:
             raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
-        low, high = check_range(f"the range of {name}", bounds[name])
-        for end in (low, high):
-            if not PARAMETER_DOMAINS[name].contains(end):
+        lower_bound, upper_bound = check_range(f"the range of {name}", bounds[name])
+        for bound_value in (lower_bound, upper_bound):
+            if not PARAMETER_DOMAINS[name].contains(bound_value):
                 raise ValueError(
-                    f"the bounds of {name} reach {end:g}, but "
+                    f"the bounds of {name} reach {bound_value:g}, but "
                     f"{PARAMETER_DOMAINS[name].description} must lie "
                     f"in {PARAMETER_DOMAINS[name]}: keep them inside."
                 )
         value = float(getattr(params, name))
-        if not low <= value <= high:
+        if not lower_bound <= value <= upper_bound:
             raise ValueError(
-                f"the start has {name} {value:g}, outside its bounds ({low:g}, {high:g}): "
-                "widen the bounds or start inside them."
+                f"the start has {name} {value:g}, outside its bounds "
+                f"({lower_bound:g}, {upper_bound:g}): widen the bounds or start inside them."
             )
-    ends = np.array([[float(v) for v in bounds[name]] for name in names])
-    return names, ends[:, 0], ends[:, 1]
+    bound_pair = np.array([[float(bound) for bound in bounds[name]] for name in names])
+    return names, bound_pair[:, 0], bound_pair[:, 1]

@@ -1,4 +1,4 @@
-"""Result of tuning: the gait, how it was found, and the constraints that are active."""
+"""Result of tuning: the gait, the way to it, and the constraints that are active."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ NO_ACTIVE_CONSTRAINT_TEXTS = {
 class ActiveConstraint(NamedTuple):
     """Active constraint or bound at the optimum.
 
-    - `name`: of the constraint (with the leg, if it has one), or of the parameter;
-    - `limit`: its margin, or the bound;
+    - `name`: name of the constraint, with the leg if it has one, or of the parameter;
+    - `limit`: margin of the constraint, or the bound;
     - `price`: gain of the objective per unit of a relaxed limit.
     """
 
@@ -38,7 +38,7 @@ class ActiveConstraint(NamedTuple):
 class WalkValidation(NamedTuple):
     """Validation of the tuned wheel by a walk from a slightly displaced start.
 
-    - `distance`: from the limit cycle after the last step, rad, rad/s and m/s;
+    - `distance`: distance from the limit cycle after the last step, rad, rad/s and m/s;
     - `is_feasible`: whether every step satisfied every constraint on a margin, within 1e-3 of its
       value and 1e-2 of its default margin.
     """
@@ -109,14 +109,16 @@ class TuneResult:
         """Return the printed lines of the result by label."""
         free_names = self.path.attrs["free"].split()
         parameter_texts = [
-            f"{n} {MEASURES[n].format_with_unit(getattr(self.params, n))}" for n in free_names
+            f"{name} {MEASURES[name].format_with_unit(getattr(self.params, name))}"
+            for name in free_names
         ]
         feasibility = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
         )
         feasibility = feasibility if self.path.sizes["constraint"] else "no constraint to keep"
         active_texts = [
-            f"{a.name} at {get_measure(a.name).format_with_unit(a.limit)}" for a in self.active
+            f"{name} at {get_measure(name).format_with_unit(limit)}"
+            for name, limit, *_ in self.active
         ]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
