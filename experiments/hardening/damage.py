@@ -143,7 +143,8 @@ FOLDER_FAULTS = {
 }
 QUICK_ROWS = (
     ("chunk of speed", "a bit flipped"), ("chunk of speed", "another's content"),
-    ("mark of a chunk", "deleted"), ("metadata of an array", "cut in half"),
+    ("mark of a chunk", "deleted"), ("mark of a chunk", "noise"),
+    ("metadata of an array", "cut in half"),
     ("metadata of the store", "noise"), ("other coordinate", "deleted"),
     ("index of machine code", "another's content"), ("machine code", "noise"),
     ("trace", "a folder in its place"), ("machine code", "writable by others"),

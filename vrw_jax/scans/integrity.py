@@ -242,7 +242,21 @@ class ChunkChecksums:
 
     def is_chunk_marked(self) -> np.ndarray:
         """Return whether each chunk is marked, shape (chunks,)."""
-        return _are_marks_set(np.asarray(self._marks[:]))
+        return _are_marks_set(self._read_marks())
+
+    def _read_marks(self) -> np.ndarray:
+        """Return the marks of all chunks, shape (chunks, bytes of a mark).
+
+        A mark that cannot be read gets the value 255, so that its chunk counts as damaged.
+        """
+        try:
+            return np.asarray(self._marks[:])
+        except READ_ERRORS:
+            marks = np.full(self._marks.shape, 255, self._marks.dtype)
+        for chunk_index in range(len(marks)):
+            with contextlib.suppress(*READ_ERRORS):
+                marks[chunk_index] = self._marks[chunk_index]
+        return marks
 
     def mark_chunk(self, chunk_index: int) -> None:
         """Mark a chunk as written, with the digest of its files."""
@@ -255,7 +269,7 @@ class ChunkChecksums:
         The marks are read once, before any file, because a running scan marks a chunk after it has
         written the files.
         """
-        marks = np.asarray(self._marks[:])
+        marks = self._read_marks()
         is_intact = lambda chunk_index: bool(
             (self._compute_chunk_digest(chunk_index) == marks[chunk_index]).all()
         )
