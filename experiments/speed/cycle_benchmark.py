@@ -215,8 +215,8 @@ def measure_hit_rates() -> str:
     box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in WIDE_BOX.items())
     table = format_markdown(("", "wheels"), [(name, f"{n:,}") for name, n in hit_rate().items()])
     return (
-        f"Random wheels of the box {box}. Reference: continuation from Table 1 in {N_STAGES} "
-        f"steps.\n\n{table}"
+        f"The table counts random wheels from the box {box}. The reference is continuation from "
+        f"Table 1 in {N_STAGES} steps.\n\n{table}"
     )
 
 

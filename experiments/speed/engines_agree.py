@@ -146,7 +146,7 @@ def reasons(n: int, seed: int) -> tuple[list[tuple[str, int, str]], np.ndarray, 
     codes = np.unique(lanes[0], return_counts=True)
     each = zip(*codes, strict=True)
     names = ", ".join(f"{count:,} {Outcome(int(code)).name}" for code, count in each)
-    return result_list, left_part, f"Outcomes: {names}. Where they agree: {spread}."
+    return result_list, left_part, f"Outcomes: {names}. Differences of equal outcomes: {spread}."
 
 
 def main() -> None:
