@@ -1,4 +1,4 @@
-"""Figures of labelled results; the only package that imports matplotlib."""
+"""Figures of labeled results; the only package that imports matplotlib."""
 
 from vrw_jax.figures import branch_figures, style
 from vrw_jax.figures.branch_figures import basin_figure, branch_figure

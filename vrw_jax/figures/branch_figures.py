@@ -30,19 +30,19 @@ from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
 BRANCH_END_COLOR = PINK
-"""Color of the end of a branch, chosen because no curve has it."""
+"""Color of the end of a branch, chosen because no curve has this color."""
 
 SPECIAL_POINT_LINE_STYLE = (0, (1, 1.2))
-"""Dotted line of a special point, chosen because no curve has it."""
+"""Dotted line style of a special point, chosen because no curve has this style."""
 
 SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": GREEN}
-"""Colors of special points by kind; those of other kinds, which change the stability, are black."""
+"""Colors of special points by kind; the other kinds, which change the stability, are black."""
 
 COMMON_PANELS = (
     ("DLS fraction", {"dls_fraction": LEG_1_COLOR}),
     ("moduli of multipliers", {"spectral_radius": "black"}),
 )
-"""Label, and the color of each measure, of the panels of every branch."""
+"""Panels of every branch: label, and the color of each measure."""
 PAPER_PANELS = (
     *COMMON_PANELS,
     (
@@ -61,13 +61,16 @@ OTHER_MODEL_PANELS = (
 
 
 def _split_by_stability(branch: Branch) -> list[tuple[np.ndarray, bool]]:
-    """Return indices and stability of pieces of a branch; a piece ends where the next starts."""
-    cuts = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
-    parts = np.split(np.arange(branch.values.size), cuts)
+    """Return the point indices of pieces of equal stability, and whether each piece is stable.
+
+    A piece ends at the point where the next one starts.
+    """
+    change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
+    piece_indices = np.split(np.arange(branch.values.size), change_indices)
     return [
-        (np.append(part, part[-1] + 1) if part[-1] + 1 < branch.values.size else part,
-         bool(branch.stable[part[0]]))
-        for part in parts
+        (np.append(piece, piece[-1] + 1) if piece[-1] + 1 < branch.values.size else piece,
+         bool(branch.stable[piece[0]]))
+        for piece in piece_indices
     ]  # fmt: skip
 
 
@@ -92,27 +95,29 @@ def branch_figure(branch: Branch) -> Figure:
     check_type("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
     values, data = branch.values, branch.dataset
     special_points = sorted(branch.special_points, key=lambda special_point: special_point.value)
-    rows = -(-len(special_points) // 2)
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.0 + 0.16 * rows))
+    n_rows = -(-len(special_points) // 2)
+    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.0 + 0.16 * n_rows))
     panels = figure.subplots(2, 2, sharex=True)
     has_indicators = "lambda_2_plus" in data
     shown_panels = PAPER_PANELS if has_indicators else OTHER_MODEL_PANELS
-    for axes, (label, series), letter in zip(panels.ravel(), shown_panels, "abcd", strict=True):
-        label_panel(axes, letter)
-        for name, color in series.items():
+    for axes, (label, panel_series), panel_letter in zip(
+        panels.ravel(), shown_panels, "abcd", strict=True
+    ):
+        label_panel(axes, panel_letter)
+        for name, color in panel_series.items():
             columns = [data[name].values]
             if name == "clearance_sls1":
-                # In mm, with a gap at a jump, where a dip vanishes.
-                clearance = 1e3 * data[name].values
-                clearance[1:][clearance[:-1] * clearance[1:] < 0.0] = np.nan
-                columns = [clearance]
+                # The clearance is in mm, with a gap at a jump, where a lowest point vanishes.
+                clearance_mm = 1e3 * data[name].values
+                clearance_mm[1:][clearance_mm[:-1] * clearance_mm[1:] < 0.0] = np.nan
+                columns = [clearance_mm]
             if name == "spectral_radius":
                 columns = list(np.abs(branch.multipliers).T)
             for column in columns:
-                for indices, stable in _split_by_stability(branch):
-                    line = "-" if stable else "--"
-                    axes.plot(values[indices], column[indices], line, color=color)
-        _draw_special_points(axes, special_points, has_numbers=letter in "ab")
+                for indices, is_stable in _split_by_stability(branch):
+                    line_style = "-" if is_stable else "--"
+                    axes.plot(values[indices], column[indices], line_style, color=color)
+        _draw_special_points(axes, special_points, has_numbers=panel_letter in "ab")
         axes.set_ylabel(label)
     panels[0, 1].axhline(1.0, color=DARK_GRAY, linewidth=0.5)
     panels[0, 1].set_ylim(0.0, None)
@@ -123,9 +128,11 @@ def branch_figure(branch: Branch) -> Figure:
         for name, color in PAPER_PANELS[2][1].items():
             force_axes.plot([], [], color=color, label=f"${MEASURES[name].mathtext}$")
         force_axes.legend(loc="center left")
-        clearance = 1e3 * data.clearance_sls1.values
+        clearance_mm = 1e3 * data.clearance_sls1.values
         clearance_axes.set_yscale("symlog", linthresh=0.1)
-        clearance_axes.set_ylim(2.0 * min(clearance.min(), -0.1), 2.0 * max(clearance.max(), 0.1))
+        clearance_axes.set_ylim(
+            2.0 * min(clearance_mm.min(), -0.1), 2.0 * max(clearance_mm.max(), 0.1)
+        )
     for axes in panels[1]:
         axes.set_xlabel(format_axis_label(branch.parameter))
     _add_legend(figure, special_points, branch.parameter)
@@ -142,10 +149,10 @@ def _select_color(special_point: SpecialPoint) -> str:
 
 
 def _draw_special_points(axes: Axes, special_points: list[SpecialPoint], has_numbers: bool) -> None:
-    """Draw vertical lines at the special points, with numbers if wanted."""
-    low, high = axes.get_xlim()
+    """Draw vertical lines at the special points, with numbers if `has_numbers`."""
+    lower_limit, upper_limit = axes.get_xlim()
     label_position = -np.inf
-    for i, special_point in enumerate(special_points):
+    for point_number, special_point in enumerate(special_points):
         axes.axvline(
             special_point.value,
             color=_select_color(special_point),
@@ -154,9 +161,11 @@ def _draw_special_points(axes: Axes, special_points: list[SpecialPoint], has_num
             zorder=0,
         )
         if has_numbers:
-            label_position = max(special_point.value, label_position + 0.03 * (high - low))
+            label_position = max(
+                special_point.value, label_position + 0.03 * (upper_limit - lower_limit)
+            )
             axes.annotate(
-                str(i + 1),
+                str(point_number + 1),
                 (label_position, 1.0),
                 xycoords=("data", "axes fraction"),
                 ha="center",
@@ -167,12 +176,12 @@ def _draw_special_points(axes: Axes, special_points: list[SpecialPoint], has_num
 
 
 def _add_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
-    """Add a legend of the special points and of the line styles."""
+    """Add a legend of the special points and of the line styles to a figure."""
     handles = []
-    for i, special_point in enumerate(special_points):
+    for point_number, special_point in enumerate(special_points):
         violation = typeset_symbols(describe_violation(special_point.name))
         text = f"{format_value_label(parameter, special_point.value, 6)}: {violation}"
-        text = f"{i + 1}  {text}" + (" (ends here)" if special_point.ends_branch else "")
+        text = f"{point_number + 1}  {text}" + (" (ends here)" if special_point.ends_branch else "")
         handles.append(
             Line2D(
                 [],
@@ -211,12 +220,21 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     require_variables_of_all(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
     )
-    codes = sorted({int(c) for r in results for c in np.unique(r.outcome) if c != Outcome.STEPPED})
+    codes = sorted(
+        {
+            int(length_index)
+            for rate_index in results
+            for length_index in np.unique(rate_index.outcome)
+            if length_index != Outcome.STEPPED
+        }
+    )
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 3.3))
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-    max_steps = max(float(r.steps.where(r.attractor >= 0).max()) for r in results)
+    max_steps = max(
+        float(rate_index.steps.where(rate_index.attractor >= 0).max()) for rate_index in results
+    )
     for axes, result, title in zip(panels, results, titles, strict=True):
-        y, x = (str(d) for d in result.attractor.dims)
+        y, x = (str(step_counts) for step_counts in result.attractor.dims)
         steps = result.steps.where(result.attractor >= 0)
         image = axes.pcolormesh(
             result[x], result[y], steps, cmap="Greys_r", vmin=0.0, vmax=2.2 * max_steps
@@ -235,9 +253,9 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         axes.set_title(title)
         axes.set_xlabel(format_axis_label(x, "{symbol}"))
     panels[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
-    bar = figure.colorbar(image, ax=list(panels), aspect=25, pad=0.01)
-    bar.set_label("steps until the gait is reached")
-    bar.ax.set_ylim(0.0, max_steps)
+    color_bar = figure.colorbar(image, ax=list(panels), aspect=25, pad=0.01)
+    color_bar.set_label("steps until the gait is reached")
+    color_bar.ax.set_ylim(0.0, max_steps)
     figure.legend(
         handles=make_outcome_patches(codes), loc="outside lower center", ncols=4, fontsize=7.5
     )

@@ -28,10 +28,10 @@ CONTACT_COLORS = ("white", GREEN, AMBER, PINK)
 """Colors of the contact modes, by code."""
 
 CONTACT_MARKERS = ("o", "o", ">", "<")
-"""Markers of the contact modes, by code. Green and pink are one gray to some eyes."""
+"""Markers of the contact modes, by code, because some readers see green and pink as one gray."""
 
 OTHER_LEG_COLOR = "#999999"
-"""Color of every leg but Legs 1 and 2."""
+"""Color of every leg other than Legs 1 and 2."""
 
 LEG_LINES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
 """Color and line style of Legs 1 and 2 over time."""
@@ -50,30 +50,34 @@ class FootMotion(NamedTuple):
 
     time: np.ndarray  # (time,), s
     hub: np.ndarray  # (time, 2), x downhill and z normal to the slope, m
-    feet: np.ndarray  # (time, leg, 2), likewise, m
-    forces: np.ndarray  # (time, leg, 2), tangential and normal, N
+    feet: np.ndarray  # (time, leg, 2), in the same coordinates, m
+    forces: np.ndarray  # (time, leg, 2), tangential and normal force, N
     contact: np.ndarray  # (time, leg), contact mode
     step: np.ndarray  # (time,), number of the step
 
     def interpolate(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return hub and feet at the time `t`, and the sample of its modes and forces."""
-        after = min(int(np.searchsorted(self.time, t, side="right")), self.time.size - 1)
-        before = max(after - 1, 0)
-        interval = self.time[after] - self.time[before]
-        fraction = (t - self.time[before]) / interval if interval > 0.0 else 1.0
-        mix = lambda values: (1.0 - fraction) * values[before] + fraction * values[after]
-        return mix(self.hub), mix(self.feet), after
+        """Return hub, feet, and the index of the sample of contact modes and forces, at the time
+        `t`, s.
+        """
+        index_after = min(int(np.searchsorted(self.time, t, side="right")), self.time.size - 1)
+        index_before = max(index_after - 1, 0)
+        interval = self.time[index_after] - self.time[index_before]
+        fraction = (t - self.time[index_before]) / interval if interval > 0.0 else 1.0
+        interpolate_samples = lambda values: (
+            (1.0 - fraction) * values[index_before] + fraction * values[index_after]
+        )
+        return interpolate_samples(self.hub), interpolate_samples(self.feet), index_after
 
 
 def reports_contact_modes(walk: xr.Dataset) -> bool:
-    """Return whether a trajectory has the contact modes of each leg."""
+    """Return whether a trajectory contains the contact modes of each leg."""
     return "contact" in walk.variables
 
 
 def compute_foot_motion(walk: xr.Dataset) -> FootMotion:
     """Return the motion of the feet of a trajectory of any model.
 
-    In the phases of the paper no foot slides: Leg 1 is at rest, and so is Leg 2 in double support.
+    In the paper's phases no foot slides: Leg 1 is at rest, and so is Leg 2 in double support.
     """
     hub = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
     if reports_contact_modes(walk):
@@ -81,8 +85,8 @@ def compute_foot_motion(walk: xr.Dataset) -> FootMotion:
         forces = np.stack([walk.tangential.values, walk.normal.values], -1)
         modes = walk.contact.values
         return FootMotion(walk.time.values, hub, feet, forces, modes, walk.step.values)
-    n = int(walk.attrs["parameter_n_legs"])
-    angles = walk.theta.values[:, None] + 2.0 * np.pi / n * np.arange(n)
+    n_legs = int(walk.attrs["parameter_n_legs"])
+    angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
     lengths = np.full(angles.shape, walk.attrs["parameter_locked_length"])
     lengths[:, 0] = walk.L1.values
     lengths[:, 1] = walk.L2.values
@@ -103,7 +107,9 @@ def select_leg_color(leg: int) -> str:
 
 
 def draw_feet(axes: Axes, positions: np.ndarray, modes: np.ndarray, size: float) -> None:
-    """Draw feet at `positions`, (2, foot), as markers in the colors of their contact modes."""
+    """Draw feet at `positions`, shape (2, feet), as markers in the colors of their contact
+    modes.
+    """
     for mode in np.unique(modes):
         axes.plot(
             *positions[:, modes == mode],
@@ -126,7 +132,9 @@ def make_mode_handles(modes: np.ndarray) -> list[Line2D]:
 
 
 def _select_legs(is_drawn: np.ndarray) -> list[int]:
-    """Return Legs 1 and 2, and the legs that are ever marked in `is_drawn`, (time, leg)."""
+    """Return the numbers of Legs 1 and 2, and of the legs that are ever marked in `is_drawn`,
+    (time, leg).
+    """
     return [leg for leg, flag in enumerate(np.any(is_drawn, axis=0).tolist(), 1) if flag or leg < 3]
 
 
@@ -136,17 +144,19 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     is_touching = motion.contact != ContactMode.OFF
     touching_legs = _select_legs(is_touching)
     moving_legs = _select_legs(is_touching | ~walk.on_stopper.values.astype(bool))
-    landings = np.flatnonzero(np.diff(motion.step)) + 1  # at which the legs are relabeled
-    with_gaps = lambda values: np.insert(np.asarray(values, float), landings, np.nan)
-    time = with_gaps(motion.time)
-    other_lines = iter(OTHER_LEG_LINES * len(moving_legs))
-    lines = {leg: LEG_LINES.get(leg) or next(other_lines) for leg in moving_legs}
+    landing_indices = (
+        np.flatnonzero(np.diff(motion.step)) + 1
+    )  # At landings the legs are relabeled.
+    insert_gaps = lambda values: np.insert(np.asarray(values, float), landing_indices, np.nan)
+    time = insert_gaps(motion.time)
+    other_leg_lines = iter(OTHER_LEG_LINES * len(moving_legs))
+    lines = {leg: LEG_LINES.get(leg) or next(other_leg_lines) for leg in moving_legs}
     figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 8.0))
     heights = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
     panels = figure.subplots(6, 1, sharex=True, height_ratios=heights)
-    for axes, letter in zip(panels, "abcdef", strict=True):
-        label_panel(axes, letter)
-    panels[0].plot(time, with_gaps(walk.theta), color="black")
+    for axes, panel_letter in zip(panels, "abcdef", strict=True):
+        label_panel(axes, panel_letter)
+    panels[0].plot(time, insert_gaps(walk.theta), color="black")
     panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
     rows = (
         (panels[1], moving_legs, walk.length.values, "$L$ [m]"),
@@ -157,7 +167,7 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     for axes, legs, values, label in rows:
         for leg in legs:
             color, line_style = lines[leg]
-            leg_values = with_gaps(values[:, leg - 1])
+            leg_values = insert_gaps(values[:, leg - 1])
             axes.plot(time, leg_values, color=color, linestyle=line_style, label=f"Leg {leg}")
         axes.set_ylabel(label)
     for axes in panels[3:]:
@@ -172,13 +182,20 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
 
 def _draw_mode_bars(axes: Axes, motion: FootMotion, legs: list[int]) -> None:
     """Draw the contact modes of each leg over time as bars in their colors."""
-    for row, leg in enumerate(legs):
+    for bar_row, leg in enumerate(legs):
         modes = motion.contact[:, leg - 1]
-        ends = np.flatnonzero(np.diff(modes) | np.diff(motion.step)) + 1
-        for begin, end in zip(np.r_[0, ends], np.r_[ends, len(modes)], strict=True):
-            if modes[begin] != ContactMode.OFF:
-                span = motion.time[begin], motion.time[end - 1] - motion.time[begin]
-                axes.broken_barh([span], (row - 0.35, 0.7), color=CONTACT_COLORS[modes[begin]])
+        change_indices = np.flatnonzero(np.diff(modes) | np.diff(motion.step)) + 1
+        for start_index, end_index in zip(
+            np.r_[0, change_indices], np.r_[change_indices, len(modes)], strict=True
+        ):
+            if modes[start_index] != ContactMode.OFF:
+                span = (
+                    motion.time[start_index],
+                    motion.time[end_index - 1] - motion.time[start_index],
+                )
+                axes.broken_barh(
+                    [span], (bar_row - 0.35, 0.7), color=CONTACT_COLORS[modes[start_index]]
+                )
     axes.set_yticks(range(len(legs)), [str(leg) for leg in legs])
     axes.set_ylim(len(legs) - 0.5, -0.5)
     axes.set_ylabel("foot on\nthe ground")
@@ -192,17 +209,28 @@ def _draw_mode_bars(axes: Axes, motion: FootMotion, legs: list[int]) -> None:
 
 
 def draw_contact_sticks(axes: Axes, walk: xr.Dataset, interval: float) -> None:
-    """Draw Legs 1 and 2 and every leg that touches, with feet in the colors of their modes."""
+    """Draw Legs 1 and 2 and every leg that touches, with feet in the colors of their contact
+    modes.
+    """
     motion = compute_foot_motion(walk)
     samples = np.searchsorted(motion.time, np.arange(0.0, motion.time[-1], interval))
     is_drawn = motion.contact != ContactMode.OFF
     is_drawn[:, :2] = True
-    for i in samples:
-        for leg in (np.flatnonzero(is_drawn[i]) + 1).tolist():
-            stick = np.stack([motion.feet[i, leg - 1], motion.hub[i]], -1)
+    for sample_index in samples:
+        for leg in (np.flatnonzero(is_drawn[sample_index]) + 1).tolist():
+            stick_coordinates = np.stack(
+                [motion.feet[sample_index, leg - 1], motion.hub[sample_index]], -1
+            )
             color = "black" if leg < 3 else DARK_GRAY
-            axes.plot(*stick, color=color, linestyle=_stick_line_style(leg), linewidth=0.7)
-        draw_feet(axes, motion.feet[i, is_drawn[i]].T, motion.contact[i, is_drawn[i]], 4.0)
+            axes.plot(
+                *stick_coordinates, color=color, linestyle=_stick_line_style(leg), linewidth=0.7
+            )
+        draw_feet(
+            axes,
+            motion.feet[sample_index, is_drawn[sample_index]].T,
+            motion.contact[sample_index, is_drawn[sample_index]],
+            4.0,
+        )
     named_legs = [(1, "Leg 1"), (2, "Leg 2")]
     if is_drawn[samples, 2:].any():
         named_legs.append((3, "another leg"))

@@ -1,4 +1,4 @@
-"""Figures of scans: DLS fraction, speed and outcome over parameters, with zeros of margins."""
+"""Figures of scans: DLS fraction, speed and outcome over parameters, with zero lines of margins."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -58,7 +58,7 @@ MAX_PAIRED_PARAMETERS = 6
 """Largest number of parameters shown in pairs, chosen because more leave no space for labels."""
 
 MAX_DRAWN_SAMPLES = 20_000
-"""Largest number of samples drawn in pairs, chosen because more cover each other."""
+"""Largest number of samples drawn in pairs, chosen because more would cover each other."""
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
@@ -78,12 +78,12 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     require_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
     names = [name for name in dict.fromkeys(AXIS_ORDER) if name in scan.coords]
     if "sample" in scan.dims:
-        swept = [name for name in names if np.ptp(scan[name].values) > 0.0] or names
-        if len(swept) < 3:
-            return {"scan": draw_samples(scan, swept)}
-        figures = {"scan_pairs": draw_pairs(scan, swept[:MAX_PAIRED_PARAMETERS])}
+        swept_names = [name for name in names if np.ptp(scan[name].values) > 0.0] or names
+        if len(swept_names) < 3:
+            return {"scan": draw_samples(scan, swept_names)}
+        figures = {"scan_pairs": draw_pairs(scan, swept_names[:MAX_PAIRED_PARAMETERS])}
         if read_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_KIND:
-            measures = [n for n in DIFFERENTIABLE_MEASURES if n in scan]
+            measures = [n_axes for n_axes in DIFFERENTIABLE_MEASURES if n_axes in scan]
             figures["sobol_indices"] = draw_sobol_indices(sobol_indices(scan, measures))
         return figures
     long_axes = [name for name in names if scan.sizes[name] > 1] or names
@@ -100,26 +100,34 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
 
 @figure_style()
 def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None) -> Figure:
-    """Return a figure over (x, y), with one column per value of `column_parameter`.
+    """Return a figure over the parameters (x, y), with one column per value of `column_parameter`.
 
-    It shows DLS fraction, speed and outcome. Other parameters have their middle value, which is in
-    the title. Gray cells have no gait.
+    The figure shows DLS fraction, speed and outcome. Other parameters have their middle value,
+    which the title gives. Gray cells have no gait.
     """
-    cut_indices = {n: scan.sizes[n] // 2 for n in SWEEPABLE_PARAMETERS if n in scan.dims}
+    cut_indices = {
+        n_columns: scan.sizes[n_columns] // 2
+        for n_columns in SWEEPABLE_PARAMETERS
+        if n_columns in scan.dims
+    }
     cut_indices = {
         name: index for name, index in cut_indices.items() if name not in (x, y, column_parameter)
     }
     scan_slice = scan.isel(cut_indices)
     columns = [scan_slice]
     if column_parameter is not None:
-        n = scan.sizes[column_parameter]
-        indices = np.unique(np.linspace(0, n - 1, min(n, MAX_COLUMNS)).round().astype(int))
+        n_columns = scan.sizes[column_parameter]
+        indices = np.unique(
+            np.linspace(0, n_columns - 1, min(n_columns, MAX_COLUMNS)).round().astype(int)
+        )
         columns = [scan_slice.isel({column_parameter: int(index)}) for index in indices]
-    rows = _shown_measures(scan)
+    panel_rows = _shown_measures(scan)
     width = PAGE_WIDTH_INCHES if len(columns) > 1 else COLUMN_WIDTH_INCHES
-    figure = Figure(figsize=(width, 1.65 * (len(rows) + 1) + 1.0))
-    panels = figure.subplots(len(rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False)
-    for row, name in zip(panels, rows, strict=False):
+    figure = Figure(figsize=(width, 1.65 * (len(panel_rows) + 1) + 1.0))
+    panels = figure.subplots(
+        len(panel_rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False
+    )
+    for row, name in zip(panels, panel_rows, strict=False):
         values = [column[name].transpose(y, x).values for column in columns]
         is_stable = [
             _outcome_codes(column).transpose(y, x).values == Outcome.STEPPED for column in columns
@@ -127,9 +135,11 @@ def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None =
         limits = _find_color_limits(values, is_stable)
         for axes, column, value in zip(row, columns, values, strict=True):
             image = _draw_cells(axes, column[x].values, column[y].values, value, limits)
-        extend = _find_extended_ends(values, limits)
-        bar = figure.colorbar(image, ax=row.tolist(), aspect=12, pad=0.01, extend=extend)
-        bar.set_label(format_axis_label(name, "{name}"))
+        extended_ends = _find_extended_ends(values, limits)
+        color_bar = figure.colorbar(
+            image, ax=row.tolist(), aspect=12, pad=0.01, extend=extended_ends
+        )
+        color_bar.set_label(format_axis_label(name, "{name}"))
     codes = np.unique([_outcome_codes(column).values for column in columns])
     for axes, column in zip(panels[-1], columns, strict=True):
         codes_of_cells = _outcome_codes(column).transpose(y, x).values
@@ -155,10 +165,11 @@ def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None =
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
     _add_legend(figure, codes, legend_lines, len(columns))
     if cut_indices:
-        cut_text = ", ".join(
-            format_value_label(n, scan[n].values[i]) for n, i in cut_indices.items()
+        fixed_values_text = ", ".join(
+            format_value_label(n_columns, scan[n_columns].values[i])
+            for n_columns, i in cut_indices.items()
         )
-        figure.suptitle(f"at {cut_text}", fontsize=9.0)
+        figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
     return figure
 
 
@@ -166,17 +177,19 @@ def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None =
 def draw_samples(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """Return a figure of single samples over the first two parameters."""
     x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
-    rows = _shown_measures(scan)
-    size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
+    measure_names = _shown_measures(scan)
+    marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.9))
-    panels = figure.subplots(1, len(rows) + 1, sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, rows, strict=False):
-        points = _draw_values(axes, scan, x, y, name, size)
-        extend = _find_extended_ends([scan[name].values], points.get_clim())
-        bar = figure.colorbar(points, ax=axes, location="top", aspect=25, extend=extend)
-        bar.set_label(format_axis_label(name))
+    panels = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, measure_names, strict=False):
+        points = _draw_values(axes, scan, x, y, name, marker_size)
+        extended_ends = _find_extended_ends([scan[name].values], points.get_clim())
+        color_bar = figure.colorbar(
+            points, ax=axes, location="top", aspect=25, extend=extended_ends
+        )
+        color_bar.set_label(format_axis_label(name))
     codes = _outcome_codes(scan).values
-    _draw_outcomes(panels[-1], scan[x].values, scan[y].values, codes, size)
+    _draw_outcomes(panels[-1], scan[x].values, scan[y].values, codes, marker_size)
     for axes in panels:
         axes.set_xlabel(format_axis_label(x, "{symbol}"))
     panels[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}"))
@@ -188,27 +201,27 @@ def draw_samples(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
     """Return a figure of samples over each pair of parameters.
 
-    It shows the DLS fraction below the diagonal and the outcome above it. The diagonal shows the
-    share of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn; they
-    are as evenly spread as all.
+    The figure shows the DLS fraction below the diagonal and the outcome above it. The diagonal
+    shows the fraction of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples
+    are drawn, which are as evenly spread as all.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     value = next(iter(_shown_measures(scan)), None)
     codes = _outcome_codes(drawn_samples).values
-    d = len(names)
-    size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
+    n_parameters = len(names)
+    marker_size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, PAGE_WIDTH_INCHES * 0.9))
-    panels = figure.subplots(d, d, sharex="col", squeeze=False)
+    panels = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
     points = None
     for (i, j), axes in np.ndenumerate(panels):
         x, y = drawn_samples[names[j]].values, drawn_samples[names[i]].values
         if i == j:
             _draw_stable_share(axes, x, codes == Outcome.STEPPED)
         elif i < j:
-            _draw_outcomes(axes, x, y, codes, size)
+            _draw_outcomes(axes, x, y, codes, marker_size)
         elif value is not None:
-            points = _draw_values(axes, drawn_samples, names[j], names[i], value, size)
-        if i == d - 1:
+            points = _draw_values(axes, drawn_samples, names[j], names[i], value, marker_size)
+        if i == n_parameters - 1:
             axes.set_xlabel(format_axis_label(names[j], "{symbol}"))
         if j == 0 and i > 0:
             axes.set_ylabel(format_axis_label(names[i], "{symbol}"))
@@ -216,10 +229,12 @@ def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
             axes.tick_params(labelleft=False)
     panels[0, 0].set_ylabel("share that walks")
     if value is not None and points is not None:
-        extend = _find_extended_ends([drawn_samples[value].values], points.get_clim())
+        extended_ends = _find_extended_ends([drawn_samples[value].values], points.get_clim())
         all_panels = panels.ravel().tolist()
-        bar = figure.colorbar(points, ax=all_panels, aspect=40, pad=0.01, extend=extend)
-        bar.set_label(format_axis_label(value, "{name}"))
+        color_bar = figure.colorbar(
+            points, ax=all_panels, aspect=40, pad=0.01, extend=extended_ends
+        )
+        color_bar.set_label(format_axis_label(value, "{name}"))
     _add_legend(figure, np.unique(codes), {}, 3)
     return figure
 
@@ -227,14 +242,23 @@ def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 def _draw_values(
     axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, size: float
 ) -> PathCollection:
-    """Draw samples in the colors of a measure, or in gray if they have no gait."""
+    """Draw samples in the colors of a measure, or in gray if they have no gait, and return the
+    points.
+    """
     dot_style: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
     has_gait, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
-    low, high = _find_color_limits([values], [_outcome_codes(scan).values == Outcome.STEPPED])
+    min_value, max_value = _find_color_limits(
+        [values], [_outcome_codes(scan).values == Outcome.STEPPED]
+    )
     x_values, y_values = scan[x].values, scan[y].values
     axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY, **dot_style)
     return axes.scatter(
-        x_values[has_gait], y_values[has_gait], c=values[has_gait], vmin=low, vmax=high, **dot_style
+        x_values[has_gait],
+        y_values[has_gait],
+        c=values[has_gait],
+        vmin=min_value,
+        vmax=max_value,
+        **dot_style,
     )
 
 
@@ -247,7 +271,7 @@ def _draw_outcomes(
 
 
 def _draw_stable_share(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
-    """Draw the share of samples with a stable gait along a parameter."""
+    """Draw the fraction of samples with a stable gait along a parameter."""
     edges = np.linspace(x.min(), x.max(), 13)
     n_samples, n_stable = (
         np.histogram(positions, edges)[0] for positions in (x, x[has_stable_gait])
@@ -264,7 +288,10 @@ def _draw_stable_share(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -
 @figure_style()
 def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     """Return a figure of the Sobol' indices of each measure with their intervals."""
-    measures, parameters = indices.measure.values, [str(p) for p in indices.parameter.values]
+    measures, parameters = (
+        indices.measure.values,
+        [str(parameter_positions) for parameter_positions in indices.parameter.values],
+    )
     n_columns = min(len(measures), 3)
     n_rows = -(-len(measures) // n_columns)
     positions = np.arange(len(parameters))
@@ -280,11 +307,11 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
             ("total", "with all it meets (total)", 0.19, AMBER),
         ):
             value = measure_indices[kind].values
-            low, high = (
+            lower_ends, upper_ends = (
                 measure_indices[f"{kind}_lower"].values,
                 measure_indices[f"{kind}_upper"].values,
             )
-            interval_lengths = np.maximum([value - low, high - value], 0.0)
+            interval_lengths = np.maximum([value - lower_ends, upper_ends - value], 0.0)
             bars = {"height": 0.36, "color": color, "label": label}
             axes.barh(
                 positions + shift,
@@ -296,7 +323,10 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         if measure_indices.is_constant:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
         axes.set_title(typeset_symbols(MEASURES[str(name)].long_name))
-        axes.set_yticks(positions, [f"${MEASURES[p].mathtext}$" for p in parameters])
+        axes.set_yticks(
+            positions,
+            [f"${MEASURES[parameter_positions].mathtext}$" for parameter_positions in parameters],
+        )
         axes.set_xlim(0.0, 1.05)
     panels[0, 0].invert_yaxis()
     for axes in panels.ravel()[max(len(measures) - n_columns, 0) : len(measures)]:
@@ -304,8 +334,8 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
         axes.tick_params(labelbottom=True)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    left_out = 100.0 * indices.attrs["left_out"]
-    note = f"{indices.attrs['rows']:,} rows; {left_out:.1f} % left out, without a gait"
+    left_out_fraction = 100.0 * indices.attrs["left_out"]
+    note = f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
     figure.suptitle(note, fontsize=8.0)
     return figure
 
@@ -313,13 +343,19 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 @figure_style()
 def draw_curves(scan: xr.Dataset, x: str) -> Figure:
     """Return a figure of DLS fraction and speed along one parameter; gray cells have no gait."""
-    scan = scan.isel({n: 0 for n in SWEEPABLE_PARAMETERS if n in scan.dims and n != x}).sortby(x)
-    rows = _shown_measures(scan) or ["fore_foot_force"]
-    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 1.6 * len(rows) + 0.6))
-    panels = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    scan = scan.isel(
+        {
+            n_measures: 0
+            for n_measures in SWEEPABLE_PARAMETERS
+            if n_measures in scan.dims and n_measures != x
+        }
+    ).sortby(x)
+    measure_names = _shown_measures(scan) or ["fore_foot_force"]
+    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
+    panels = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
     edges = _find_cell_edges(scan[x].values)
     has_failed = scan.outcome.values != Outcome.STEPPED
-    for axes, name in zip(panels, rows, strict=True):
+    for axes, name in zip(panels, measure_names, strict=True):
         axes.plot(scan[x].values, scan[name].values, marker=".", color=BLUE)
         axes.set_ylabel(format_axis_label(name, "{name}"))
         for cell in np.flatnonzero(has_failed):
@@ -338,7 +374,7 @@ def _find_color_limits(
 ) -> tuple[float, float]:
     """Return the color range of a row of panels: the range of stable gaits if there are any.
 
-    A few distant unstable gaits would otherwise give all others the same color.
+    A few distant unstable gaits would otherwise give all other gaits the same color.
     """
     finite_values = [value[np.isfinite(value)] for value in values]
     stable_values = [v[s & np.isfinite(v)] for v, s in zip(values, is_stable, strict=True)]
@@ -371,10 +407,10 @@ def _find_extended_ends(
 def _draw_cells(
     axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limits: tuple[float, float]
 ) -> AxesImage:
-    """Draw one colored cell per sample, without interpolation."""
+    """Draw one colored cell per sample, without interpolation, and return the image."""
     axes.set_facecolor(LIGHT_GRAY)
     masked_values = np.ma.masked_invalid(values)
-    mesh = axes.pcolormesh(
+    cell_image = axes.pcolormesh(
         _find_cell_edges(x),
         _find_cell_edges(y),
         masked_values,
@@ -382,8 +418,8 @@ def _draw_cells(
         vmin=limits[0],
         vmax=limits[1],
     )
-    mesh.set_rasterized(True)
-    return mesh  # type: ignore[return-value]  # A color bar accepts it.
+    cell_image.set_rasterized(True)
+    return cell_image  # type: ignore[return-value]  # A color bar accepts it.
 
 
 def _find_cell_edges(positions: np.ndarray) -> np.ndarray:
@@ -399,7 +435,9 @@ def _find_cell_edges(positions: np.ndarray) -> np.ndarray:
 
 
 def _outcome_codes(scan: xr.Dataset) -> xr.DataArray:
-    """Return the outcomes, with `UNSTABLE_CODE` for unstable cycles if multipliers are known."""
+    """Return the outcomes, with `UNSTABLE_CODE` for unstable cycles if the spectral radius is
+    known.
+    """
     codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
         return codes
@@ -416,7 +454,8 @@ def _draw_margin_zeros(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str
         if MARGIN_MEASURES[name].dimension:
             margin = margin.min("leg")
         if name == "clearance_sls1" and "takeoff_acceleration" in scan:
-            margin = margin.where(scan.takeoff_acceleration >= 0.0)  # The line gets no steps.
+            # Without missing values the line has no steps.
+            margin = margin.where(scan.takeoff_acceleration >= 0.0)
         values = margin.transpose(y, x).values
         finite_values = values[np.isfinite(values)]
         if not len(finite_values) or finite_values.min() >= 0.0 or finite_values.max() <= 0.0:
@@ -467,7 +506,11 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     require_variables(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
-    x, y = curves[0].parameters if curves else [n for n in SWEEPABLE_PARAMETERS if n in scan.dims]
+    x, y = (
+        curves[0].parameters
+        if curves
+        else [n_samples for n_samples in SWEEPABLE_PARAMETERS if n_samples in scan.dims]
+    )
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 0.62 * PAGE_WIDTH_INCHES))
     axes = figure.subplots()
     axes.set_facecolor(LIGHT_GRAY)
@@ -479,17 +522,17 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
     names = sorted({curve.name for curve in curves})
     labels = {name: typeset_symbols(describe_violation(name)) for name in names}
     for curve in curves:
-        color, dash = select_special_point_style(curve.name)
+        color, line_style = select_special_point_style(curve.name)
         is_stable = curve.dataset.spectral_radius.values < 1.0
         for is_drawn, width in ((is_stable, 1.2), (~is_stable, 0.5)):
-            # Each piece includes the first point of the next; the curve has one legend entry.
+            # Each piece includes the first point of the next one; the curve has one legend entry.
             is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
             points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
             label = labels.pop(curve.name, None) if is_drawn.any() else None
-            halo = [Stroke(linewidth=width + 1.0, foreground="white"), Normal()]
+            text_outline = [Stroke(linewidth=width + 1.0, foreground="white"), Normal()]
             axes.plot(
-                *points.T, color=color, linestyle=dash, linewidth=width, label=label,
-                path_effects=halo,
+                *points.T, color=color, linestyle=line_style, linewidth=width, label=label,
+                path_effects=text_outline,
             )  # fmt: skip
     codim2_points = np.array(
         [codim2_point.values for curve in curves for codim2_point in curve.codim2_points]

@@ -1,7 +1,7 @@
 """Style of all figures: journal widths, distinguishable colors, vector output, labels with units.
 
-Figures are created inside `figure_style()` and written by `save`. No global setting of
-matplotlib changes, and no window opens.
+Figures are created inside `figure_style()` and written by `save`. No global setting of matplotlib
+changes, and no window opens.
 """
 
 import re
@@ -31,7 +31,7 @@ PINK = "#CC79A7"
 SKY = "#56B4E9"
 AMBER = "#E69F00"
 YELLOW = "#F0E442"
-"""The last of the colors of Okabe and Ito, which color-blind readers can distinguish."""
+"""Last of the colors of Okabe and Ito, which color-blind readers can distinguish."""
 
 LEG_1_COLOR = BLUE
 LEG_2_COLOR = ORANGE
@@ -62,9 +62,9 @@ MATPLOTLIB_STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, PINK, SKY]),
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
-    "svg.hashsalt": "vrw_jax",  # The same figure gives the same file.
+    "svg.hashsalt": "vrw_jax",  # The same figure then gives the same file.
 }
-"""Settings of matplotlib, with a serif font as in the journal that matplotlib includes."""
+"""Settings of matplotlib, with the serif font that matplotlib includes and the journal uses."""
 
 COLUMN_WIDTH_INCHES = 3.4
 """Width of a figure in one column, chosen as the column width of the journal."""
@@ -95,7 +95,9 @@ OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
 """Label and color of each outcome."""
 
 SPECIAL_POINT_LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
-"""Line styles of curves of special points; `SPECIAL_POINT_NAMES_BY_COLOR` gives the index."""
+"""Line styles of curves of special points, in the order of the names in
+`SPECIAL_POINT_NAMES_BY_COLOR`.
+"""
 
 SPECIAL_POINT_NAMES_BY_COLOR = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
@@ -109,8 +111,9 @@ SPECIAL_POINT_NAMES_BY_COLOR = {
         "landing_stopper_impulse",
     ),
 }  # fmt: skip
-"""Names of special points by color; the index of a name gives its line style, the same in every
-figure. Green and pink, which color-blind readers may confuse, share no line style."""
+"""Names of special points by color. The index of a name gives its line style, which is the same
+in every figure. Green and pink, which color-blind readers may confuse, share no line style.
+"""
 
 NOT_COMPUTED_STYLE = ("not computed", "#FFFFFF")
 """Label and color of a sample that is not computed."""
@@ -167,26 +170,30 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 
 def require_variables(name: str, data: Any, needed_names: Sequence[str], advice: str) -> None:
-    """Raise unless `data` is a dataset that holds the needed variables or attributes."""
+    """Raise an error unless `data` is a dataset that contains the needed variables or
+    attributes.
+    """
     check_type(name, data, xr.Dataset, advice)
-    missing = [
+    missing_names = [
         variable
         for variable in needed_names
         if variable not in data.variables and variable not in data.attrs
     ]
-    if missing:
-        raise ValueError(f"{name} holds no {missing[0]!r}, which is to be drawn: {advice}.")
+    if missing_names:
+        raise ValueError(f"{name} holds no {missing_names[0]!r}, which is to be drawn: {advice}.")
 
 
 def require_variables_of_all(
     name: str, datasets: Any, needed_names: Sequence[str], advice: str
 ) -> None:
-    """Raise unless `datasets` is a nonempty list of datasets that hold the needed variables."""
+    """Raise an error unless `datasets` is a nonempty list of datasets that contain the needed
+    variables.
+    """
     check_type(name, datasets, (list, tuple), f"{advice}, several in a list")
     if not datasets:
         raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
-    for i, data in enumerate(datasets):
-        require_variables(f"{name}[{i}]", data, needed_names, advice)
+    for dataset_index, data in enumerate(datasets):
+        require_variables(f"{name}[{dataset_index}]", data, needed_names, advice)
 
 
 def typeset_symbols(text: str) -> str:
@@ -199,20 +206,22 @@ def _format_unit(name: str) -> str:
     return MEASURES[name].display_unit.replace(" ", "·").replace("^2", "²")
 
 
-def format_axis_label(name: str, form: str = "{name} {symbol}") -> str:
-    """Return the label of a quantity with its unit, formatted by `form`.
+def format_axis_label(name: str, label_format: str = "{name} {symbol}") -> str:
+    """Return the label of a quantity with its unit, formatted by `label_format`.
 
-    An unknown name is returned as it is.
+    An unknown name is returned unchanged.
     """
     if name not in MEASURES:
         return name
     measure = MEASURES[name]
-    text = form.format(name=typeset_symbols(measure.long_name), symbol=f"${measure.mathtext}$")
+    text = label_format.format(
+        name=typeset_symbols(measure.long_name), symbol=f"${measure.mathtext}$"
+    )
     return f"{text} [{_format_unit(name)}]" if _format_unit(name) else text
 
 
 def format_value_label(name: str, value: float, digits: int = 4) -> str:
-    """Return the text of a quantity with a value, as in "c = 50 N·s/m"."""
+    """Return the text of a quantity with its value, as in "c = 50 N·s/m"."""
     if name not in MEASURES:
         return f"{name} = {value:.{digits}g}"
     return f"${MEASURES[name].mathtext}$ = {value:.{digits}g} {_format_unit(name)}".rstrip()
@@ -246,7 +255,9 @@ def select_special_point_style(name: str) -> tuple[str, Any]:
 
 
 def select_outcome_style(code: int) -> tuple[str, str]:
-    """Return label and color of an outcome, of an unstable cycle, or of a sample not computed."""
+    """Return label and color of an outcome, of an unstable cycle, or of a sample that is not
+    computed.
+    """
     if code == UNSTABLE_CODE:
         return "unstable limit cycle", YELLOW
     return OUTCOME_STYLES[Outcome(code)] if code >= 0 else NOT_COMPUTED_STYLE
@@ -259,7 +270,9 @@ def draw_outcome_cells(
     codes: np.ndarray,
     known_codes: Sequence[int] | np.ndarray,
 ) -> None:
-    """Draw cells over (x, y) in the colors of their outcomes, except codes not in `known_codes`."""
+    """Draw cells over (x, y) in the colors of their outcomes; codes not in `known_codes` are
+    left out.
+    """
     colors = ListedColormap([select_outcome_style(int(code))[1] for code in known_codes])
     code_indices = np.ma.masked_where(
         ~np.isin(codes, known_codes), np.searchsorted(known_codes, codes)

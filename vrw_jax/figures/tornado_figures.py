@@ -96,7 +96,7 @@ def tornado_figure(
 def _compute_changes(table: xr.Dataset, spreads: Mapping[str, float] | None) -> xr.DataArray:
     """Return the change of each measure for an increase of each parameter."""
     if spreads is None:
-        return table.elasticity  # in per cent for 1 %
+        return table.elasticity  # changes in per cent for 1 %
     known_parameters = tuple(map(str, table.parameter.values))
     for name in spreads:
         check_parameter_name(name, known_parameters, "parameter of this table")
@@ -111,8 +111,8 @@ def _draw_bars(axes: Axes, changes: xr.DataArray) -> None:
     changes = changes[np.isfinite(changes.values)]
     changes = changes[np.argsort(-np.abs(changes.values), kind="stable")]
     positions = np.arange(changes.size)
-    for sign, color in ((1.0, BLUE), (-1.0, AMBER)):
-        axes.barh(positions, sign * changes.values, 0.7, color=color, label=str(sign))
+    for signs, color in ((1.0, BLUE), (-1.0, AMBER)):
+        axes.barh(positions, signs * changes.values, 0.7, color=color, label=str(signs))
     axes.axvline(0.0, color="black", linewidth=0.6)
     symbols = [f"${MEASURES[str(name)].mathtext}$" for name in changes.parameter.values]
     axes.set_yticks(positions, symbols)

@@ -42,8 +42,8 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     """
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path = tuned.path
-    n = path.sizes["constraint"]
-    height_inches = max(3.2, 0.19 * n + 1.0)  # One row of text per constraint.
+    n_constraints = path.sizes["constraint"]
+    height_inches = max(3.2, 0.19 * n_constraints + 1.0)  # Each constraint has one row of text.
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, height_inches))
     panels = figure.subplot_mosaic(
         [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
@@ -57,21 +57,36 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 
 def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
     """Draw the objective over the evaluated gaits."""
-    number, value = path.evaluation.values, path.objective.values
+    evaluation_numbers, value = path.evaluation.values, path.objective.values
     is_gait_lost = np.isin(path.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
     keeps_constraints = path.breach.values <= MAXIMIZATION_OPTIONS.active_bound_tolerance
-    axes.plot(number[~is_gait_lost], value[~is_gait_lost], color=DARK_GRAY, linewidth=0.7, zorder=1)
-    for is_feasible, fill, text in (
+    axes.plot(
+        evaluation_numbers[~is_gait_lost],
+        value[~is_gait_lost],
+        color=DARK_GRAY,
+        linewidth=0.7,
+        zorder=1,
+    )
+    for is_feasible, fill_color, text in (
         (True, BLUE, "keeps the constraints"),
         (False, "white", "breaks one"),
     ):
         is_drawn = ~is_gait_lost & (keeps_constraints == is_feasible)
         draw_marks(
-            axes, number[is_drawn], value[is_drawn], "o", BLUE, fill, markersize=4.0, label=text
+            axes,
+            evaluation_numbers[is_drawn],
+            value[is_drawn],
+            "o",
+            BLUE,
+            fill_color,
+            markersize=4.0,
+            label=text,
         )
     if is_gait_lost.any():
-        for i, evaluation in enumerate(number[is_gait_lost]):
-            legend_text = "gait or finite value lost, step shortened" if i == 0 else None
+        for evaluation_index, evaluation in enumerate(evaluation_numbers[is_gait_lost]):
+            legend_text = (
+                "gait or finite value lost, step shortened" if evaluation_index == 0 else None
+            )
             axes.axvline(evaluation, color=ORANGE, linewidth=0.8, linestyle=":", label=legend_text)
     axes.set_ylabel(format_axis_label(path.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
@@ -115,15 +130,15 @@ def _draw_slack(axes: Axes, result: TuneResult) -> None:
         scale = np.maximum(np.nanmax(np.abs(values - margin), axis=0), 1e-12)
     positions = np.arange(len(names))[::-1]
     active_names = {active.name for active in result.active}
-    for share, offset, tone, text in (
+    for slack_fraction, vertical_offset, color, text in (
         ((values[0] - margin) / scale, 0.19, LIGHT_GRAY, "at the start"),
         ((values[tuned_index] - margin) / scale, -0.19, BLUE, "tuned"),
     ):
         axes.barh(
-            positions + offset,
-            share,
+            positions + vertical_offset,
+            slack_fraction,
             0.36,
-            color=tone,
+            color=color,
             label=text,
             edgecolor=DARK_GRAY,
             linewidth=0.3,
@@ -131,9 +146,10 @@ def _draw_slack(axes: Axes, result: TuneResult) -> None:
     axes.axvline(0.0, color="black", linewidth=0.6)
     texts = []
     for name in names:
-        measure_name, _, leg = name.partition("[")
+        measure_name, _, leg_suffix = name.partition("[")
         texts.append(
-            typeset_symbols(MEASURES[measure_name].long_name) + (f", {leg[:-1]}" if leg else "")
+            typeset_symbols(MEASURES[measure_name].long_name)
+            + (f", {leg_suffix[:-1]}" if leg_suffix else "")
         )
     axes.set_yticks(positions, texts, fontsize=7.0)
     for tick, name in zip(axes.get_yticklabels(), names, strict=True):

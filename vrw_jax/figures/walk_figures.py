@@ -43,7 +43,7 @@ Coordinate = float | np.ndarray
 """One coordinate of points, in m."""
 
 FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
-"""Names of the ground forces on the feet of Leg 1 and Leg 2, in N."""
+"""Names of the ground forces on the feet of Leg 1 and Leg 2, N."""
 
 
 WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
@@ -57,7 +57,7 @@ PAPER_WALK_REMEDY = (
 
 
 def _require_walk(name: str, walk: xr.Dataset) -> None:
-    """Raise unless `walk` is a trajectory with at least one sample."""
+    """Raise an error unless `walk` is a trajectory with at least one sample."""
     needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
     require_variables(name, walk, needed_names, WALK_REMEDY)
     if not walk.sizes["time"]:
@@ -68,18 +68,24 @@ def _require_walk(name: str, walk: xr.Dataset) -> None:
 
 
 def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
-    """Return (begin, end, phase) of every phase of a trajectory, times in s."""
-    key = 3 * gait.step.values + gait.phase.values
-    cuts = np.flatnonzero(np.diff(key)) + 1
-    times = np.split(gait.time.values, cuts)
-    phases = gait.phase.values[np.r_[0, cuts]]
-    return [(t[0], t[-1], int(p)) for t, p in zip(times, phases, strict=True)]
+    """Return (start time, end time, phase) of every phase of a trajectory, times in s."""
+    step_and_phase = 3 * gait.step.values + gait.phase.values
+    change_indices = np.flatnonzero(np.diff(step_and_phase)) + 1
+    times = np.split(gait.time.values, change_indices)
+    phases = gait.phase.values[np.r_[0, change_indices]]
+    return [
+        (phase_times[0], phase_times[-1], int(phase_code))
+        for phase_times, phase_code in zip(times, phases, strict=True)
+    ]
 
 
 def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
     """Return time and variables with a gap at each landing, at which the legs are relabeled."""
-    cuts = np.flatnonzero(np.diff(gait.step.values)) + 1
-    return [np.insert(gait[name].values.astype(float), cuts, np.nan) for name in ("time", *names)]
+    landing_indices = np.flatnonzero(np.diff(gait.step.values)) + 1
+    return [
+        np.insert(gait[name].values.astype(float), landing_indices, np.nan)
+        for name in ("time", *names)
+    ]
 
 
 @figure_style()
@@ -108,19 +114,21 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     load_share = 100.0 * forces[3] / (forces[1] + forces[3])
     figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 7.4))
     panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
-    for axes, letter in zip(panels, "abcde", strict=True):
-        label_panel(axes, letter)
-        for begin, end, phase in find_phase_spans(gait):
+    for axes, panel_letter in zip(panels, "abcde", strict=True):
+        label_panel(axes, panel_letter)
+        for start_time, end_time, phase in find_phase_spans(gait):
             if phase == 0:
-                axes.axvspan(begin, end, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
+                axes.axvspan(start_time, end_time, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
             if phase == 2:
-                axes.axvline(begin, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0)
+                axes.axvline(
+                    start_time, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0
+                )
     panels[0].plot(time, theta, color="black")
     panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
-    for begin, end, phase in find_phase_spans(gait)[:3]:
+    for start_time, end_time, phase in find_phase_spans(gait)[:3]:
         panels[0].annotate(
             PHASE_NAMES[phase],
-            (0.5 * (begin + end), 1.0),
+            (0.5 * (start_time + end_time), 1.0),
             xycoords=("data", "axes fraction"),
             ha="center",
             va="bottom",
@@ -193,24 +201,24 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
 
 
 def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
-    """Draw Legs 1 and 2 of a walk in phases, in the colors of the phases."""
-    tones = ("#A0A0A0", SKY, "#000000")
+    """Draw Legs 1 and 2 of a walk, in the colors of its phases."""
+    phase_colors = ("#A0A0A0", SKY, "#000000")
     time = gait.time.values
     for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
-        instant = gait.isel(time=int(i))
+        sample = gait.isel(time=int(i))
         for foot, line in ((1, "-"), (2, ":")):
             axes.plot(
-                [float(instant[f"foot_{foot}_x"]), float(instant.hub_x)],
-                [float(instant[f"foot_{foot}_z"]), float(instant.hub_z)],
-                color=tones[int(instant.phase)],
+                [float(sample[f"foot_{foot}_x"]), float(sample.hub_x)],
+                [float(sample[f"foot_{foot}_z"]), float(sample.hub_z)],
+                color=phase_colors[int(sample.phase)],
                 linestyle=line,
                 linewidth=0.8,
             )
     for line, name in (("-", "Leg 1"), (":", "Leg 2")):
         axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
-    for phase, tone in zip(PHASE_NAMES, tones, strict=True):
-        axes.plot([], [], color=tone, linewidth=3.0, label=phase)
+    for phase, phase_color in zip(PHASE_NAMES, phase_colors, strict=True):
+        axes.plot([], [], color=phase_color, linewidth=3.0, label=phase)
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
@@ -243,24 +251,24 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
     step_axes, takeoff_axes = figure.subplots(1, 2)
     for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
-        name, lowest = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
-        clearance_text = f"lowest −{-lowest:.1f} mm" if lowest < -1e-6 else "clear"
+        name, min_clearance = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
+        clearance_text = f"lowest −{-min_clearance:.1f} mm" if min_clearance < -1e-6 else "clear"
         step_axes.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
         takeoff_axes.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=clearance_text)
-    for letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
-        label_panel(axes, letter)
+    for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
+        label_panel(axes, panel_letter)
         axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
-    lowest = min(float(gait.foot_2_z.min()) for gait in gaits)
-    take_off = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
-    highest = max(float(gait.foot_2_z.max()) for gait in gaits)
-    step_axes.set_ylim(2.0 * lowest - 0.004, 1.05 * highest)
+    min_clearance = min(float(gait.foot_2_z.min()) for gait in gaits)
+    takeoff_time = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
+    max_height = max(float(gait.foot_2_z.max()) for gait in gaits)
+    step_axes.set_ylim(2.0 * min_clearance - 0.004, 1.05 * max_height)
     step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
     step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
-    takeoff_axes.set_ylim(1.3e3 * lowest - 0.5, -1.8e3 * lowest + 0.5)
-    takeoff_axes.set_xlim(min(take_off) - 0.03, max(take_off) + 0.1)
+    takeoff_axes.set_ylim(1.3e3 * min_clearance - 0.5, -1.8e3 * min_clearance + 0.5)
+    takeoff_axes.set_xlim(min(takeoff_time) - 0.03, max(takeoff_time) + 0.1)
     takeoff_axes.set_ylabel("$z_2$ [mm]")
     takeoff_axes.text(
         0.98,
@@ -356,21 +364,21 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
     )
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.7))
     panels = figure.subplots(1, 2)
-    for axes, letter, (series, axis_text) in zip(panels, "ab", rows, strict=True):
-        label_panel(axes, letter)
+    for axes, panel_letter, (series, axis_text) in zip(panels, "ab", rows, strict=True):
+        label_panel(axes, panel_letter)
         for name, color, marker in series:
             data, symbol = valid_gaits[name].values, f"${MEASURES[name].mathtext}$"
             axes.plot(values, data, color=color, linewidth=0.7)
-            for draws_scuffing, fill in ((False, color), (True, "white")):
-                is_selected = has_marker & (is_scuffing == draws_scuffing)
-                text = symbol + (", scuffing" if draws_scuffing else "")
+            for is_scuffing_drawn, fill_color in ((False, color), (True, "white")):
+                is_selected = has_marker & (is_scuffing == is_scuffing_drawn)
+                text = symbol + (", scuffing" if is_scuffing_drawn else "")
                 x, y = values[is_selected], data[is_selected]
-                draw_marks(axes, x, y, marker, color, fill, label=text, clip_on=False)
+                draw_marks(axes, x, y, marker, color, fill_color, label=text, clip_on=False)
         axes.set_xlim(0.0, values.max() + 1.0)
         axes.set_ylim(0.0, 1.18 * max(float(valid_gaits[name].max()) for name, *_ in series))
         axes.set_xlabel(format_axis_label(vary, "{symbol}"))
         axes.set_ylabel(axis_text)
-        axes.legend(loc="lower right" if letter == "a" else "upper right", ncols=len(series))
+        axes.legend(loc="lower right" if panel_letter == "a" else "upper right", ncols=len(series))
     slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
     panels[0].text(0.02, 0.05, format_value_label("slope", slope), transform=panels[0].transAxes)
     return figure
@@ -379,7 +387,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
 def _rotate_to_vertical(
     x: Coordinate, z: Coordinate, slope: float
 ) -> tuple[Coordinate, Coordinate]:
-    """Return coordinates in a frame with vertical gravity, from those in the slope's frame."""
+    """Return coordinates in a frame with vertical gravity from those in the slope's frame, m."""
     return (
         x * np.cos(slope) + z * np.sin(slope),
         z * np.cos(slope) - x * np.sin(slope),
@@ -440,26 +448,30 @@ def walk_frames(
     return frames, round(1e3 * slow * duration / n_frames)
 
 
-def _draw_wheel(axes: Axes, motion: FootMotion, t: float, slope: float) -> int:
-    """Draw hub, legs, feet and forces at the time t, in s; return the sample of the modes."""
-    hub, feet, sample = motion.interpolate(t)
-    rotate = lambda points: np.array(_rotate_to_vertical(points[..., 0], points[..., 1], slope))
+def _draw_wheel(axes: Axes, motion: FootMotion, time: float, slope: float) -> int:
+    """Draw hub, legs, feet and forces at a time in s, and return the index of the sample of
+    contact modes.
+    """
+    hub, feet, sample = motion.interpolate(time)
+    rotate_to_view = lambda points: np.array(
+        _rotate_to_vertical(points[..., 0], points[..., 1], slope)
+    )
     for leg, foot in enumerate(feet, 1):
         axes.plot(
-            *rotate(np.stack([hub, foot])),
+            *rotate_to_view(np.stack([hub, foot])),
             color=select_leg_color(leg),
             linewidth=3.0 if leg < 3 else 1.5,
             solid_capstyle="round",
             zorder=5 if leg < 3 else 3,
         )
-    axes.plot(*rotate(hub), "o", color="black", markersize=9, zorder=6)
-    draw_feet(axes, rotate(feet), motion.contact[sample], 6.0)
+    axes.plot(*rotate_to_view(hub), "o", color="black", markersize=9, zorder=6)
+    draw_feet(axes, rotate_to_view(feet), motion.contact[sample], 6.0)
     for foot, force in zip(feet, motion.forces[sample], strict=True):
         if force[1] != 0.0:
             axes.annotate(
                 "",
-                tuple(rotate(foot + force / 300.0)),
-                tuple(rotate(foot)),
+                tuple(rotate_to_view(foot + force / 300.0)),
+                tuple(rotate_to_view(foot)),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
@@ -468,12 +480,14 @@ def _draw_wheel(axes: Axes, motion: FootMotion, t: float, slope: float) -> int:
 
 def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None:
     """Draw the slope with marks that repeat every half stride, so that the animation loops."""
-    ends = np.array([center - 3.0, center + 3.0])
-    axes.plot(*_rotate_to_vertical(ends, 0.0 * ends, slope), color="black", linewidth=1.2)
+    ground_ends = np.array([center - 3.0, center + 3.0])
+    axes.plot(
+        *_rotate_to_vertical(ground_ends, 0.0 * ground_ends, slope), color="black", linewidth=1.2
+    )
     spacing = 0.5 * stride
     first_mark = np.ceil((center - 2.0) / spacing)
-    for k in range(int(4.0 / spacing)):
-        x = np.array([0.0, -0.06]) + (first_mark + k) * spacing
+    for mark_number in range(int(4.0 / spacing)):
+        x = np.array([0.0, -0.06]) + (first_mark + mark_number) * spacing
         axes.plot(
             *_rotate_to_vertical(x, np.array([0.0, -0.06]), slope), color="black", linewidth=0.7
         )
@@ -505,9 +519,9 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
     check_type("path", path, (str, Path), 'give a file, such as "walk.gif"')
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    palette = frames[0].quantize(32)
+    shared_palette = frames[0].quantize(32)
     paletted_frames = [
-        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
+        frame.quantize(palette=shared_palette, dither=Image.Dither.NONE) for frame in frames
     ]
     paletted_frames[0].save(
         path,
