@@ -1,7 +1,7 @@
-"""The command line: walk a wheel, reproduce the paper, scan parameters.
+"""The commands: walk a wheel, reproduce the paper, scan parameters, tune, continue branches.
 
-Slow imports are inside commands, so that help appears at once. A user's mistake is reported in one
-sentence on stderr, with exit code 2.
+Slow imports are inside the commands, so that help appears quickly. A user's mistake is reported in
+one sentence on stderr, with exit code 2.
 """
 
 import gc
@@ -54,7 +54,7 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line."""
     # Traces consist of many small, long-lived objects. With Python's default thresholds the garbage
-    # collector takes a tenth of a cold start.
+    # collector takes a tenth of the first run's time.
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _interrupt_command)
     show_warnings_as_sentences()
@@ -64,13 +64,15 @@ def main() -> None:
 
 
 def _interrupt_command(_signal: int, _frame: object) -> None:
-    """Handle the first Ctrl-C: end the command in order, and let a second one end it at once."""
+    """Handle the first Ctrl-C: end the command regularly, and install the handler of a second
+    one.
+    """
     signal.signal(signal.SIGINT, _end_process)
     raise KeyboardInterrupt
 
 
 def _end_process(_signal: int, _frame: object) -> None:
-    """Handle the second Ctrl-C: end the process at once."""
+    """Handle the second Ctrl-C: end the process immediately."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
     os._exit(ExitCode.INTERRUPTED)
 
@@ -79,10 +81,10 @@ def _print_version(is_wanted: bool) -> None:
     """Print the version and exit if `--version` is given."""
     if is_wanted:
         try:
-            number = importlib.metadata.version("vrw-jax")
+            version_number = importlib.metadata.version("vrw-jax")
         except importlib.metadata.PackageNotFoundError:
-            number = "(not installed)"
-        print(f"vrw {number}")
+            version_number = "(not installed)"
+        print(f"vrw {version_number}")
         raise typer.Exit
 
 
@@ -210,30 +212,38 @@ def init(
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
     with report_errors():
-        source = find_example_configs()
-        texts = {path.name: path.read_text(encoding="utf-8") for path in source.glob("*.toml")}
-        existing = [folder / name for name in sorted(texts) if (folder / name).exists()]
+        example_folder = find_example_configs()
+        example_texts = {
+            path.name: path.read_text(encoding="utf-8") for path in example_folder.glob("*.toml")
+        }
+        existing = [folder / name for name in sorted(example_texts) if (folder / name).exists()]
         for path in existing:
-            if path.read_text(encoding="utf-8", errors="replace") != texts[path.name]:
+            if path.read_text(encoding="utf-8", errors="replace") != example_texts[path.name]:
                 raise ValueError(f"{path} is there already and differs: give another folder.")
         _require_writable(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        missing = [folder / name for name in sorted(texts) if folder / name not in existing]
-        for path in missing:
-            path.write_text(texts[path.name], encoding="utf-8")
-        printing.print_written_paths(missing)
-        if not missing:
+        missing_names = [
+            folder / name for name in sorted(example_texts) if folder / name not in existing
+        ]
+        for path in missing_names:
+            path.write_text(example_texts[path.name], encoding="utf-8")
+        printing.print_written_paths(missing_names)
+        if not missing_names:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
 
 
 def find_example_configs() -> Path:
     """Return the folder of the example configs, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
-    return next(p for p in (package / "configs", package.parent / "configs") if p.is_dir())
+    return next(
+        candidate_folder
+        for candidate_folder in (package / "configs", package.parent / "configs")
+        if candidate_folder.is_dir()
+    )
 
 
 def _require_writable(folder: Path) -> None:
-    """Raise if the folder cannot be written to, without creating it."""
+    """Raise a ValueError if the folder cannot be written to; nothing is created."""
     existing = folder
     while not existing.exists():
         existing = existing.parent
@@ -268,12 +278,14 @@ def reproduce(
 
     with (
         report_errors(f"stopped; what is done stays in {folder}."),
-        printing.make_progress_bar("reproducing the paper") as bar,
+        printing.make_progress_bar("reproducing the paper") as progress_bar,
     ):
-        task = bar.add_task("starting", total=1.0)
+        task = progress_bar.add_task("starting", total=1.0)
         facts = run(
             folder,
-            on_progress=lambda share, what: bar.update(task, completed=share, description=what),
+            on_progress=lambda progress_fraction, stage_description: progress_bar.update(
+                task, completed=progress_fraction, description=stage_description
+            ),
         )
     with report_errors():
         printing.print_facts(facts, folder)
@@ -499,7 +511,7 @@ def _require_compiler() -> None:
 
 
 def _require_pictures(picture: bool) -> None:
-    """Raise a ValueError, before anything is computed, if matplotlib lacks the backend."""
+    """Raise a ValueError if matplotlib lacks the backend, before anything is computed."""
     if not picture:
         return
     try:
@@ -519,23 +531,25 @@ MISSING_TABLE_MESSAGES = {
     "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
     "[branch], as in configs/branch_damping.toml of `vrw init`.",
 }
-"""Messages about a config that lacks the table that a command needs."""
+"""Messages about a config that lacks the table that a command needs, by table."""
 
 
 def _load_config_for(
-    path: Path, folder: Path | None, table: str, command: str
+    path: Path, folder: Path | None, table_name: str, command: str
 ) -> tuple["Config", Path]:
-    """Return the config and the folder of the result; raise if the needed table is missing."""
+    """Return the config and the folder of the result; raise a ValueError if the needed table is
+    missing.
+    """
     settings = _load_config(path)
-    if getattr(settings, table) is None:
-        raise ValueError(f"{settings.file_name} {MISSING_TABLE_MESSAGES[table]}")
+    if getattr(settings, table_name) is None:
+        raise ValueError(f"{settings.file_name} {MISSING_TABLE_MESSAGES[table_name]}")
     from vrw_jax.selection import list_config_names
 
-    supported = list_config_names(command)
-    if settings.model_name not in supported:
+    supported_models = list_config_names(command)
+    if settings.model_name not in supported_models:
         raise ValueError(
             f"{settings.file_name} names the model {settings.model_name}, but this command takes "
-            f"{', '.join(supported)}: write {'one of these' if len(supported) > 1 else 'that'} "
-            "below [model]."
+            f"{', '.join(supported_models)}: write "
+            f"{'one of these' if len(supported_models) > 1 else 'that'} below [model]."
         )
     return settings, Path("results") / path.stem if folder is None else folder

@@ -35,14 +35,18 @@ DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
 TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
 _OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 PARAMETER_SET_KEY = "parameter_set"
-"""Key of `[wheel]` that names a set of parameters, which the other keys of the table replace."""
+"""Key of `[wheel]` that names a set of parameters; the other keys of the table override its
+values.
+"""
 _AXIS_KEYS = ("from", "to", "count")
 
 MAX_CONFIG_INTEGER = 2**53
 """Largest integer of a config, chosen because floats represent all integers up to it."""
 
 MAX_CONFIG_LEGS = 1_000
-"""Largest number of legs, chosen because results have a number for each leg of each sample."""
+"""Largest number of legs of a config, chosen because results have a number for each leg of each
+sample.
+"""
 
 RENAMED_KEYS = {
     "[model]": {"rung": "name"},
@@ -53,7 +57,7 @@ RENAMED_KEYS = {
     },
     "[branch]": {"largest_step": "max_ds"},
 }
-"""Old keys by table, and their present names, which a config must use instead."""
+"""Old keys by table, with the present names that a config must use."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,16 @@ class ScanConfig:
     def from_table(
         cls, table: Mapping[str, object], model_class: type[AbstractWheel]
     ) -> "ScanConfig":
-        """Return the settings of `[scan]`; raise if the model does not have a measure."""
+        """Return the settings of `[scan]`; raise a ValueError if the model does not have a
+        measure.
+        """
         _require_known_keys(table, cls.__dataclass_fields__, "[scan]", "settings")
         measures = table.get("measures")
         if measures is not None:
-            if not (isinstance(measures, list) and all(isinstance(m, str) for m in measures)):
+            if not (
+                isinstance(measures, list)
+                and all(isinstance(measure_name, str) for measure_name in measures)
+            ):
                 requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
                 raise _make_error("measures", measures, requirement)
             catalog = (
@@ -196,8 +205,8 @@ class BranchConfig:
 
     @classmethod
     def from_table(cls, table: Mapping[str, object], names: tuple[str, ...]) -> "BranchConfig":
-        """Return the settings of `[branch]` along one of the parameters `names`."""
-        _refuse_renamed_keys(table, "[branch]")
+        """Return the settings of `[branch]`; its parameter is one of `names`."""
+        _raise_for_renamed_keys(table, "[branch]")
         _require_known_keys(table, cls.__dataclass_fields__, "[branch]", "settings")
         parameter = table.get("parameter")
         check_parameter_name(parameter, names, "parameter that a branch of this model runs along")
@@ -224,7 +233,7 @@ class BranchConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """A config as checked values, with the text that it was read from."""
+    """A config as checked values, with the text from which it was read."""
 
     wheel_values: Mapping[str, float | int] = field(default_factory=dict)
     model_name: str = "viscoelastic"
@@ -254,7 +263,7 @@ class Config:
 
 
 def load_config(path: str | Path) -> Config:
-    """Read and check a config file; raise if it is invalid."""
+    """Return the config of a file after checks; raise a ValueError if it is invalid."""
     path = Path(path)
     if not path.exists():
         suggestion = suggest_name(
@@ -276,7 +285,7 @@ def load_config(path: str | Path) -> Config:
 
 
 def parse_config(text: str, file_name: str = "config") -> Config:
-    """Parse and check the text of a config; `file_name` begins every message about an error."""
+    """Return the config of a text after checks; `file_name` begins every message about an error."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -299,13 +308,13 @@ def parse_config(text: str, file_name: str = "config") -> Config:
 
 
 def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Config:
-    """Return the config of the tables of a file; raise if a table is invalid."""
+    """Return the config of the tables of a file; raise a ValueError if a table is invalid."""
     _require_known_keys(tables, TABLE_NAMES, "the file", "tables")
     for key, table in tables.items():
         if not isinstance(table, dict):
             requirement = f"a table: write [{key}] on a line of its own and its settings below"
             raise _make_error(f"[{key}]", table, requirement)
-    design_kinds = [kind for kind in DESIGN_KINDS if kind in tables]
+    design_kinds = [design_kind for design_kind in DESIGN_KINDS if design_kind in tables]
     if len(design_kinds) > 1:
         raise ValueError(
             f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one "
@@ -320,16 +329,16 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
         else None
     )
     wheel = _parse_wheel(_get_table(tables, "wheel"))
-    doubly_given = [
+    doubly_given_names = [
         key for key in _get_table(tables, "wheel") if design is not None and key in design.names
     ]
-    if doubly_given:
+    if doubly_given_names:
         raise ValueError(
-            f"{doubly_given[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it can "
-            "only be one: drop one of the two."
+            f"{doubly_given_names[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it "
+            "can only be one: drop one of the two."
         )
     option_table = _get_table(tables, "options")
-    _refuse_renamed_keys(option_table, "[options]")
+    _raise_for_renamed_keys(option_table, "[options]")
     _require_known_keys(option_table, _OPTION_KEYS, "[options]", "options")
     default_options = {key: getattr(StepOptions(), key) for key in _OPTION_KEYS}
     option_values = _parse_like_defaults(option_table, default_options)
@@ -351,7 +360,8 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
     config.make_wheel()
     try:
         config.make_model()
-    except TypeError as error:  # A setting that no file can write, such as uneven ground.
+    # The wheel has a setting that no file can contain, such as uneven ground.
+    except TypeError as error:
         raise ValueError(str(error)) from error
     options = config.make_options()
     options.check_tolerances(np.dtype(float))
@@ -360,7 +370,7 @@ def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Con
 
 
 def _get_table(tables: Mapping[str, object], key: str) -> dict[str, object]:
-    """Return a table of the file, empty if it is missing."""
+    """Return a table of the file; an empty one if it is missing."""
     table = tables.get(key, {})
     assert isinstance(table, dict)
     return table
@@ -368,8 +378,8 @@ def _get_table(tables: Mapping[str, object], key: str) -> dict[str, object]:
 
 def parse_assignment(text: str) -> tuple[str, float | int]:
     """Return a parameter and its value from `name=value` of the command line."""
-    name, equals, value = (part.strip() for part in text.partition("="))
-    if not equals:
+    name, equals_sign, value = (key.strip() for key in text.partition("="))
+    if not equals_sign:
         raise ValueError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
     try:
         number = int(value) if name == "n_legs" else float(value)
@@ -379,9 +389,9 @@ def parse_assignment(text: str) -> tuple[str, float | int]:
 
 
 def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
-    """Return the parameters of `[wheel]`."""
-    known = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
-    _require_known_keys(table, known, "[wheel]", "parameters")
+    """Return the parameters of `[wheel]` by name."""
+    known_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
+    _require_known_keys(table, known_keys, "[wheel]", "parameters")
     values: dict[str, float | int] = {}
     if (set_name := table.get(PARAMETER_SET_KEY)) is not None:
         check_known_name(set_name, tuple(parameter_sets), "parameter set")
@@ -400,7 +410,7 @@ def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
 
 def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
     """Return the name and the settings of the model of `[model]`."""
-    _refuse_renamed_keys(table, "[model]")
+    _raise_for_renamed_keys(table, "[model]")
     model_name = table.get("name", Config.model_name)
     check_known_name(model_name, list_config_names(), "model")
     assert isinstance(model_name, str)
@@ -430,34 +440,38 @@ def _parse_like_defaults(
         elif isinstance(default, int):
             values[key] = _parse_int(value, key, 1)
         elif key == FRICTION_NAME and value == math.inf:
-            values[key] = math.inf  # Feet do not slip.
+            values[key] = math.inf  # Infinite friction means that feet do not slip.
         else:
             values[key] = _parse_number(value, key, must_be_positive=True)
     return values
 
 
 def _parse_design(
-    kind: str, table: Mapping[str, object], names: tuple[str, ...]
+    design_kind: str, table: Mapping[str, object], names: tuple[str, ...]
 ) -> designs.AbstractDesign:
     """Return the design of a table that sweeps some of the parameters `names`."""
-    design_keys = ("n", "seed") if kind in RANDOM_DESIGNS else ()
+    design_keys = ("n", "seed") if design_kind in RANDOM_DESIGNS else ()
     if FRICTION_NAME in table and FRICTION_NAME not in names:
-        choices = [f'name = "{x}"' for x in list_config_names("scan", FRICTION_NAME)]
+        model_choices = [
+            f'name = "{list_value}"' for list_value in list_config_names("scan", FRICTION_NAME)
+        ]
         raise ValueError(
-            f"[{kind}] sweeps friction, which does not affect this model: write [model] "
-            f"and below it {' or '.join(choices)}."
+            f"[{design_kind}] sweeps friction, which does not affect this model: write [model] "
+            f"and below it {' or '.join(model_choices)}."
         )
-    _require_known_keys(table, (*design_keys, *names), f"[{kind}]", "settings")
-    swept = {name: value for name, value in table.items() if name not in design_keys}
+    _require_known_keys(table, (*design_keys, *names), f"[{design_kind}]", "settings")
+    swept_names = {name: value for name, value in table.items() if name not in design_keys}
     if design_keys:
         if "n" not in table:
-            raise ValueError(f"[{kind}] has no number of samples: write n = 4096, say.")
+            raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
         n, seed = _parse_int(table["n"], "n", 1), _parse_int(table.get("seed", 0), "seed", 0)
-        ranges = {name: _parse_range(name, value) for name, value in swept.items()}
-        return RANDOM_DESIGNS[kind](ranges, n, seed)
-    if kind == "grid":
-        return designs.grid(**{name: _parse_axis(name, value) for name, value in swept.items()})
-    return designs.samples({name: _parse_list(name, value) for name, value in swept.items()})
+        ranges = {name: _parse_range(name, value) for name, value in swept_names.items()}
+        return RANDOM_DESIGNS[design_kind](ranges, n, seed)
+    if design_kind == "grid":
+        return designs.grid(
+            **{name: _parse_axis(name, value) for name, value in swept_names.items()}
+        )
+    return designs.samples({name: _parse_list(name, value) for name, value in swept_names.items()})
 
 
 def _parse_axis(name: str, value: object) -> np.ndarray:
@@ -465,10 +479,10 @@ def _parse_axis(name: str, value: object) -> np.ndarray:
     if not isinstance(value, dict):
         return _parse_list(name, value, " or { from = ..., to = ..., count = ... }")
     _require_known_keys(value, _AXIS_KEYS, f"the axis of {name}", "keys")
-    missing = [key for key in _AXIS_KEYS if key not in value]
-    if missing:
+    missing_keys = [key for key in _AXIS_KEYS if key not in value]
+    if missing_keys:
         raise ValueError(
-            f"the axis of {name} has no '{missing[0]}': "
+            f"the axis of {name} has no '{missing_keys[0]}': "
             f"write {name} = {{ from = ..., to = ..., count = ... }}."
         )
     lower, upper = (_parse_parameter(name, value[key]) for key in ("from", "to"))
@@ -482,14 +496,14 @@ def _parse_axis(name: str, value: object) -> np.ndarray:
 
 
 def _parse_list(name: str, value: object, alternative: str = "") -> np.ndarray:
-    """Return a list of values in the domain of the parameter `name`."""
+    """Return a list of values in the domain of the parameter `name` as an array."""
     if not isinstance(value, list):
         raise _make_error(name, value, f"a list of numbers{alternative}")
     return np.asarray([_parse_parameter(name, item) for item in value])
 
 
 def _parse_range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
-    """Return two values in the domain of `parameter`, by default `name` itself."""
+    """Return lower and upper bound in the domain of `parameter`, by default `name` itself."""
     if not (isinstance(value, list) and len(value) == 2):
         raise _make_error(name, value, f"a range of two numbers: write {name} = [lower, upper]")
     lower, upper = (_parse_parameter(parameter or name, item) for item in value)
@@ -497,7 +511,9 @@ def _parse_range(name: str, value: object, parameter: str = "") -> tuple[float, 
 
 
 def _parse_parameter(name: str, value: object) -> float:
-    """Return a value as a number; raise if it is not in the domain of the parameter."""
+    """Return a value as a number; raise a ValueError if it is not in the domain of the
+    parameter.
+    """
     number = _parse_number(value, name, must_be_positive=name == FRICTION_NAME)
     if name != FRICTION_NAME:
         PARAMETER_DOMAINS[name].require_inside(name, number)
@@ -505,10 +521,11 @@ def _parse_parameter(name: str, value: object) -> float:
 
 
 def _parse_number(value: object, name: str, must_be_positive: bool = False) -> float:
-    """Return a value as a finite float; raise if it is not one."""
+    """Return a value as a finite float; raise a ValueError if it is none."""
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):  # An integer of hundreds of digits is too large.
+        # An integer of hundreds of digits is too large for a float.
+        with contextlib.suppress(OverflowError):
             number = float(value)
     if not math.isfinite(number):
         raise _make_error(name, value, "a finite number")
@@ -518,7 +535,7 @@ def _parse_number(value: object, name: str, must_be_positive: bool = False) -> f
 
 
 def _parse_int(value: object, name: str, minimum: int) -> int:
-    """Return a value as a whole number of at least `minimum`; raise if it is not one."""
+    """Return a value as a whole number of at least `minimum`; raise a ValueError if it is none."""
     if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
         raise _make_error(name, value, f"a whole number of at least {minimum}")
     if value > MAX_CONFIG_INTEGER:
@@ -529,7 +546,7 @@ def _parse_int(value: object, name: str, minimum: int) -> int:
 def _require_known_keys(
     table: Mapping[str, object], allowed_keys: Iterable[str], location: str, key_kind: str
 ) -> None:
-    """Raise if a table has a key that is not allowed."""
+    """Raise a ValueError if a table has a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for key in table:
         refuse_symbol(key, allowed_keys)
@@ -540,8 +557,8 @@ def _require_known_keys(
             )
 
 
-def _refuse_renamed_keys(table: Mapping[str, object], location: str) -> None:
-    """Raise if a table has an old key."""
+def _raise_for_renamed_keys(table: Mapping[str, object], location: str) -> None:
+    """Raise a ValueError if a table has an old key."""
     for key, new_key in RENAMED_KEYS[location].items():
         if key in table:
             raise ValueError(f"{location} has the old key '{key}': write {new_key} in its place.")
@@ -549,9 +566,9 @@ def _refuse_renamed_keys(table: Mapping[str, object], location: str) -> None:
 
 def _make_error(name: str, value: object, requirement: str) -> ValueError:
     """Return the error about a value, written as in TOML, that does not satisfy a requirement."""
-    text = format_value(value)
+    value_text = format_value(value)
     if isinstance(value, bool):
-        text = text.lower()
+        value_text = value_text.lower()
     elif isinstance(value, str):
-        text = text.replace("'", '"')
-    return ValueError(f"{name} is {text}, but it must be {requirement}.")
+        value_text = value_text.replace("'", '"')
+    return ValueError(f"{name} is {value_text}, but it must be {requirement}.")

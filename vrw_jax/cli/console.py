@@ -1,4 +1,4 @@
-"""Output of commands: tables, progress, and one sentence for a user's mistake."""
+"""Output of commands: tables, progress, and one sentence about a user's mistake."""
 
 import contextlib
 import enum
@@ -42,7 +42,9 @@ stderr_console = Console(stderr=True)
 
 @contextlib.contextmanager
 def report_errors(interruption_message: str = "stopped; nothing was written.") -> Iterator[None]:
-    """Report an error in one sentence on stderr with exit code 2, and a Ctrl-C with 130."""
+    """Return a context that reports an error in one sentence with exit code 2, and a Ctrl-C with
+    130.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -60,25 +62,25 @@ def report_errors(interruption_message: str = "stopped; nothing was written.") -
 
 @contextlib.contextmanager
 def report_output_errors() -> Iterator[None]:
-    """Report in one sentence, with exit code 2, that standard output cannot be written."""
-    code: Any = 0
+    """Return a context that reports, with exit code 2, that standard output cannot be written."""
+    exit_code: Any = 0
     try:
         yield
     except SystemExit as end:
-        code = end.code
+        exit_code = end.code
     except OSError as error:
         _abandon_output(error)
     try:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output(error)
-    raise SystemExit(code)
+    raise SystemExit(exit_code)
 
 
 def _abandon_output(error: OSError) -> None:
-    """Discard the remaining output, which Python would write at its end, and exit."""
+    """Discard the remaining output, which Python would write at the end, and exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(error, BrokenPipeError):  # The reader closed the pipe on purpose.
+    if not isinstance(error, BrokenPipeError):  # The reader has closed the pipe on purpose.
         print_error(f"standard output can't be written: {_format_system_error(error)}")
     raise SystemExit(ExitCode.USER_ERROR)
 
@@ -109,23 +111,24 @@ def show_warnings_as_sentences() -> None:
 
 
 def _format_system_error(error: OSError) -> str:
-    """Return the sentence about an error of the operating system."""
+    """Return a sentence about an error of the operating system."""
     location = f"{error.filename}: " if error.filename else ""
     return f"{location}{str(error.strerror or error).rstrip('.')}."
 
 
 @contextlib.contextmanager
 def show_stages(first_stage: str) -> Iterator[Callable[[str], None]]:
-    """Show the stage of a computation and its duration, and yield the callback of the next stage.
+    """Show the stage of a computation and its duration, and yield the function that sets the next
+    stage.
 
-    If stderr is no terminal, each stage that is passed to the callback is printed as one line.
+    If stderr is no terminal, each stage that is passed to this function is printed as one line.
     """
     if not stderr_console.is_terminal:
         yield lambda stage: stderr_console.print(f"{stage} ...", highlight=False, soft_wrap=True)
         return
-    with make_progress_bar("stages") as bar:
-        task = bar.add_task(first_stage, total=None)
-        yield lambda stage: bar.update(task, description=stage)
+    with make_progress_bar("stages") as progress_bar:
+        task = progress_bar.add_task(first_stage, total=None)
+        yield lambda stage: progress_bar.update(task, description=stage)
 
 
 def print_written_paths(paths: Iterable[Path]) -> None:
@@ -162,7 +165,10 @@ def print_facts(facts: "list[Fact]", folder: Path) -> None:
     verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
     print_table(
         None,
-        ((f.claim, f.source, f.published_value, f.computed, verdict[f.holds]) for f in facts),
+        (
+            (fact.claim, fact.source, fact.published_value, fact.computed, verdict[fact.holds])
+            for fact in facts
+        ),
         ("fact", "where", "published", "found", ""),
     )
     from vrw_jax.paper import summarize_facts
@@ -184,11 +190,11 @@ def make_progress_bar(task: str) -> "Bar":
     return Bar(*columns, console=stderr_console)
 
 
-def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"], None]:
-    """Return the callback that shows rate, share without a gait and remaining time.
+def make_scan_reporter(update_bar: Callable, task: int) -> Callable[["ScanProgress"], None]:
+    """Return the function that shows rate, fraction without a gait and remaining time of a scan.
 
     The rate is measured from the second chunk on, because the first one includes compilation. The
-    bar includes the samples of an earlier run; rate and share are those of this run.
+    bar includes the samples of an earlier run; rate and fraction are those of this run.
     """
     import time
 
@@ -199,21 +205,24 @@ def make_scan_reporter(update: Callable, task: int) -> Callable[["ScanProgress"]
     def report(progress: "ScanProgress") -> None:
         """Update the bar."""
         time_now, n_done = time.monotonic(), progress.n_done
-        note = f"{progress.n_reused:,} from an earlier run" if progress.n_reused else ""
+        bar_note = f"{progress.n_reused:,} from an earlier run" if progress.n_reused else ""
         if n_done:
             first_report.append((time_now, n_done))
             first_time, n_before = first_report[0]
-            note = f"{100 * progress.n_failed / n_done:.0f} % without a gait"
+            bar_note = f"{100 * progress.n_failed / n_done:.0f} % without a gait"
             if time_now > first_time:
-                rate = (n_done - n_before) / (time_now - first_time)
-                seconds_left = (progress.n_samples - n_done) / rate
-                note = f"{rate:,.0f} per s, {note}, {format_seconds(seconds_left)} left"
-        update(
+                samples_per_second = (n_done - n_before) / (time_now - first_time)
+                seconds_left = (progress.n_samples - n_done) / samples_per_second
+                bar_note = (
+                    f"{samples_per_second:,.0f} per s, {bar_note}, "
+                    f"{format_seconds(seconds_left)} left"
+                )
+        update_bar(
             task,
             total=progress.n_reused + progress.n_samples,
             completed=progress.n_reused + n_done,
             description="scanning" if n_done else "compiling",
-            note=note,
+            note=bar_note,
         )
 
     return report
@@ -225,13 +234,18 @@ def print_outcomes(scan: "xr.Dataset") -> None:
 
     from vrw_jax.wheel import Outcome
 
-    codes, counts = np.unique(scan.outcome.values, return_counts=True)
-    ends = [Outcome(int(code)) for code in codes]
+    codes, count_by_code = np.unique(scan.outcome.values, return_counts=True)
+    ending_texts = [Outcome(int(code)) for code in codes]
     print_table(
         "Outcomes",
         (
-            (f"{count:,}", f"{100 * count / counts.sum():.1f} %", end.name, end.meaning)
-            for count, end in zip(counts, ends, strict=True)
+            (
+                f"{count:,}",
+                f"{100 * count / count_by_code.sum():.1f} %",
+                ending_text.name,
+                ending_text.meaning,
+            )
+            for count, ending_text in zip(count_by_code, ending_texts, strict=True)
         ),
         ("samples", "share", "outcome", "meaning"),
         ("samples", "share"),
@@ -240,18 +254,21 @@ def print_outcomes(scan: "xr.Dataset") -> None:
 
 def print_gait(
     params: "WheelParams",
-    result: Any,  # the step of any model
+    result: Any,  # `result` is the step of any model.
     start: "ArrayLike | tuple[float, ...]",
     n_walked: int,
     cycle: "LimitCycle | ReturnMapCycle",
 ) -> None:
-    """Print a wheel, the last step of its walk, from the state `start`, and its limit cycle."""
+    """Print a wheel, the last step of its walk, which began at the state `start`, and its limit
+    cycle.
+    """
     import numpy as np
 
     from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
 
     parameter_texts = [
-        f"{name} {float(getattr(params, name)):g} {d.unit}" for name, d in PARAMETER_DOMAINS.items()
+        f"{name} {float(getattr(params, name)):g} {difference.unit}"
+        for name, difference in PARAMETER_DOMAINS.items()
     ]
     stdout_console.print(
         "[bold]Wheel[/]  " + ", ".join(parameter_texts) + f", {params.n_legs} legs"
@@ -268,7 +285,8 @@ def print_gait(
             f"[bold]Step {n_walked + 1} ended as {outcome.name}:[/] {outcome.meaning}"
         )
     _print_cycle(cycle)
-    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():  # the paper's model
+    # This is a cycle of the paper's model.
+    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():
         _print_margins(result)
 
 
@@ -293,13 +311,13 @@ def _print_cycle(cycle: "LimitCycle | ReturnMapCycle") -> None:
     from vrw_jax.wheel import Outcome
 
     if not bool(cycle.found):
-        end = Outcome(int(cycle.outcome))
-        stdout_console.print(f"[bold]Limit cycle[/]  {end.name}: {end.meaning}")
+        ending_text = Outcome(int(cycle.outcome))
+        stdout_console.print(f"[bold]Limit cycle[/]  {ending_text.name}: {ending_text.meaning}")
         return
-    radius, multipliers = format_multipliers(np.asarray(cycle.monodromy_value))
-    verdict = "stable" if radius < 1.0 else "unstable"
+    spectral_radius, multipliers = format_multipliers(np.asarray(cycle.monodromy_value))
+    stability_text = "stable" if spectral_radius < 1.0 else "unstable"
     stdout_console.print(
-        f"[bold]Limit cycle[/]  {verdict}: multipliers {multipliers}; period "
+        f"[bold]Limit cycle[/]  {stability_text}: multipliers {multipliers}; period "
         f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
         f"DLS {100 * float(cycle.dls_fraction):.2f} %."
     )
@@ -315,15 +333,17 @@ def _print_margins(result: "StepResult") -> None:
     for name, measure in MARGIN_MEASURES.items():
         values = np.atleast_1d(np.asarray(getattr(result.margins, name)))
         least_margin, label = float(values.min()), measure.long_name
-        mark = "[green]holds[/]" if least_margin >= 0.0 else "[bold red]broken[/]"
+        violation_mark = "[green]holds[/]" if least_margin >= 0.0 else "[bold red]broken[/]"
         if measure.dimension and least_margin < 0.0:
             legs = [str(leg + 3) for leg in np.flatnonzero(values < 0.0)]
             label += f" (broken at legs {', '.join(legs)})"
-        rows.append((mark, label, measure.symbol, f"{least_margin:.4g}", measure.display_unit))
+        rows.append(
+            (violation_mark, label, measure.symbol, f"{least_margin:.4g}", measure.display_unit)
+        )
     headings = ("", "margin of", "symbol", "least", "unit")
     print_table("Margins of the paper's model", rows, headings, ("least",))
-    n, n_broken = len(rows), sum("broken[" in mark for mark, *_ in rows)
+    n_margins, n_violated = len(rows), sum("broken[" in mark for mark, *_ in rows)
     stdout_console.print(
-        f"{n - n_broken} of {n} margins hold, {n_broken} are broken. The model walks on "
-        "regardless: it measures what it does not model."
+        f"{n_margins - n_violated} of {n_margins} margins hold, {n_violated} are broken. The model "
+        "walks on regardless: it measures what it does not model."
     )

@@ -1,4 +1,4 @@
-"""Spelling of characters that the encoding of a terminal lacks, such as ASCII or cp1252."""
+"""Replacement of characters that the encoding of a terminal lacks, such as ASCII or cp1252."""
 
 import codecs
 import io
@@ -14,11 +14,11 @@ ASCII_SPELLINGS = {
     "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'", "“": '"', "”": '"',
     "§": "section ",
 }  # fmt: skip
-"""Spellings of the characters that commands print beside ASCII."""
+"""Replacements of the characters beyond ASCII that commands print."""
 
 
 def spell_unencodable_characters() -> None:
-    """Make standard output and standard error spell the characters that their encoding lacks."""
+    """Make standard output and standard error replace the characters that their encoding lacks."""
     codecs.register_error(ERROR_HANDLER_NAME, _spell_unencodable)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -32,17 +32,19 @@ def format_for_encoding(text: str, encoding: str) -> str:
 
 
 def _spell_unencodable(error: UnicodeError) -> tuple[str, int]:
-    """Return the spelling of characters that an encoding lacks, and the index behind them."""
+    """Return the replacement of characters that an encoding lacks, and the index after them."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     return "".join(map(_spell_in_ascii, error.object[error.start : error.end])), error.end
 
 
 def _spell_in_ascii(character: str) -> str:
-    """Return a character in ASCII: its spelling, or the spellings of its parts."""
+    """Return a character in ASCII: its replacement, or those of the characters of which it is
+    composed.
+    """
     if character.isascii() or character in ASCII_SPELLINGS:
         return ASCII_SPELLINGS.get(character, character)
-    parts = unicodedata.normalize("NFKD", character)
-    if parts == character:
+    decomposed_characters = unicodedata.normalize("NFKD", character)
+    if decomposed_characters == character:
         return "" if unicodedata.combining(character) else "?"
-    return "".join(map(_spell_in_ascii, parts))
+    return "".join(map(_spell_in_ascii, decomposed_characters))

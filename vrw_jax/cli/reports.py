@@ -1,4 +1,4 @@
-"""Files that commands write into a folder: labelled data, tables, a summary, figures."""
+"""Files that commands write into a folder: labeled data, tables, a summary, figures."""
 
 import csv
 import io
@@ -28,7 +28,9 @@ def write_scan(scan: xr.Dataset, folder: Path) -> list[Path]:
 
 
 def write_tuning(result: TuneResult, folder: Path, draws_figure: bool = True) -> list[Path]:
-    """Write everything about a tuned gait into `folder`, and return the paths."""
+    """Write data, summary, config and figure of a tuned gait into `folder`, and return the
+    paths.
+    """
     texts = {"wheel.toml": _format_wheel_toml(result), "summary.md": format_tuning_summary(result)}
     paths = _write_files(folder, "path.zarr", result.path, texts)
     return paths + (
@@ -37,7 +39,7 @@ def write_tuning(result: TuneResult, folder: Path, draws_figure: bool = True) ->
 
 
 def write_branch(branch: Branch, folder: Path, draws_figure: bool = True) -> list[Path]:
-    """Write everything about a branch into `folder`, and return the paths."""
+    """Write data, table, summary and figure of a branch into `folder`, and return the paths."""
     texts = {
         "borders.csv": _format_special_points_csv(branch),
         "summary.md": format_branch_summary(branch),
@@ -50,7 +52,9 @@ def write_branch(branch: Branch, folder: Path, draws_figure: bool = True) -> lis
 
 
 def write_map(special_points: SpecialPointMap, folder: Path) -> list[Path]:
-    """Write a map of special points into `folder`: text, table and figure; return the paths."""
+    """Write text, table and figure of a map of special points into `folder`, and return the
+    paths.
+    """
     scan, curves, _ = special_points
     parameter_names = tuple(map(str, scan.outcome.dims))
     rows = [
@@ -77,7 +81,7 @@ def _write_files(
 
 
 def _format_wheel_toml(result: TuneResult) -> str:
-    """Return a config of the tuned wheel."""
+    """Return a config of the tuned wheel as TOML text."""
     lines = [
         f"# Tuned: {result.objective} {result.value:.6g}. Walk it with `vrw gait`.",
         "",
@@ -93,8 +97,12 @@ def _format_wheel_toml(result: TuneResult) -> str:
 def format_tuning_summary(result: TuneResult) -> str:
     """Return the summary of a tuning run in Markdown."""
     active_rows = [
-        (a.name, get_measure(a.name).format_with_unit(a.limit), f"{a.price:.4g}")
-        for a in result.active
+        (
+            active_constraint.name,
+            get_measure(active_constraint.name).format_with_unit(active_constraint.limit),
+            f"{active_constraint.price:.4g}",
+        )
+        for active_constraint in result.active
     ]
     parameter_rows = [
         (name, f"{float(result.path[name][0]):.6g}", f"{float(getattr(result.params, name)):.6g}",
@@ -118,21 +126,21 @@ def format_tuning_summary(result: TuneResult) -> str:
 
 def _format_special_points_csv(branch: Branch) -> str:
     """Return the table of the special points of a branch as CSV."""
-    text = io.StringIO(newline="")
-    rows = csv.writer(text)
+    quote_text = io.StringIO(newline="")
+    rows = csv.writer(quote_text)
     rows.writerow([branch.parameter, "kind", "name", "ends_branch", "spectral_radius"])
     for special_point in branch.special_points:
-        radius = f"{special_point.point.spectral_radius:.9g}"
+        spectral_radius = f"{special_point.point.spectral_radius:.9g}"
         rows.writerow(
             [
                 f"{special_point.value:.12g}",
                 special_point.kind,
                 special_point.name,
                 special_point.ends_branch,
-                radius,
+                spectral_radius,
             ]
         )
-    return text.getvalue()
+    return quote_text.getvalue()
 
 
 def format_branch_summary(branch: Branch) -> str:
@@ -141,7 +149,10 @@ def format_branch_summary(branch: Branch) -> str:
     lines = [f"# Branch along {branch.parameter}", "", first_line, ""]
     if not branch.values.size:
         return "\n".join(lines)
-    radius, dls_fraction = branch.dataset.spectral_radius.values, branch.dataset.dls_fraction.values
+    spectral_radius, dls_fraction = (
+        branch.dataset.spectral_radius.values,
+        branch.dataset.dls_fraction.values,
+    )
     rows = []
     for special_point in branch.special_points:
         kind = special_point.kind.replace("_", " ")
@@ -151,8 +162,8 @@ def format_branch_summary(branch: Branch) -> str:
     return "\n".join([
         *lines,
         *(f"- at {branch.values[i]:.6g}: {branch.ends[i]}" for i in (0, -1)),
-        f"- spectral radius {radius.min():.4f} to {radius.max():.4f}, DLS fraction "
-        f"{dls_fraction.min():.4f} to {dls_fraction.max():.4f}",
+        f"- spectral radius {spectral_radius.min():.4f} to {spectral_radius.max():.4f}, DLS "
+        f"fraction {dls_fraction.min():.4f} to {dls_fraction.max():.4f}",
         f"- walked, every gait repeats within {np.max(branch.dataset.closure.values):.1e}",
         "",
         *format_markdown_table((branch.parameter, "kind", "name", "what happens there"), rows),

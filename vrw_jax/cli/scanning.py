@@ -50,15 +50,17 @@ def verify_store(plan: "ScanPlan", store: Path) -> None:
             "these again."
         )
         raise typer.Exit(ExitCode.CHECK_FAILED)
-    n, missing = plan.layout.n_chunks, len(zarr_store.find_missing_chunks())
+    n_chunks, missing_chunks = plan.layout.n_chunks, len(zarr_store.find_missing_chunks())
     state_text = (
-        f"lacks {missing:,} of {n:,} chunks, the others are" if missing else "is complete and"
+        f"lacks {missing_chunks:,} of {n_chunks:,} chunks, the others are"
+        if missing_chunks
+        else "is complete and"
     )
     stdout_console.print(f"{store} {state_text} sound.", highlight=False, soft_wrap=True)
 
 
 def compute_scan(plan: "ScanPlan", store: Path, dask: str | None) -> "xr.Dataset":
-    """Compute the chunks that the store lacks, with a progress bar, and return its dataset."""
+    """Compute the chunks that the store lacks, with a progress bar, and return the dataset."""
     from vrw_jax.scans import open_or_create_store, resolve_executor, run_scan
 
     interruption_message = f"stopped; what is done stays in {store}, run the same to go on."
@@ -69,7 +71,7 @@ def compute_scan(plan: "ScanPlan", store: Path, dask: str | None) -> "xr.Dataset
         elif not zarr_store.find_missing_chunks():
             stdout_console.print(f"{store} is complete: nothing to compute.", highlight=False)
             return zarr_store.load_dataset()
-        with printing.make_progress_bar("scan") as bar:
-            task = bar.add_task("compiling", total=None, note="")
-            report = printing.make_scan_reporter(bar.update, task)
+        with printing.make_progress_bar("scan") as progress_bar:
+            task = progress_bar.add_task("compiling", total=None, note="")
+            report = printing.make_scan_reporter(progress_bar.update, task)
             return run_scan(plan, zarr_store, on_progress=report, executor=executor)
