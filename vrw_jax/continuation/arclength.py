@@ -23,7 +23,7 @@ from vrw_jax.numerics import Scalar, StatusCode, batch_sizes, tree_where, value_
 from vrw_jax.validation import (
     check_int,
     check_positive,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 
 Unknowns = Any
@@ -31,7 +31,7 @@ Unknowns = Any
 SectionVector = Float[Array, " n"]
 
 
-@refuse_renamed_arguments(
+@raise_for_renamed_arguments(
     first_step="initial_ds",
     largest_step="max_ds",
     smallest_step="min_ds",

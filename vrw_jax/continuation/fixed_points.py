@@ -19,7 +19,7 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     check_reals,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 
 
@@ -86,7 +86,7 @@ needs.
 """
 
 
-@refuse_renamed_arguments(iterations="max_iterations")
+@raise_for_renamed_arguments(iterations="max_iterations")
 def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],

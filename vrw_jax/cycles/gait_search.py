@@ -42,7 +42,7 @@ from vrw_jax.validation import (
     check_real,
     check_type,
     is_traced,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
 
@@ -111,7 +111,7 @@ def limit_cycle(
 
 
 @with_default_settings
-@refuse_renamed_arguments(lost="on_failure")
+@raise_for_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
     *,

@@ -16,7 +16,7 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     check_reals,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 
 SolverName = Literal[
@@ -57,7 +57,7 @@ def _int_field(name: str, default: int) -> Any:
     return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
 
 
-@refuse_renamed_arguments(
+@raise_for_renamed_arguments(
     first_step="dt0",
     event_steps="max_event_iterations",
     monitor_steps="max_margin_search_iterations",

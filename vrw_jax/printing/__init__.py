@@ -1,4 +1,4 @@
-"""Text and tables of results."""
+"""Texts and tables of results."""
 
 from vrw_jax.printing.text import (
     AbstractPrintable,

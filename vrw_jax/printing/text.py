@@ -27,7 +27,7 @@ class AbstractPrintable(eqx.Module):
 
     @abc.abstractmethod
     def summary_rows(self) -> list[TextRow]:
-        """Return the names and texts to print, one pair per line."""
+        """Return the pairs (name, text) to print, one per line."""
 
     @property
     def title(self) -> str:
@@ -50,7 +50,7 @@ class AbstractPrintable(eqx.Module):
 
 
 def format_quantity(value: object, unit: str) -> str:
-    """Return a number with its unit, or the count and range of several numbers."""
+    """Return a number with its unit as text; of several numbers, their count and range."""
     values, unit = np.asarray(value), "" if unit == "1" else unit
     if values.ndim == 0:
         return f"{float(values):.6g} {unit}".strip()
@@ -59,17 +59,18 @@ def format_quantity(value: object, unit: str) -> str:
 
 
 def format_outcome_counts(outcomes: Any, status_class: type[enum.IntEnum]) -> str:
-    """Return the number of outcomes, their shape, and the count of each outcome."""
-    n, shape = np.size(outcomes), np.shape(outcomes)
+    """Return a text with the number of outcomes, their shape, and the count of each outcome."""
+    n_outcomes, shape = np.size(outcomes), np.shape(outcomes)
     codes, counts = np.unique(np.asarray(outcomes), return_counts=True)
     count_texts = (
-        f"{count:,} {status_class(int(c)).name}" for c, count in zip(codes, counts, strict=True)
+        f"{count:,} {status_class(int(status_code)).name}"
+        for status_code, count in zip(codes, counts, strict=True)
     )
-    return f"{n:,} in shape {shape}: {', '.join(count_texts)}"
+    return f"{n_outcomes:,} in shape {shape}: {', '.join(count_texts)}"
 
 
 def describe_elements(describe: Callable[..., str], *values: Any) -> Any:
-    """Return the text of numbers; for a batch, an array of the texts of its elements."""
+    """Return the text of numbers; for a batch, an array with the text of each element."""
     return np.vectorize(describe, otypes=[object])(*values)[()]
 
 
@@ -79,12 +80,12 @@ def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> Any:
 
 
 def format_text(title: str, rows: Iterable[TextRow]) -> str:
-    """Return a title and indented rows as text."""
+    """Return a title and indented rows as one text."""
     return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])
 
 
 def format_html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> str:
-    """Return the rows as a table for a notebook; the first cell of each row is its header."""
+    """Return the rows as an HTML table; the first cell of each row is its header."""
     format_cell = lambda kind, text: f"<{kind} style='text-align:left'>{escape(text)}</{kind}>"
     lines = ["".join(format_cell("th", text) for text in header)] if header else []
     lines += [
@@ -134,5 +135,5 @@ def _format_token(match: re.Match[str]) -> str:
 
 
 def format_numbers(values: object) -> str:
-    """Return numbers separated by commas."""
-    return ", ".join(f"{v:.5g}" for v in np.ravel(np.asarray(values)))
+    """Return numbers as text, separated by commas."""
+    return ", ".join(f"{value:.5g}" for value in np.ravel(np.asarray(values)))

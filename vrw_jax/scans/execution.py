@@ -39,7 +39,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_callable, check_type, refuse_renamed_arguments
+from vrw_jax.validation import check_callable, check_type, raise_for_renamed_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -57,7 +57,7 @@ class ScanProgress:
 
 
 @with_default_settings
-@refuse_renamed_arguments(report="on_progress")
+@raise_for_renamed_arguments(report="on_progress")
 def scan(
     design: AbstractDesign,
     measures: Iterable[str] | None = None,

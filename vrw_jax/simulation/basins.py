@@ -23,7 +23,7 @@ from vrw_jax.validation import (
     check_not_traced,
     check_reals,
     check_type,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 
@@ -38,7 +38,7 @@ StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 
 
 @with_default_settings
-@refuse_renamed_arguments(most_steps="max_steps", longest_period="max_period")
+@raise_for_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,
     grid: StartGrid,

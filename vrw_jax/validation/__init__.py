@@ -1,5 +1,4 @@
-"""Checks of arguments, each with one sentence for what was given, what is allowed and what to
-do."""
+"""Checks of arguments, whose messages state what was given, what is allowed and what to do."""
 
 from vrw_jax.validation.checks import (
     check_bool,
@@ -22,6 +21,6 @@ from vrw_jax.validation.checks import (
 from vrw_jax.validation.renamed import (
     RENAMED_IN_PACKAGE,
     describe_renamed,
-    refuse_renamed_arguments,
-    refuse_renamed_numerics,
+    raise_for_renamed_arguments,
+    raise_for_renamed_numerics,
 )

@@ -19,22 +19,22 @@ from jaxtyping import Array
 MAX_INTEGER = np.iinfo(np.int64).max
 """Largest accepted integer, chosen because arrays use 64-bit indices."""
 
-_state = {"is_forked": False}
-"""Whether this process is a fork of a process in which JAX had made an array."""
+_process_state = {"is_forked": False}
+"""Whether this process was forked from a process in which JAX had made an array."""
 
 
-def _note_fork() -> None:
-    """Record, in a child made by fork, whether JAX's threads are missing."""
-    _state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
+def _record_fork() -> None:
+    """Record, in a child process made by fork, whether JAX's threads are missing."""
+    _process_state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
 
 
 if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    os.register_at_fork(after_in_child=_note_fork)
+    os.register_at_fork(after_in_child=_record_fork)
 
 
-def refuse_fork() -> None:
-    """Raise a RuntimeError in a forked child, which would wait for JAX's missing threads."""
-    if _state["is_forked"]:
+def raise_if_forked() -> None:
+    """Raise a RuntimeError in a forked process, in which JAX would wait for missing threads."""
+    if _process_state["is_forked"]:
         raise RuntimeError(
             "this process was forked after JAX had made an array, and JAX's threads are not copied,"
             " so that it would wait for ever: start processes with "
@@ -43,13 +43,15 @@ def refuse_fork() -> None:
 
 
 def suggest_name(name: object, allowed_names: Iterable[str]) -> str:
-    """Return ' (did you mean ...?)' if a similar name is allowed, otherwise ''."""
+    """Return ' (did you mean ...?)' if a similar name is allowed, otherwise an empty text."""
     close_matches = difflib.get_close_matches(str(name), list(allowed_names), n=1, cutoff=0.5)
     return f" (did you mean '{close_matches[0]}'?)" if close_matches else ""
 
 
 def check_known_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
-    """Raise a ValueError unless a name is one of those allowed: "'dampng' is no parameter ..."."""
+    """Raise a ValueError unless the name is one of those allowed, as in "'dampng' is no
+    parameter ...".
+    """
     if not isinstance(name, str) or name not in allowed_names:
         allowed_text = ", ".join(allowed_names)
         raise ValueError(
@@ -59,12 +61,13 @@ def check_known_name(name: Any, allowed_names: Sequence[str], description: str) 
 
 
 def format_value(value: object) -> str:
-    """Return a value as text for a message: its repr if short, otherwise its type."""
+    """Return a value as text for a message: its repr if that is short, otherwise its type."""
     if isinstance(value, jax.Array | np.ndarray) and np.ndim(value):
         return f"an array of shape {np.shape(value)}"
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # A foreign object may raise anything, an integer be too long to print.
+    # The repr of a foreign object may raise any error, and an integer may be too long to print.
+    except Exception:
         return f"a {type(value).__name__}"
     if len(text) <= 60:
         return text
@@ -72,7 +75,7 @@ def format_value(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a value is one real number, which True and False are not."""
+    """Return whether a value is one real number; True and False are none."""
     if isinstance(value, int) and not isinstance(value, bool):
         return True
     dtype_kind = (
@@ -85,7 +88,7 @@ def _is_number(value: object) -> bool:
 
 def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> int:
     """Return an integer of at least `min_value`; `reason` is a clause that explains this limit."""
-    refuse_fork()
+    raise_if_forked()
     is_number = _is_number(value) and not isinstance(value, jax.core.Tracer)
     is_whole = is_number and (isinstance(value, int) or np.asarray(value).dtype.kind in "iu")
     if is_whole and int(value) > MAX_INTEGER:
@@ -103,8 +106,8 @@ def check_int(name: str, value: Any, min_value: int = 1, reason: str = "") -> in
 
 
 def check_real(name: str, value: Any) -> float:
-    """Return one finite number as a float."""
-    refuse_fork()
+    """Return one finite number as a float; raise an error if the value is none."""
+    raise_if_forked()
     if not _is_number(value) or isinstance(value, jax.core.Tracer):
         raise TypeError(
             f"{name} is {format_value(value)}, but it is one real number: give it as a float."
@@ -119,7 +122,7 @@ def check_real(name: str, value: Any) -> float:
 
 
 def check_positive(name: str, value: Any) -> float:
-    """Return one positive number as a float."""
+    """Return one positive number as a float; raise an error if the value is none."""
     if not check_real(name, value) > 0.0:
         raise ValueError(
             f"{name} is {float(value):g}, but it must be positive: give a number above 0."
@@ -128,40 +131,41 @@ def check_positive(name: str, value: Any) -> float:
 
 
 def check_range(name: str, bounds: Any) -> tuple[float, float]:
-    """Return a lower and an upper bound as floats."""
+    """Return a lower and an upper bound as floats; raise an error if the value has no such form."""
     try:
-        low, high = bounds
+        lower_bound, upper_bound = bounds
     except (TypeError, ValueError):
         raise TypeError(
             f"{name} is {format_value(bounds)}, but it is a lower and an upper bound: write "
             f"(lower, upper)."
         ) from None
-    low, high = (
-        check_real(f"the lower end of {name}", low),
-        check_real(f"the upper end of {name}", high),
+    lower_bound, upper_bound = (
+        check_real(f"the lower end of {name}", lower_bound),
+        check_real(f"the upper end of {name}", upper_bound),
     )
-    if not low < high:
+    if not lower_bound < upper_bound:
         raise ValueError(
-            f"{name} is ({low:g}, {high:g}), which holds nothing: give a lower one below the upper."
+            f"{name} is ({lower_bound:g}, {upper_bound:g}), which holds nothing: give "
+            "a lower one below the upper."
         )
-    return low, high
+    return lower_bound, upper_bound
 
 
 def check_reals(name: str, value: Any, advice: str = "give a number, or an array of them") -> Array:
-    """Return real numbers of any shape as a strongly typed array.
+    """Return real numbers of any shape as a strongly typed JAX array.
 
     Python's numbers get JAX's default type.
     """
-    refuse_fork()
+    raise_if_forked()
     try:
         if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
-            # jnp.asarray compiles a program for each shape. The copy keeps its values if the
+            # jnp.asarray would compile a program for each shape. The copy keeps its values if the
             # caller changes the array.
             return jax.device_put(value.copy())
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
-    except Exception:  # A foreign object may raise anything.
+    except Exception:  # The conversion of a foreign object may raise any error.
         _check_device()  # The first array of a process may fail because there is no device.
         array = None
     if array is None or not (
@@ -176,8 +180,8 @@ def check_reals(name: str, value: Any, advice: str = "give a number, or an array
 def check_numpy_reals(
     name: str, value: Any, advice: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """Return known real numbers as a NumPy array; a valid array is returned as it is."""
-    refuse_fork()
+    """Return real numbers as a NumPy array; a valid array is returned unchanged."""
+    raise_if_forked()
     if isinstance(value, np.ndarray) and value.dtype == jax.dtypes.canonicalize_dtype(float):
         return value
     return np.asarray(check_reals(name, value, advice))
@@ -187,7 +191,8 @@ def _check_device() -> None:
     """Raise an OSError if JAX finds no device."""
     try:
         jax.devices()
-    except (RuntimeError, AssertionError) as error:  # A plugin asserts if its device is missing.
+    # A plugin raises an AssertionError if its device is missing.
+    except (RuntimeError, AssertionError) as error:
         requested = os.environ.get("JAX_PLATFORMS")
         raise OSError(
             f"JAX_PLATFORMS is {requested!r}, but JAX finds no device of that kind: unset it, "
@@ -197,16 +202,16 @@ def _check_device() -> None:
 
 
 def check_bool(name: str, value: Any) -> bool:
-    """Return a Python bool."""
-    refuse_fork()
+    """Return a Python bool; raise a TypeError if the value is none."""
+    raise_if_forked()
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} is {format_value(value)}, but it is a choice: give True or False.")
     return bool(value)
 
 
 def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
-    """Return one of several words."""
-    refuse_fork()
+    """Return one of several names; raise an error if the value is none of them."""
+    raise_if_forked()
     if not isinstance(value, str):
         raise TypeError(
             f"{name} is {format_value(value)}, but it is a word: give '{allowed_names[0]}', say."
@@ -219,21 +224,21 @@ def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
     return value
 
 
-def check_names(name: str, value: Any, such_as: str = '"dls_fraction"') -> tuple[str, ...]:
+def check_names(name: str, value: Any, example: str = '"dls_fraction"') -> tuple[str, ...]:
     """Return several names as a tuple; a single name may be given as a string."""
-    refuse_fork()
+    raise_if_forked()
     try:
         values = (value,) if isinstance(value, str) else tuple(value)
     except Exception:  # The value is no collection, an array without axes, or a tracer.
         values = (None,)
     if not all(isinstance(name, str) for name in values):
-        raise TypeError(f"{name} is {format_value(value)}, but it holds names: write [{such_as}].")
+        raise TypeError(f"{name} is {format_value(value)}, but it holds names: write [{example}].")
     return values
 
 
 def check_type(name: str, value: Any, expected_type: type | tuple[type, ...], advice: str) -> None:
     """Raise a TypeError unless a value has the expected type."""
-    refuse_fork()
+    raise_if_forked()
     if not isinstance(value, expected_type):
         type_name = (
             expected_type[0] if isinstance(expected_type, tuple) else expected_type
@@ -258,8 +263,10 @@ def is_traced(*trees: Any) -> bool:
 
 
 def check_not_traced(function: str, alternative: str, *trees: Any) -> None:
-    """Raise a TypeError inside `jit`, `vmap` or `grad`, for a function that runs on the host."""
-    refuse_fork()
+    """Raise a TypeError inside `jit`, `vmap` or `grad`, for a function that needs concrete
+    values.
+    """
+    raise_if_forked()
     if is_traced(*trees):
         raise TypeError(
             f"{function} is called inside jit, vmap or grad, but it runs on known numbers: call it "

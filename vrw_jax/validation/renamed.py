@@ -1,4 +1,4 @@
-"""Public names of version 0.1: each is refused in one sentence that gives the present name."""
+"""Public names of version 0.1; the use of one raises an error that gives the present name."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ RENAMED_IN_PACKAGE = {
     "newton_cycle": "solve_fixed_point",
     "steps": "step_batch",
 }
-"""Names of `vrw_jax`."""
+"""Old names of `vrw_jax`, each with the present one."""
 
 RENAMED_IN_NUMERICS = {
     "AbstractFollowed": "vrw_jax.continuation.AbstractContinuationProblem",
@@ -42,10 +42,10 @@ RENAMED_IN_NUMERICS = {
     "volume_change": "vrw_jax.hybrid.flow_jacobian_determinant",
     "walk": "vrw_jax.hybrid.simulate_hybrid",
 }
-"""Names of `vrw_jax.numerics`."""
+"""Old names of `vrw_jax.numerics`, each with the present one."""
 
 
-def refuse_renamed_numerics(name: str) -> Any:
+def raise_for_renamed_numerics(name: str) -> Any:
     """Raise the AttributeError of `vrw_jax.numerics` for a name that it does not have."""
     hint = f": it is called {RENAMED_IN_NUMERICS[name]} now" if name in RENAMED_IN_NUMERICS else ""
     raise AttributeError(f"vrw_jax.numerics has no {name!r}{hint}.")
@@ -55,31 +55,32 @@ FunctionType = TypeVar("FunctionType", bound=Callable)
 
 
 def describe_renamed(module: str, name: str, renamed: Mapping[str, str]) -> str | None:
-    """Return the sentence about a name that was renamed, or None."""
+    """Return a sentence with the present name of a renamed attribute, or None."""
     if name not in renamed:
         return None
     return f"{module} has no {name!r}: it is called {renamed[name]} now."
 
 
-def refuse_renamed_arguments(**renamed: str) -> Callable[[FunctionType], FunctionType]:
-    """Return a decorator that refuses old keyword arguments of a function or a class.
+def raise_for_renamed_arguments(**renamed: str) -> Callable[[FunctionType], FunctionType]:
+    """Return a decorator that makes old keyword arguments of a function or class raise a TypeError.
 
-    `renamed`: old names with the present ones. The decorated function raises a TypeError for an
-    old name, in one sentence that gives the present one.
+    `renamed` maps old names to the present ones. The message gives the present name.
     """
 
-    def check_keywords(owner: str, keywords: Mapping[str, Any]) -> None:
-        for old in renamed.keys() & keywords.keys():
-            raise TypeError(f"{owner} has no argument {old!r}: it is called {renamed[old]} now.")
+    def check_keywords(owner_name: str, keywords: Mapping[str, Any]) -> None:
+        for old_name in renamed.keys() & keywords.keys():
+            raise TypeError(
+                f"{owner_name} has no argument {old_name!r}: it is called {renamed[old_name]} now."
+            )
 
     def decorate(function: Any) -> Any:
         if isinstance(function, type):
-            initialize = function.__init__  # type: ignore[misc]
+            original_init = function.__init__  # type: ignore[misc]
 
-            @functools.wraps(initialize)
+            @functools.wraps(original_init)
             def checked_init(self: Any, *args: Any, **keywords: Any) -> None:
                 check_keywords(function.__name__, keywords)
-                initialize(self, *args, **keywords)
+                original_init(self, *args, **keywords)
 
             function.__init__ = checked_init  # type: ignore[misc]
             return function

@@ -12,7 +12,7 @@ from vrw_jax.validation import (
     check_int,
     check_not_traced,
     check_type,
-    refuse_renamed_arguments,
+    raise_for_renamed_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
 
@@ -58,30 +58,32 @@ function render({ model, el }) {
 }
 export default { render };
 """
-"""JavaScript of the widget: it shows the page in a frame and exchanges changed values with it."""
+"""JavaScript of the widget, which shows the page in a frame and exchanges changed values with
+it.
+"""
 
 
 def find_page() -> Path:
     """Return the path of the page, inside an installed package or beside it."""
     package = Path(__file__).parents[1]
     return next(
-        p for p in (package / "wheel.html", package.parent / "docs/wheel.html") if p.exists()
+        candidate_path
+        for candidate_path in (package / "wheel.html", package.parent / "docs/wheel.html")
+        if candidate_path.exists()
     )
 
 
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
-    """Return the address of the page, opened at this wheel."""
+    """Return the address of the page, opened with this wheel."""
     default_values = _page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
-    values_of_wheel = _page_values(
+    page_values = _page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
     )
-    values = {
-        name: value for name, value in values_of_wheel.items() if value != default_values[name]
-    }
+    values = {name: value for name, value in page_values.items() if value != default_values[name]}
     return find_page().as_uri() + (f"#{urlencode(values)}" if values else "")
 
 
-@refuse_renamed_arguments(rung="model_name")
+@raise_for_renamed_arguments(rung="model_name")
 def explore(
     params: WheelParams | None = None,
     *,
@@ -137,7 +139,9 @@ def explore(
 
 @functools.cache
 def _make_widget_class() -> type:
-    """Return the class of the widget, created on first use because anywidget is optional."""
+    """Return the class of the widget, which is created on first use because anywidget is
+    optional.
+    """
     try:
         import anywidget
         import traitlets
@@ -169,7 +173,7 @@ def _make_widget_class() -> type:
 
         @property
         def friction(self) -> float:
-            """Return the friction coefficient."""
+            """Return the friction coefficient of the ground."""
             return float(self.values[FRICTION_NAME])
 
         @friction.setter
@@ -178,7 +182,7 @@ def _make_widget_class() -> type:
 
         @property
         def model_name(self) -> str:
-            """Return the name of the model."""
+            """Return the name of the model that is shown."""
             return str(self.values["rung"])
 
         @model_name.setter
@@ -192,7 +196,7 @@ def _make_widget_class() -> type:
 
 
 def _page_values(params: WheelParams, friction: float, model_name: str) -> dict[str, float | str]:
-    """Return the values that the page exchanges."""
+    """Return the values that the page exchanges: parameters, friction and model, by name."""
     numbers = {name: float(getattr(params, name)) for name in PARAMETER_DOMAINS}
     return {**numbers, FRICTION_NAME: friction, "n_legs": params.n_legs, "rung": model_name}
 
@@ -200,7 +204,7 @@ def _page_values(params: WheelParams, friction: float, model_name: str) -> dict[
 def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
     """Return a scan over two parameters in the format of the page's map.
 
-    Values that are not finite become None. Of the values of several legs the smallest is kept.
+    Values that are not finite become None. Of the values of several legs the smallest one is taken.
     """
     import xarray
 
@@ -213,20 +217,20 @@ def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
         )
-    plane = dataset.isel(
+    measure_values = dataset.isel(
         {name: 0 for name in dataset.sizes if name in PARAMETER_DOMAINS and name not in axes}
     )
     measures: dict[str, Any] = {}
-    for name, column in plane.data_vars.items():
-        other_dims = [dim for dim in column.dims if dim not in axes]
-        if column.dtype.kind == "f" and set(axes) <= set(column.dims):
-            worst_values = column.min(other_dims).transpose(*axes[::-1]).values
+    for name, values_of_column in measure_values.data_vars.items():
+        other_dims = [dim for dim in values_of_column.dims if dim not in axes]
+        if values_of_column.dtype.kind == "f" and set(axes) <= set(values_of_column.dims):
+            worst_values = values_of_column.min(other_dims).transpose(*axes[::-1]).values
             measures[str(name)] = [
                 [float(value) if math.isfinite(value) else None for value in row]
                 for row in worst_values.tolist()
             ]
     return {
-        "axes": [{"name": name, "values": plane[name].values.tolist()} for name in axes],
+        "axes": [{"name": name, "values": measure_values[name].values.tolist()} for name in axes],
         "measures": measures,
-        "outcome": plane["outcome"].transpose(*axes[::-1]).values.tolist(),
+        "outcome": measure_values["outcome"].transpose(*axes[::-1]).values.tolist(),
     }
