@@ -133,9 +133,9 @@ class AbstractContinuation(abc.ABC):
         """Return a name for the end of a branch from the first point beyond it."""
         return ADMISSIBLE_COLUMN
 
-    def is_same_gait(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+    def is_same_gait(self, table_before: QuantityTable, table_after: QuantityTable) -> np.ndarray:
         """Return whether each point beyond a jump belongs to the branch before the jump."""
-        return after[ADMISSIBLE_COLUMN] > 0.0
+        return table_after[ADMISSIBLE_COLUMN] > 0.0
 
     def describe_end(self, name: str, value: float) -> str:
         """Return a sentence about an end of a branch from the name of its special point and the

@@ -141,15 +141,15 @@ class GaitContinuation(AbstractContinuation):
             table["closure"] <= STATE_AGREEMENT_TOLERANCE
         )
 
-    def is_same_gait(self, before: QuantityTable, after: QuantityTable) -> np.ndarray:
+    def is_same_gait(self, table_before: QuantityTable, table_after: QuantityTable) -> np.ndarray:
         """Return whether period and step length are about equal before and after a jump, for
         each row.
         """
-        is_same = super().is_same_gait(before, after)
+        is_similar = super().is_same_gait(table_before, table_after)
         for name in ("period", "step_length"):
-            max_change = self.gait_options.max_jump_change * np.abs(before[name])
-            is_same &= np.abs(after[name] - before[name]) <= max_change
-        return is_same
+            max_change = self.gait_options.max_jump_change * np.abs(table_before[name])
+            is_similar &= np.abs(table_after[name] - table_before[name]) <= max_change
+        return is_similar
 
     def describe_end(self, name: str, value: float) -> str:
         if name != FRICTION_SURPLUS_COLUMN:

@@ -221,11 +221,11 @@ class CurveTracer(NamedTuple):
         """Return the seed at a special point of a branch."""
         cycle = special_point.cycle
         params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
-        first, second = (float(getattr(params, name)) for name in self.parameters)
+        first_value, second_value = (float(getattr(params, name)) for name in self.parameters)
         gait = BranchWheel(params, cycle.collocation_state.phase_active)
         z = cycle.collocation_state.solution
         name = name_special_point(special_point.name, gait, z, self.tracing_options)
-        return CurveSeed(name, (first, second), cycle.system, gait, z)
+        return CurveSeed(name, (first_value, second_value), cycle.system, gait, z)
 
     def trace_curves(
         self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]

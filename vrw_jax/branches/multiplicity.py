@@ -94,8 +94,8 @@ def evaluate_quantity(table: dict[str, np.ndarray], name: str) -> np.ndarray:
     """
     if name.startswith(CONTACT_ORDER_COLUMN + ":"):
         order = table[CONTACT_ORDER_COLUMN]
-        sign = np.where(order == int(name.split(":")[1]), 1.0, -1.0)
-        return np.where(np.isnan(order), np.nan, sign)
+        margin_sign = np.where(order == int(name.split(":")[1]), 1.0, -1.0)
+        return np.where(np.isnan(order), np.nan, margin_sign)
     if not name.startswith(MODULI_COLUMN + ":"):
         return table[name]
     first_rank, last_rank = map(int, name.split(":")[1:])

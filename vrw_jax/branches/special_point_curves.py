@@ -110,7 +110,7 @@ def continue_special_points(
 ) -> tuple[SpecialPointCurve, ...]:
     """Return `continue_special_point` of several special points."""
     parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
-    first, second = parameters
+    first_parameter, second_parameter = parameters
     check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
         raise ValueError(
@@ -136,15 +136,14 @@ def continue_special_points(
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:
         raise ValueError(
-            f"no special point {missing_names[0]!r} on branches along {first} and {second} "
-            f"within their "
-            f"bounds, but {', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to "
-            f"it, or wider "
+            f"no special point {missing_names[0]!r} on branches along {first_parameter} "
+            f"and {second_parameter} within their bounds, but "
+            f"{', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
             "bounds."
         )
     curves_by_name = {
-        traced_curves.curve.name: traced_curves.curve
-        for traced_curves in tracer.trace_curves([seeds_by_name[name] for name in names], ())
+        traced_curve.curve.name: traced_curve.curve
+        for traced_curve in tracer.trace_curves([seeds_by_name[name] for name in names], ())
     }
     lost_names = sorted(set(names) - set(curves_by_name))
     if lost_names:

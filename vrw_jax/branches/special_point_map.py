@@ -267,16 +267,16 @@ def find_unexplained_changes(
 
 
 def _select_distant_changes(
-    remaining: Sequence[UnexplainedChange],
-    examined: Sequence[UnexplainedChange],
+    remaining_changes: Sequence[UnexplainedChange],
+    examined_changes: Sequence[UnexplainedChange],
     options: MapOptions,
 ) -> list[UnexplainedChange]:
     """Return changes of each name that are distant from each other and from the examined ones."""
     selected_changes: list[UnexplainedChange] = []
-    for change in remaining:
+    for change in remaining_changes:
         changes_of_same_name = [
             other_change
-            for other_change in (*examined, *selected_changes)
+            for other_change in (*examined_changes, *selected_changes)
             if (other_change.name, other_change.axis) == (change.name, change.axis)
         ]
         if all(

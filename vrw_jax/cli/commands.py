@@ -216,14 +216,16 @@ def init(
         example_texts = {
             path.name: path.read_text(encoding="utf-8") for path in example_folder.glob("*.toml")
         }
-        existing = [folder / name for name in sorted(example_texts) if (folder / name).exists()]
-        for path in existing:
+        existing_paths = [
+            folder / name for name in sorted(example_texts) if (folder / name).exists()
+        ]
+        for path in existing_paths:
             if path.read_text(encoding="utf-8", errors="replace") != example_texts[path.name]:
                 raise ValueError(f"{path} is there already and differs: give another folder.")
         _require_writable(folder)
         folder.mkdir(parents=True, exist_ok=True)
         missing_names = [
-            folder / name for name in sorted(example_texts) if folder / name not in existing
+            folder / name for name in sorted(example_texts) if folder / name not in existing_paths
         ]
         for path in missing_names:
             path.write_text(example_texts[path.name], encoding="utf-8")
@@ -244,11 +246,11 @@ def find_example_configs() -> Path:
 
 def _require_writable(folder: Path) -> None:
     """Raise a ValueError if the folder cannot be written to; nothing is created."""
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
+    existing_folder = folder
+    while not existing_folder.exists():
+        existing_folder = existing_folder.parent
     try:
-        with tempfile.TemporaryDirectory(dir=existing):
+        with tempfile.TemporaryDirectory(dir=existing_folder):
             pass
     except OSError as error:
         raise ValueError(

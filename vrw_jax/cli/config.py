@@ -495,18 +495,18 @@ def _parse_axis(name: str, value: object) -> np.ndarray:
     return np.linspace(lower, upper, count)
 
 
-def _parse_list(name: str, value: object, alternative: str = "") -> np.ndarray:
+def _parse_list(name: str, value: object, alternative_text: str = "") -> np.ndarray:
     """Return a list of values in the domain of the parameter `name` as an array."""
     if not isinstance(value, list):
-        raise _make_error(name, value, f"a list of numbers{alternative}")
-    return np.asarray([_parse_parameter(name, item) for item in value])
+        raise _make_error(name, value, f"a list of numbers{alternative_text}")
+    return np.asarray([_parse_parameter(name, list_value) for list_value in value])
 
 
 def _parse_range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
     """Return lower and upper bound in the domain of `parameter`, by default `name` itself."""
     if not (isinstance(value, list) and len(value) == 2):
         raise _make_error(name, value, f"a range of two numbers: write {name} = [lower, upper]")
-    lower, upper = (_parse_parameter(parameter or name, item) for item in value)
+    lower, upper = (_parse_parameter(parameter or name, bound_value) for bound_value in value)
     return lower, upper
 
 

@@ -162,11 +162,17 @@ def print_table(
 
 def print_facts(facts: "list[Fact]", folder: Path) -> None:
     """Print the table of facts and how many hold."""
-    verdict = ("[bold red]does not hold[/]", "[green]holds[/]")
+    verdict_texts = ("[bold red]does not hold[/]", "[green]holds[/]")
     print_table(
         None,
         (
-            (fact.claim, fact.source, fact.published_value, fact.computed, verdict[fact.holds])
+            (
+                fact.claim,
+                fact.source,
+                fact.published_value,
+                fact.computed,
+                verdict_texts[fact.holds],
+            )
             for fact in facts
         ),
         ("fact", "where", "published", "found", ""),
@@ -342,7 +348,10 @@ def _print_margins(result: "StepResult") -> None:
         )
     headings = ("", "margin of", "symbol", "least", "unit")
     print_table("Margins of the paper's model", rows, headings, ("least",))
-    n_margins, n_violated = len(rows), sum("broken[" in mark for mark, *_ in rows)
+    n_margins, n_violated = (
+        len(rows),
+        sum("broken[" in violation_mark for violation_mark, *_ in rows),
+    )
     stdout_console.print(
         f"{n_margins - n_violated} of {n_margins} margins hold, {n_violated} are broken. The model "
         "walks on regardless: it measures what it does not model."

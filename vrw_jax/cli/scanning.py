@@ -73,5 +73,5 @@ def compute_scan(plan: "ScanPlan", store: Path, dask: str | None) -> "xr.Dataset
             return zarr_store.load_dataset()
         with printing.make_progress_bar("scan") as progress_bar:
             task = progress_bar.add_task("compiling", total=None, note="")
-            report = printing.make_scan_reporter(progress_bar.update, task)
-            return run_scan(plan, zarr_store, on_progress=report, executor=executor)
+            report_progress = printing.make_scan_reporter(progress_bar.update, task)
+            return run_scan(plan, zarr_store, on_progress=report_progress, executor=executor)

@@ -95,7 +95,7 @@ def lagrange_weights(location: float) -> np.ndarray:
     return np.prod(factors, axis=1)
 
 
-def mesh_transfer_matrix(source: PhaseMesh, target: PhaseMesh) -> np.ndarray:
+def mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -> np.ndarray:
     """Return the (target, source) matrix from node accelerations of one mesh to those of another.
 
     It is exact for accelerations that are cubic in each interval of the source.
@@ -104,14 +104,17 @@ def mesh_transfer_matrix(source: PhaseMesh, target: PhaseMesh) -> np.ndarray:
     def interval_ends(mesh: PhaseMesh) -> np.ndarray:
         return np.concatenate([[0.0], np.cumsum(mesh.interval_fractions)])
 
-    source_ends = interval_ends(source)
+    source_ends = interval_ends(source_mesh)
     times = (
-        interval_ends(target)[:-1, None] + target.interval_fractions[:, None] * GAUSS_NODES
+        interval_ends(target_mesh)[:-1, None]
+        + target_mesh.interval_fractions[:, None] * GAUSS_NODES
     ).ravel()
-    matrix = np.zeros((times.size, source.n_intervals * N_GAUSS_NODES))
+    matrix = np.zeros((times.size, source_mesh.n_intervals * N_GAUSS_NODES))
     for target_index, time in enumerate(times):
-        interval = int(np.clip(np.searchsorted(source_ends, time) - 1, 0, source.n_intervals - 1))
-        location = (time - source_ends[interval]) / source.interval_fractions[interval]
+        interval = int(
+            np.clip(np.searchsorted(source_ends, time) - 1, 0, source_mesh.n_intervals - 1)
+        )
+        location = (time - source_ends[interval]) / source_mesh.interval_fractions[interval]
         matrix[target_index, interval * N_GAUSS_NODES : (interval + 1) * N_GAUSS_NODES] = (
             lagrange_weights(location)
         )

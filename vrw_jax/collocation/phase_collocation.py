@@ -675,6 +675,6 @@ def estimate_mesh_error(
             max_fraction[:, None, None].astype(largest_jump.dtype)
             * solution.durations[:, None, None, i]
         )
-        jump = jnp.abs(left_limits - right_limits) * length * length
-        largest_jump = jnp.maximum(largest_jump, jnp.max(jump, axis=(0, 1, 2)))
+        acceleration_jump = jnp.abs(left_limits - right_limits) * length * length
+        largest_jump = jnp.maximum(largest_jump, jnp.max(acceleration_jump, axis=(0, 1, 2)))
     return error_per_jump * largest_jump

@@ -127,17 +127,21 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     larger_cube_root = jnp.cbrt(
         -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant)
     )
-    single_root = larger_cube_root - jnp.where(
+    unique_real_root = larger_cube_root - jnp.where(
         larger_cube_root == 0.0,
         0.0,
         p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
     )
     # Of three real roots, the extreme one on the isolated side is computed.
-    radius = 2.0 * _safe_sqrt(-p / 3.0)
-    cosine = -4.0 * q / jnp.where(radius == 0.0, 1.0, radius**3)
-    extreme_root = radius * jnp.cos(jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0)
+    trigonometric_radius = 2.0 * _safe_sqrt(-p / 3.0)
+    cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
+    extreme_root = trigonometric_radius * jnp.cos(
+        jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0
+    )
     z = mean_root + jnp.where(
-        has_three_real_roots, jnp.where(cosine >= 0.0, extreme_root, -extreme_root), single_root
+        has_three_real_roots,
+        jnp.where(cosine >= 0.0, extreme_root, -extreme_root),
+        unique_real_root,
     )
     for _ in range(3):
         value = a0 + z * (a1 + z * (a2 + z))
@@ -181,8 +185,8 @@ def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
 def _sort_by_modulus(values: Array) -> Array:
     """Return the eigenvalues sorted by modulus, the largest first."""
     modulus = jnp.square(values.real) + jnp.square(values.imag)
-    order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
-    return jnp.take_along_axis(values, order, -1)
+    descending_order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
+    return jnp.take_along_axis(values, descending_order, -1)
 
 
 @jax.jit
@@ -267,8 +271,12 @@ def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[A
     real_values = [*isolated_values, mean + real_offset, mean - real_offset]
     is_complex_pair = imaginary_offset > 0.0
     moduli = jnp.sort(jnp.abs(jnp.stack(real_values, -1)), -1)
-    is_real_tied = moduli[..., -1] - moduli[..., -2] <= tolerance
-    is_tied = jnp.where(is_complex_pair, imaginary_offset <= tolerance, is_real_tied)
+    has_equal_real_moduli = moduli[..., -1] - moduli[..., -2] <= tolerance
+    has_equal_moduli = jnp.where(
+        is_complex_pair, imaginary_offset <= tolerance, has_equal_real_moduli
+    )
     for x in isolated_values:
-        is_tied = is_tied | (is_complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance))
-    return is_tied
+        has_equal_moduli = has_equal_moduli | (
+            is_complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance)
+        )
+    return has_equal_moduli

@@ -79,12 +79,12 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
     p, sin, cos = _params_as_numpy(params), math.sin(params.leg_angle), math.cos(params.leg_angle)
     weight = (p.hub_mass + params.n_legs * p.leg_mass) * p.gravity * np.cos(p.slope)
     static_length_ratio = (p.natural_length - weight / p.stiffness) / p.locked_length
-    lengths = [
+    leg_lengths = [
         np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), cos + 0.02, 1.0)
         for contraction_share, _ in WALK_STARTS
     ]
-    thetas = [np.arctan((length - cos) / sin) for length in lengths]
-    return _section_states(params, thetas, [share for _, share in WALK_STARTS])
+    thetas = [np.arctan((length - cos) / sin) for length in leg_lengths]
+    return _make_section_states(params, thetas, [rate_share for _, rate_share in WALK_STARTS])
 
 
 def compute_fallback_starts(params: WheelParams) -> np.ndarray:
@@ -95,7 +95,7 @@ def compute_fallback_starts(params: WheelParams) -> np.ndarray:
         np.full(np.shape(params.slope), angle_share * params.leg_angle)
         for angle_share, _ in FALLBACK_STARTS
     ]
-    return _section_states(params, thetas, [share for _, share in FALLBACK_STARTS])
+    return _make_section_states(params, thetas, [rate_share for _, rate_share in FALLBACK_STARTS])
 
 
 def _params_as_numpy(params: WheelParams) -> Any:
@@ -103,7 +103,7 @@ def _params_as_numpy(params: WheelParams) -> Any:
     return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
 
-def _section_states(
+def _make_section_states(
     params: WheelParams, thetas: list[np.ndarray], rate_shares: list[float]
 ) -> np.ndarray:
     """Return section states with these angles, rad, and with rates as fractions of the rigid
@@ -122,8 +122,8 @@ def _section_states(
     angles_and_shares = zip(thetas, rate_shares, strict=True)
     return np.stack(
         [
-            np.stack([theta, share * rolling_rate, leg_rate], -1)
-            for theta, share in angles_and_shares
+            np.stack([theta, rate_share * rolling_rate, leg_rate], -1)
+            for theta, rate_share in angles_and_shares
         ]
     )
 

@@ -80,7 +80,7 @@ class CollocationSystem(NamedTuple):
     period_n: int
     options: CycleOptions
     stop_at_lift_off: bool = True  # whether the ground must push in an admissible gait
-    limits: SearchLimits = SEARCH_LIMITS
+    search_limits: SearchLimits = SEARCH_LIMITS
 
     @property
     def sequence(self) -> PhaseSequence:
@@ -176,8 +176,10 @@ def surface_start(
     """Return the gait that the stored surface predicts as a start; without DLS its duration is
     added to SLS-I.
     """
-    predicted = predict_gait(wheel_from_parameters(parameters, system.n_legs), system.meshes)
-    dls_duration, sls1_duration, sls2_duration = predicted.durations[0]
+    predicted_solution = predict_gait(
+        wheel_from_parameters(parameters, system.n_legs), system.meshes
+    )
+    dls_duration, sls1_duration, sls2_duration = predicted_solution.durations[0]
     durations = jnp.stack(
         [
             jnp.where(has_dls, dls_duration, 0.0),
@@ -185,11 +187,11 @@ def surface_start(
             sls2_duration,
         ]
     )
-    start = make_start(system, predicted.section_state, durations, has_dls)
+    start = make_start(system, predicted_solution.section_state, durations, has_dls)
     accelerations = tuple(
         jnp.broadcast_to(jnp.where(has_dls, acceleration, 0.0), template.shape)
         for acceleration, template in zip(
-            predicted.accelerations, start.solution.accelerations, strict=True
+            predicted_solution.accelerations, start.solution.accelerations, strict=True
         )
     )
     return start._replace(solution=start.solution._replace(accelerations=accelerations))
@@ -226,7 +228,7 @@ def init_search_flags(system: CollocationSystem, section: Array) -> tuple[Array,
     return zeros(), zeros(), zeros(system.period_n, n_ends)
 
 
-def reduce_over_lanes(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
+def reduce_all_but_lanes(combine: Callable[[Array, Array], Array], x: Array) -> LaneArray:
     """Return `x` reduced by `combine` over all axes but that of the lanes.
 
     The reduction goes by halves, because XLA's reduction runs along the wrong axis.
@@ -250,15 +252,17 @@ def collocation_correction_norm(
     """Return the largest entry of a correction, with accelerations weighted by their effect on
     positions.
     """
-    max_over_entries = functools.partial(reduce_over_lanes, jnp.maximum)
-    norm = jnp.maximum(
+    max_over_entries = functools.partial(reduce_all_but_lanes, jnp.maximum)
+    correction_norm = jnp.maximum(
         max_over_entries(jnp.abs(correction.section_state)),
         max_over_entries(jnp.abs(correction.durations)),
     )
     for phase_index, acceleration_change in enumerate(correction.accelerations):
         duration = max_over_entries(jnp.abs(solution.durations[:, phase_index]))
-        norm = jnp.maximum(norm, max_over_entries(jnp.abs(acceleration_change)) * duration**2)
-    return norm
+        correction_norm = jnp.maximum(
+            correction_norm, max_over_entries(jnp.abs(acceleration_change)) * duration**2
+        )
+    return correction_norm
 
 
 def _step_fraction(solution: CollocationSolution, correction: CollocationSolution) -> LaneArray:
@@ -281,7 +285,7 @@ def _step_fraction(solution: CollocationSolution, correction: CollocationSolutio
         ]
     )
     smallest_float = jnp.finfo(changes.dtype).tiny
-    step_fraction = reduce_over_lanes(
+    step_fraction = reduce_all_but_lanes(
         jnp.minimum, change_limits / jnp.maximum(jnp.abs(changes), smallest_float)
     )
     return jnp.minimum(1.0, step_fraction)
@@ -322,16 +326,16 @@ def run_newton(
     system: CollocationSystem,
     parameters: Parameters,
     start: CollocationState,
-    origin: Parameters,
+    initial_parameters: Parameters,
     homotopy_steps: Array,
     max_iterations: Array | int,
     is_pending: Bool[Array, " lanes"],
 ) -> SearchResult:
     """Run Newton's method with limited steps on the lanes of `is_pending`, and return the result.
 
-    During the first `homotopy_steps` iterations the parameters move from `origin` to their final
-    values. A lane stops when it converges, or when round-off keeps its corrections from decreasing.
-    Its result therefore does not depend on other lanes.
+    During the first `homotopy_steps` iterations the parameters move from `initial_parameters` to
+    their final values. A lane stops when it converges, or when round-off keeps its corrections from
+    decreasing. Its result therefore does not depend on other lanes.
     """
     options = system.options
     machine_epsilon = float(jnp.finfo(parameters.dtype).eps)
@@ -346,7 +350,9 @@ def run_newton(
         ).astype(parameters.dtype)
         is_at_target = homotopy_fraction >= 1.0
         current_parameters = jnp.where(
-            is_at_target, parameters, origin + homotopy_fraction * (parameters - origin)
+            is_at_target,
+            parameters,
+            initial_parameters + homotopy_fraction * (parameters - initial_parameters),
         )
         solution = newton_state.state.solution
         linearized_pass = system.linearize_at(current_parameters, newton_state.state)
@@ -355,7 +361,7 @@ def run_newton(
         is_finite = jnp.isfinite(correction_norm)
         step_fraction = _step_fraction(solution, correction)
         is_moving = newton_state.is_running & is_finite
-        replace_if_moving = lambda new, old: jnp.where(is_moving, new, old)
+        replace_if_moving = lambda new_value, old_value: jnp.where(is_moving, new_value, old_value)
 
         def apply_correction(x: Array, change: Array) -> Array:
             return jnp.where(is_moving, x + step_fraction * jnp.where(is_moving, change, 0.0), x)
@@ -455,7 +461,7 @@ def first_failed_check(
             ):
                 conditions.append(
                     ~phase_active[phase_index]
-                    | ((minimum > 0.0) & (end_guard > -system.limits.guard_tolerance))
+                    | ((minimum > 0.0) & (end_guard > -system.search_limits.guard_tolerance))
                 )
         conditions += [
             value > 0.0
@@ -471,7 +477,7 @@ def first_failed_check(
     carry = (solution.section_state, jnp.zeros(parameters.shape[-1:], parameters.dtype))
     (_, failed_check), _ = lax.scan(check_step, carry, inputs)
     is_resolved = (
-        estimate_mesh_error(sequence, system.meshes, solution) < system.limits.max_mesh_error
+        estimate_mesh_error(sequence, system.meshes, solution) < system.search_limits.max_mesh_error
     )
     return jnp.where((failed_check == 0.0) & ~is_resolved, float(MESH_CHECK_CODE), failed_check)
 
@@ -491,7 +497,7 @@ def _run_attempt(
     guess: CollocationState | None,
 ) -> SearchResult:
     """Run one attempt on the lanes that are without a cycle, and return the merged result."""
-    options, n_segments = system.options, system.limits.n_homotopy_segments
+    options, n_segments = system.options, system.search_limits.n_homotopy_segments
     table_1 = stack_parameters(WheelParams(n_legs=system.n_legs)).astype(parameters.dtype)
     max_iterations = dict.fromkeys(SEARCH_ATTEMPTS, options.max_newton_iterations) | {
         "guess": options.first_newton_iterations, "surface": options.first_newton_iterations
@@ -501,19 +507,21 @@ def _run_attempt(
     ] * (2 * n_segments)
     segment_indices = [0] * len(SEARCH_ATTEMPTS) + [1 + i // 2 for i in range(2 * n_segments)]
     select_for_attempt = lambda table: jnp.asarray(table, jnp.int32)[attempt_index]
-    origin = jnp.broadcast_to(table_1[:, None], parameters.shape)
+    table_1_parameters = jnp.broadcast_to(table_1[:, None], parameters.shape)
     # Each segment is tried twice: from the previous wheel, then without double support.
     segment = select_for_attempt(segment_indices)
-    second_tries = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_segments
-    is_second_try = select_for_attempt(second_tries) == 1
+    is_second_try_by_attempt = [0] * len(SEARCH_ATTEMPTS) + [0, 1] * n_segments
+    is_second_try = select_for_attempt(is_second_try_by_attempt) == 1
     is_segment = segment > 0
     is_last_segment = ~is_segment | (segment == n_segments)
     homotopy_fraction = segment.astype(parameters.dtype) / n_segments
     target_parameters = jnp.where(
-        is_last_segment, parameters, origin + homotopy_fraction * (parameters - origin)
+        is_last_segment,
+        parameters,
+        table_1_parameters + homotopy_fraction * (parameters - table_1_parameters),
     )
     is_homotopy = _is_attempt(attempt_index, "homotopy")
-    start_parameters = jnp.where(is_homotopy, origin, target_parameters)
+    start_parameters = jnp.where(is_homotopy, table_1_parameters, target_parameters)
     has_dls = jnp.broadcast_to(
         ~_is_attempt(attempt_index, "without DLS") & ~is_second_try, parameters.shape[-1:]
     )
@@ -534,7 +542,7 @@ def _run_attempt(
         system,
         target_parameters,
         start,
-        origin,
+        table_1_parameters,
         homotopy_steps,
         select_for_attempt(iteration_limits),
         is_pending,
@@ -616,14 +624,14 @@ def search_in_stages(
     """
     parameters, n_lanes = arguments[0], arguments[0].shape[-1]
     # With several steps, a repeated gait of one step would be continued, which decides nothing.
-    n_attempts = len(SEARCH_ATTEMPTS) + 2 * system.limits.n_homotopy_segments * (
+    n_attempts = len(SEARCH_ATTEMPTS) + 2 * system.search_limits.n_homotopy_segments * (
         system.period_n == 1
     )
     first_attempt = jnp.asarray(
         SEARCH_ATTEMPTS.index("surface" if len(arguments) == 1 else "guess"), jnp.int32
     )
     result = init_search_result(system, parameters)
-    if n_lanes <= system.limits.max_ungathered_lanes:
+    if n_lanes <= system.search_limits.max_ungathered_lanes:
         return search(
             parameters, result, first_attempt, jnp.asarray(n_attempts, jnp.int32), *arguments[1:]
         )

@@ -73,7 +73,7 @@ class AbstractCycle(AbstractPrintable):
         The number divides `period_n`: a gait of one step also repeats after two.
         """
         step_ends, n_steps = self.step_ends, self.period_n
-        scale = jnp.max(jnp.abs(step_ends), (-2, -1))
+        largest_coordinate = jnp.max(jnp.abs(step_ends), (-2, -1))
         tolerance = jnp.maximum(SAME_STATE_TOLERANCE, 100.0 * jnp.finfo(step_ends.dtype).eps)
         minimal_steps = jnp.full(self.outcome.shape, n_steps, jnp.int32)
         for candidate_period in (
@@ -85,7 +85,7 @@ class AbstractCycle(AbstractPrintable):
                 jnp.abs(jnp.roll(step_ends, candidate_period, -2) - step_ends), (-2, -1)
             )
             minimal_steps = jnp.where(
-                distance <= tolerance * scale, candidate_period, minimal_steps
+                distance <= tolerance * largest_coordinate, candidate_period, minimal_steps
             )
         return jnp.where(self.found, minimal_steps, 0)
 

@@ -282,9 +282,9 @@ class MeasureReader:
         return {name: self.read(name, cycle, step) for name in self.names}
 
 
-def measure_from_gait(gait: Gait, read: Callable, names: tuple[str, ...]) -> GaitMeasures:
+def measure_from_gait(gait: Gait, read_measure: Callable, names: tuple[str, ...]) -> GaitMeasures:
     """Return measures of a gait from its stored derivatives."""
-    measure_values, jacobian = evaluate_on_gait(MeasureReader(read, names), gait)
+    measure_values, jacobian = evaluate_on_gait(MeasureReader(read_measure, names), gait)
     stack_measures = lambda values: jnp.stack([values[name] for name in names], -1)
     return GaitMeasures(
         stack_measures(measure_values), stack_measures(jacobian).T, gait.cycle.outcome

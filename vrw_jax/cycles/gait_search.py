@@ -312,35 +312,37 @@ def _search_with_fallbacks(
         return cycle
     finder, collocation_state = fallback
     if is_concrete:
-        retry = map_in_batches(
+        retried_cycle = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
         )  # a compiled program
-        retry = retry if is_batch else _take_rows_on_device(retry, 0)
+        retried_cycle = retried_cycle if is_batch else _take_rows_on_device(retried_cycle, 0)
     else:
-        retry = _search(
+        retried_cycle = _search(
             finder,
             params,
             jax.device_put(collocation_state)
             if is_batch
             else _take_rows_on_device(collocation_state, 0),
         )
-    return _keep_first_reason(cycle, retry)
+    return _keep_first_reason(cycle, retried_cycle)
 
 
-def _keep_first_reason(cycle: LimitCycle, retry: LimitCycle) -> LimitCycle:
+def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
     """Return the cycles of the retry; a wheel without a gait keeps the reason of the first search.
 
     All functions therefore report the same reason, with or without fallbacks, and in any batch.
     """
     get_reason = lambda x: (x.outcome, x.collocation_state.failed_check)
-    first_reason, last_reason = get_reason(cycle), get_reason(retry)
-    where: Any = jnp.where
+    first_reason, last_reason = get_reason(cycle), get_reason(retried_cycle)
+    select_array: Any = jnp.where
     if not is_traced((first_reason, last_reason)):  # numpy compiles nothing for a new batch size
         first_reason, last_reason = jax.tree.map(np.asarray, (first_reason, last_reason))
-        where = lambda *arrays: jax.device_put(np.where(*arrays))
+        select_array = lambda *arrays: jax.device_put(np.where(*arrays))
     is_missing = (first_reason[0] != Outcome.STEPPED) & (last_reason[0] != Outcome.STEPPED)
-    reason = [where(is_missing, *pair) for pair in zip(first_reason, last_reason, strict=True)]
-    return eqx.tree_at(get_reason, retry, tuple(reason))
+    reason = [
+        select_array(is_missing, *pair) for pair in zip(first_reason, last_reason, strict=True)
+    ]
+    return eqx.tree_at(get_reason, retried_cycle, tuple(reason))
 
 
 def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
@@ -512,9 +514,11 @@ def _fallback_starts(
     for refinement_index in range(1 + options.max_refinements * refines_mesh):
         if refinement_index:
             coarser_finder, finder = finder, finder.with_finer_mesh()
-            transfer = jax.vmap(functools.partial(finder.transfer_to_mesh, coarser_finder.system))
+            transfer_solution = jax.vmap(
+                functools.partial(finder.transfer_to_mesh, coarser_finder.system)
+            )
             collocation_state = map_in_batches(
-                transfer, batch_sizes.GAIT_BATCH_SIZES, collocation_state
+                transfer_solution, batch_sizes.GAIT_BATCH_SIZES, collocation_state
             )
         # The search without walks has used this mesh already. One finer mesh is always tried.
         is_promising = (
@@ -535,22 +539,22 @@ def _fallback_starts(
             has_state[wheel_indices],
             subset_walks,
         )
-        retry = map_in_batches(
+        retried_cycle = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, guesses
         )
-        is_found = np.asarray(retry.outcome) == Outcome.STEPPED
+        is_found = np.asarray(retried_cycle.outcome) == Outcome.STEPPED
         mesh_error = np.asarray(
-            map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retry)
+            map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retried_cycle)
         )
         collocation_state = _replace_rows(
             collocation_state,
             wheel_indices[is_found],
-            _take_rows_on_device(retry.collocation_state, is_found),
+            _take_rows_on_device(retried_cycle.collocation_state, is_found),
         )
         if is_found.any():
             best_result = finder, collocation_state
         has_state[wheel_indices[is_found]] = True
-        is_coarse[wheel_indices] = np.asarray(retry.outcome) == Outcome.MESH_TOO_COARSE
+        is_coarse[wheel_indices] = np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
         is_unresolved[
             wheel_indices[is_found & ((mesh_error <= options.refine_above) | (not refines_mesh))]
         ] = False
@@ -564,8 +568,10 @@ def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle
     fallback = _fallback_starts(finder, params, search_result, None, refines_mesh=False)
     if fallback is None:
         return search_result
-    retry = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1])
-    return _keep_first_reason(search_result, retry)
+    retried_cycle = map_in_batches(
+        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1]
+    )
+    return _keep_first_reason(search_result, retried_cycle)
 
 
 def _guess_section_state(guess: Any) -> Any:
@@ -597,17 +603,18 @@ def _retry_from_other_steps(
         section_states = np.asarray(
             step_batch(subset_params, section_states, model=finder.model).section_state
         )
-        retry = map_in_batches(
+        retried_cycle = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, section_states
         )
         found_indices = np.flatnonzero(
-            np.asarray(retry.found) & (np.asarray(collocation_state.found)[missing_indices] < 0.5)
+            np.asarray(retried_cycle.found)
+            & (np.asarray(collocation_state.found)[missing_indices] < 0.5)
         )
         if len(found_indices):
             collocation_state = _replace_rows(
                 collocation_state,
                 missing_indices[found_indices],
-                _take_rows_on_device(retry.collocation_state, found_indices),
+                _take_rows_on_device(retried_cycle.collocation_state, found_indices),
             )
             best_result = finder, collocation_state
     return best_result

@@ -66,13 +66,13 @@ def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
     )
 
 
-def evaluate_monomials(centered: tuple[Elementwise, ...]) -> list[Elementwise]:
+def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
     """Return all monomials of the coordinates up to the surface's degree, the constant first."""
-    ones = jnp.ones_like(centered[0])
+    ones = jnp.ones_like(centered_coordinates[0])
     return [
         functools.reduce(operator.mul, factors, ones)
         for degree in range(SURFACE_DEGREE + 1)
-        for factors in itertools.combinations_with_replacement(centered, degree)
+        for factors in itertools.combinations_with_replacement(centered_coordinates, degree)
     ]
 
 
@@ -83,13 +83,13 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
     surface = load_surface()
     # Python floats preserve the dtype of the parameters.
     ranges = (x.tolist() for x in surface[:4])
-    centered = tuple(
+    centered_coordinates = tuple(
         (jnp.clip(x, lower, upper) - center) / spread
         for x, center, spread, lower, upper in zip(
             surface_coordinates(params), *ranges, strict=True
         )
     )
-    monomials = jnp.stack(evaluate_monomials(centered))
+    monomials = jnp.stack(evaluate_monomials(centered_coordinates))
     values = jnp.tensordot(jnp.asarray(surface.coefficients.T, monomials.dtype), monomials, 1)
     time_scale = time_unit(params)
     section = jnp.stack([values[0], values[1] / time_scale])
@@ -106,8 +106,8 @@ def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> Collocat
         # These are the units of the accelerations of (theta, L1, L2).
         angle_scale = 1.0 / time_scale**2
         length_scale = params.locked_length / time_scale**2
-        scale = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
-        phase_accelerations = jnp.tensordot(matrix, surface_accelerations, 1) * scale
+        acceleration_units = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
+        phase_accelerations = jnp.tensordot(matrix, surface_accelerations, 1) * acceleration_units
         accelerations.append(
             phase_accelerations.reshape(
                 1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]

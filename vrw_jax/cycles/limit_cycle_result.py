@@ -121,8 +121,8 @@ class LimitCycle(AbstractCycle):
         On the section before the impact there is a third multiplier, which is zero.
         """
         attach_function = attach_monodromy if is_inside_jit() else _compiled_attach_monodromy
-        attach = self._map_over_batch(functools.partial(attach_function, self.system))
-        return attach(self.monodromy_value, self.parameters, self.collocation_state)
+        attach_to_batch = self._map_over_batch(functools.partial(attach_function, self.system))
+        return attach_to_batch(self.monodromy_value, self.parameters, self.collocation_state)
 
     @property
     def jury_margins(self) -> Array:
@@ -167,8 +167,8 @@ class LimitCycle(AbstractCycle):
                 f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
                 "for gaits that repeat after one: give a cycle of period_n = 1."
             )
-        respond = functools.partial(collocation_slope_response, self.system)
-        return self._map_over_batch(respond)(self.parameters, self.collocation_state)
+        compute_response = functools.partial(collocation_slope_response, self.system)
+        return self._map_over_batch(compute_response)(self.parameters, self.collocation_state)
 
     def gait_sensitivity(self, name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in its unit per rad of slope; see

@@ -78,12 +78,12 @@ class CycleOptions:
         """
         computed_dtype = jax.dtypes.canonicalize_dtype(dtype)
         if self.tolerance < jnp.finfo(computed_dtype).eps:
-            source = (
+            dtype_statement = (
                 "the wheel holds" if computed_dtype == dtype else "jax_enable_x64 is off: JAX takes"
             )
             raise ValueError(
-                f"{source} {computed_dtype.name} numbers, in which no limit cycle is found "
-                f"to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
+                f"{dtype_statement} {computed_dtype.name} numbers, in which no limit cycle is "
+                f"found to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 
     def refine_mesh(self) -> "CycleOptions":

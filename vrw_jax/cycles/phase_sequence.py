@@ -47,7 +47,7 @@ def compute_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
     return symbols[:N_LANE_CONSTANTS]
 
 
-def _symbols(n_legs: int, constants: PhaseConstants) -> Symbols:
+def _make_symbols(n_legs: int, constants: PhaseConstants) -> Symbols:
     """Return all symbols of the wheel from those that vary between lanes."""
     alpha = 2.0 * math.pi / n_legs
     fields: tuple[Any, ...] = (
@@ -77,7 +77,7 @@ def _make_collocation_phase(
         constants: PhaseConstants, point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
         line_turn = sine_cosine(constants[N_LANE_CONSTANTS]) if _is_uneven(constants) else ()
-        phase = phase_class(_symbols(n_legs, constants), point.held_constants, True, line_turn)
+        phase = phase_class(_make_symbols(n_legs, constants), point.held_constants, True, line_turn)
         return phase, phase.motion_at(point.q, point.v)
 
     def residual(constants: PhaseConstants, point: PhasePoint, acceleration: Vector) -> Vector:
@@ -103,7 +103,7 @@ def _make_collocation_phase(
 
     def reset_to_section(constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
         (theta, _), (dtheta, dL1) = point.q, point.v
-        s = _symbols(n_legs, constants)
+        s = _make_symbols(n_legs, constants)
         theta = theta - constants[N_LANE_CONSTANTS] if _is_uneven(constants) else theta
         return PhasePoint((), transitions.land_on_both_feet(s, theta, dtheta, dL1), ())
 
@@ -144,7 +144,7 @@ def held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSe
     )
 
     def make_start_point(constants: PhaseConstants, section: Vector) -> PhasePoint:
-        s = _symbols(n_legs, constants)
+        s = _make_symbols(n_legs, constants)
         sin, cos = sine_cosine(section[0])
         distance = s.L0 * s.sin_alpha / rear_direction(s, sin, cos).cos
         return PhasePoint((distance,), section[:1], section[1:])
@@ -155,7 +155,7 @@ def held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSe
         dls, sls1, sls2 = phase_points
         lift_off_guard = phases[0].event(constants, dls.start)
         (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
-        landing = transitions.land(_symbols(n_legs, constants), theta, dtheta, dL1)
+        landing = transitions.land(_make_symbols(n_legs, constants), theta, dtheta, dL1)
         return (
             jnp.where(is_active[0], lift_off_guard, -lift_off_guard),
             landing.rear_impulse.normal,

@@ -177,10 +177,10 @@ def summarize_steps(steps: Any) -> tuple[Array, Array, Array]:
     """Return post-impact state, durations, s, and step lengths, m, of a cycle from its steps, on
     a leading axis.
     """
-    durations, lengths = steps.durations, steps.step_length
+    durations, step_lengths = steps.durations, steps.step_length
     if len(durations) == 1:
-        durations, lengths = durations[0], lengths[0]
-    return steps.post_impact[0], durations, lengths
+        durations, step_lengths = durations[0], step_lengths[0]
+    return steps.post_impact[0], durations, step_lengths
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):

@@ -92,16 +92,18 @@ def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
     b = A @ B0 + B1
     equation = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
     inverse = invert_by_elimination(lax.stop_gradient(equation))
-    forcing = jnp.outer(b, b).ravel()
-    covariance = inverse @ forcing
+    forcing_vector = jnp.outer(b, b).ravel()
+    covariance = inverse @ forcing_vector
     for _ in range(N_REFINEMENTS):
-        covariance = covariance - inverse @ (equation @ covariance - forcing)
+        covariance = covariance - inverse @ (equation @ covariance - forcing_vector)
     P = covariance.reshape(n, n)
     later_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step = C @ B0 + D1
-    norm = _root(D0**2 + beginning_step**2 + later_squared)
+    sensitivity_norm = _root(D0**2 + beginning_step**2 + later_squared)
     if_stable = lambda value: jnp.where(is_stable, value, jnp.inf)
-    return GaitSensitivityNorm(if_stable(norm), D0, beginning_step, if_stable(_root(later_squared)))
+    return GaitSensitivityNorm(
+        if_stable(sensitivity_norm), D0, beginning_step, if_stable(_root(later_squared))
+    )
 
 
 def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -184,8 +186,8 @@ def collocation_slope_response(
     gait_unknowns = lax.stop_gradient(
         (solution.durations[0], *(a[0] for a in solution.accelerations))
     )
-    respond = _make_collocation_response(system)
-    return respond(
+    compute_response = _make_collocation_response(system)
+    return compute_response(
         parameters, solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
     )[0]
 
@@ -200,7 +202,7 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
     """
     slope_index = PARAMETER_NAMES.index("slope")
 
-    def respond(
+    def compute_response(
         parameters: Array, section: Array, is_active: Array, *gait_unknowns: Array
     ) -> tuple:
         unknowns_of_gait, unravel = ravel_pytree(gait_unknowns)
@@ -209,7 +211,7 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
             durations, *accelerations = unravel(unknowns)
             line_parameters = parameters.at[slope_index].set(inputs[2])
             constants = (*system.compute_constants(*line_parameters), inputs[3] - inputs[2])
-            section, passages = reconstruct_step(
+            section, phase_points = reconstruct_step(
                 system.sequence,
                 system.meshes,
                 constants,
@@ -217,18 +219,18 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
                 durations,
                 tuple(accelerations),
             )
-            return constants, section, passages
+            return constants, section, phase_points
 
         def residual(unknowns: Array, inputs: Array, parameters: Array) -> Array:
             durations, *accelerations = unravel(unknowns)
-            constants, _, passages = reconstruct(unknowns, inputs, parameters)
+            constants, _, phase_points = reconstruct(unknowns, inputs, parameters)
             residuals: list[Array] = []
-            for i, (phase, passage) in enumerate(
-                zip(system.sequence.phases, passages, strict=True)
+            for i, (phase, points) in enumerate(
+                zip(system.sequence.phases, phase_points, strict=True)
             ):
                 node_accelerations = accelerations[i].reshape(-1, phase.n_coordinates).T
-                residuals += phase.residual(constants, passage.nodes, tuple(node_accelerations))
-                event = phase.event(constants, passage.end)
+                residuals += phase.residual(constants, points.nodes, tuple(node_accelerations))
+                event = phase.event(constants, points.end)
                 residuals.append(jnp.where(is_active[i] > 0.5, event, durations[i])[None])
             return jnp.concatenate(residuals)
 
@@ -242,12 +244,12 @@ def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
                 return unknowns - correction, None
 
             unknowns, _ = lax.scan(refine, unknowns_of_gait, length=N_REFINEMENTS)
-            _, end, passages = reconstruct(unknowns, inputs, parameters)
-            durations, (length,) = unravel(unknowns)[0], passages[0].start.held_constants
+            _, end, phase_points = reconstruct(unknowns, inputs, parameters)
+            durations, (length,) = unravel(unknowns)[0], phase_points[0].start.held_constants
             period = jnp.sum(durations)
             values = durations[0] / period, period, length / period, length, *durations
             return jnp.stack([*end, *values])
 
         return SlopeResponse.from_jacobian(jax.jacfwd(evaluate)(inputs), len(section)), ()
 
-    return enable_all_ad_modes(respond)
+    return enable_all_ad_modes(compute_response)

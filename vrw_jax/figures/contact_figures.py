@@ -87,10 +87,10 @@ def compute_foot_motion(walk: xr.Dataset) -> FootMotion:
         return FootMotion(walk.time.values, hub, feet, forces, modes, walk.step.values)
     n_legs = int(walk.attrs["parameter_n_legs"])
     angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
-    lengths = np.full(angles.shape, walk.attrs["parameter_locked_length"])
-    lengths[:, 0] = walk.L1.values
-    lengths[:, 1] = walk.L2.values
-    feet = hub[:, None] - lengths[..., None] * np.stack([np.sin(angles), np.cos(angles)], -1)
+    leg_lengths = np.full(angles.shape, walk.attrs["parameter_locked_length"])
+    leg_lengths[:, 0] = walk.L1.values
+    leg_lengths[:, 1] = walk.L2.values
+    feet = hub[:, None] - leg_lengths[..., None] * np.stack([np.sin(angles), np.cos(angles)], -1)
     forces = np.zeros_like(feet)
     for leg in (1, 2):
         names = f"lambda_{2 * leg - 1}", f"lambda_{2 * leg}"
@@ -106,7 +106,7 @@ def select_leg_color(leg: int) -> str:
     return {1: LEG_1_COLOR, 2: LEG_2_COLOR}.get(leg, OTHER_LEG_COLOR)
 
 
-def draw_feet(axes: Axes, positions: np.ndarray, modes: np.ndarray, size: float) -> None:
+def draw_feet(axes: Axes, positions: np.ndarray, modes: np.ndarray, marker_size: float) -> None:
     """Draw feet at `positions`, shape (2, feet), as markers in the colors of their contact
     modes.
     """
@@ -116,9 +116,9 @@ def draw_feet(axes: Axes, positions: np.ndarray, modes: np.ndarray, size: float)
             CONTACT_MARKERS[mode],
             color=CONTACT_COLORS[mode],
             zorder=8,
-            markersize=size,
+            markersize=marker_size,
             markeredgecolor=DARK_GRAY,
-            markeredgewidth=0.1 * size,
+            markeredgewidth=0.1 * marker_size,
         )
 
 
@@ -135,7 +135,11 @@ def _select_legs(is_drawn: np.ndarray) -> list[int]:
     """Return the numbers of Legs 1 and 2, and of the legs that are ever marked in `is_drawn`,
     (time, leg).
     """
-    return [leg for leg, flag in enumerate(np.any(is_drawn, axis=0).tolist(), 1) if flag or leg < 3]
+    return [
+        leg
+        for leg, is_marked in enumerate(np.any(is_drawn, axis=0).tolist(), 1)
+        if is_marked or leg < 3
+    ]
 
 
 def make_contact_panels(walk: xr.Dataset) -> Figure:
@@ -189,12 +193,12 @@ def _draw_mode_bars(axes: Axes, motion: FootMotion, legs: list[int]) -> None:
             np.r_[0, change_indices], np.r_[change_indices, len(modes)], strict=True
         ):
             if modes[start_index] != ContactMode.OFF:
-                span = (
+                time_span = (
                     motion.time[start_index],
                     motion.time[end_index - 1] - motion.time[start_index],
                 )
                 axes.broken_barh(
-                    [span], (bar_row - 0.35, 0.7), color=CONTACT_COLORS[modes[start_index]]
+                    [time_span], (bar_row - 0.35, 0.7), color=CONTACT_COLORS[modes[start_index]]
                 )
     axes.set_yticks(range(len(legs)), [str(leg) for leg in legs])
     axes.set_ylim(len(legs) - 0.5, -0.5)

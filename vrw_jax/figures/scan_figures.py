@@ -132,10 +132,10 @@ def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None =
         is_stable = [
             _outcome_codes(column).transpose(y, x).values == Outcome.STEPPED for column in columns
         ]
-        limits = _find_color_limits(values, is_stable)
+        color_limits = _find_color_limits(values, is_stable)
         for axes, column, value in zip(row, columns, values, strict=True):
-            image = _draw_cells(axes, column[x].values, column[y].values, value, limits)
-        extended_ends = _find_extended_ends(values, limits)
+            image = _draw_cells(axes, column[x].values, column[y].values, value, color_limits)
+        extended_ends = _find_extended_ends(values, color_limits)
         color_bar = figure.colorbar(
             image, ax=row.tolist(), aspect=12, pad=0.01, extend=extended_ends
         )
@@ -240,12 +240,12 @@ def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
 
 
 def _draw_values(
-    axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, size: float
+    axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, marker_size: float
 ) -> PathCollection:
     """Draw samples in the colors of a measure, or in gray if they have no gait, and return the
     points.
     """
-    dot_style: dict[str, Any] = {"s": size, "linewidths": 0.0, "rasterized": True}
+    dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
     min_value, max_value = _find_color_limits(
         [values], [_outcome_codes(scan).values == Outcome.STEPPED]
@@ -263,11 +263,11 @@ def _draw_values(
 
 
 def _draw_outcomes(
-    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, size: float
+    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, marker_size: float
 ) -> None:
     """Draw samples in the colors of their outcomes."""
     colors = [select_outcome_style(int(code))[1] for code in codes]
-    axes.scatter(x, y, s=size, color=colors, linewidths=0.0, rasterized=True)
+    axes.scatter(x, y, s=marker_size, color=colors, linewidths=0.0, rasterized=True)
 
 
 def _draw_stable_share(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
@@ -335,8 +335,10 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     left_out_fraction = 100.0 * indices.attrs["left_out"]
-    note = f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
-    figure.suptitle(note, fontsize=8.0)
+    note_text = (
+        f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
+    )
+    figure.suptitle(note_text, fontsize=8.0)
     return figure
 
 
@@ -389,13 +391,13 @@ def _find_color_limits(
 
 
 def _find_extended_ends(
-    values: Sequence[np.ndarray], limits: tuple[float, float]
+    values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
     """Return the ends of a color bar beyond which there are values."""
     finite_values = np.concatenate([value[np.isfinite(value)] for value in values])
     is_any_below, is_any_above = (
-        np.any(finite_values < limits[0]),
-        np.any(finite_values > limits[1]),
+        np.any(finite_values < color_limits[0]),
+        np.any(finite_values > color_limits[1]),
     )
     return (
         ("both" if is_any_above else "min")
@@ -405,7 +407,7 @@ def _find_extended_ends(
 
 
 def _draw_cells(
-    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limits: tuple[float, float]
+    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, color_limits: tuple[float, float]
 ) -> AxesImage:
     """Draw one colored cell per sample, without interpolation, and return the image."""
     axes.set_facecolor(LIGHT_GRAY)
@@ -415,8 +417,8 @@ def _draw_cells(
         _find_cell_edges(y),
         masked_values,
         cmap="viridis",
-        vmin=limits[0],
-        vmax=limits[1],
+        vmin=color_limits[0],
+        vmax=color_limits[1],
     )
     cell_image.set_rasterized(True)
     return cell_image  # type: ignore[return-value]  # A color bar accepts it.

@@ -233,15 +233,21 @@ def label_panel(axes: Axes, letter: str) -> None:
 
 
 def draw_marks(
-    axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, color: str, fill: str, **overrides: Any
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    marker: str,
+    color: str,
+    fill_color: str,
+    **style_overrides: Any,
 ) -> None:
-    """Draw markers without a line, filled with the color `fill`; "white" makes them open."""
+    """Draw markers without a line, filled with `fill_color`; "white" makes them open."""
     marker_style: dict[str, Any] = {
         "markersize": 3.2,
         "markeredgewidth": 0.7,
         "linestyle": "none",
-    } | overrides
-    axes.plot(x, y, marker, color=color, markerfacecolor=fill, **marker_style)
+    } | style_overrides
+    axes.plot(x, y, marker, color=color, markerfacecolor=fill_color, **marker_style)
 
 
 def select_special_point_style(name: str) -> tuple[str, Any]:
@@ -277,12 +283,12 @@ def draw_outcome_cells(
     code_indices = np.ma.masked_where(
         ~np.isin(codes, known_codes), np.searchsorted(known_codes, codes)
     )
-    norm = (
+    color_norm = (
         BoundaryNorm(np.arange(len(known_codes) + 1) - 0.5, len(known_codes))
         if len(known_codes) > 1
         else None
     )
-    axes.pcolormesh(x, y, code_indices, cmap=colors, norm=norm).set_rasterized(True)
+    axes.pcolormesh(x, y, code_indices, cmap=colors, norm=color_norm).set_rasterized(True)
 
 
 def make_outcome_patches(codes: Iterable[int]) -> list[Patch]:

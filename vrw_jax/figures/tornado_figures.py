@@ -86,9 +86,9 @@ def tornado_figure(
         axes.set_title(typeset_symbols(MEASURES[name].long_name))
         change_label = format_axis_label(name, "change of {symbol}")
         axes.set_xlabel("change [%]" if spreads is None else change_label)
-    amount = "1 %" if spreads is None else "by its spread"
+    parameter_change_text = "1 %" if spreads is None else "by its spread"
     handles, _ = panels[0].get_legend_handles_labels()
-    labels = [f"parameter {direction} {amount}" for direction in ("up", "down")]
+    labels = [f"parameter {direction} {parameter_change_text}" for direction in ("up", "down")]
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
 

@@ -225,9 +225,9 @@ GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
 """Line styles of the gaits of one figure."""
 
 
-def _format_gait_label(gait: xr.Dataset, varied: str) -> str:
+def _format_gait_label(gait: xr.Dataset, varied_parameter: str) -> str:
     """Return the label of a gait by its varied parameter, as in "c = 50 N·s/m"."""
-    return format_value_label(varied, gait.attrs[f"parameter_{varied}"])
+    return format_value_label(varied_parameter, gait.attrs[f"parameter_{varied_parameter}"])
 
 
 @figure_style()

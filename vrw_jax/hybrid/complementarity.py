@@ -63,8 +63,8 @@ def enumerate_lcp_solutions(
     if not is_traced(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
         raise ValueError("matrix or free holds a number that is not finite: give finite numbers.")
     max_entry = jnp.max(jnp.abs(matrix))
-    scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
-    free_gap, matrix = free_gap / scale, matrix / scale
+    entry_scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
+    free_gap, matrix = free_gap / entry_scale, matrix / entry_scale
     # Combinations with more closed contacts come first.
     is_closed = np.array(list(itertools.product((True, False), repeat=n)))
     is_closed = is_closed[np.argsort(-is_closed.sum(1), kind="stable")]
@@ -86,13 +86,13 @@ def enumerate_lcp_solutions(
 
     candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
     match_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))
-    is_same = (
+    is_same_solution = (
         jnp.max(jnp.abs(candidate_forces[:, None] - candidate_forces[None]), -1) <= match_tolerance
     )
-    is_duplicate = jnp.any(jnp.tril(is_same & is_solution[None], -1), 1)
+    is_duplicate = jnp.any(jnp.tril(is_same_solution & is_solution[None], -1), 1)
     is_solution = is_solution & ~is_duplicate
     force = jnp.where(jnp.any(is_solution), candidate_forces[jnp.argmax(is_solution)], jnp.nan)
     status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS)).astype(jnp.int32)
     return LCPSolutions(
-        force, scale * (matrix @ force + free_gap), status, is_solution, candidate_forces
+        force, entry_scale * (matrix @ force + free_gap), status, is_solution, candidate_forces
     )

@@ -160,14 +160,15 @@ def product_multipliers(
         is_coupled = np.abs(np.tril(closing_matrix, -1)) > 1e-14
         if not is_coupled.any():
             break
-    blocks, block_start = [], 0
+    diagonal_blocks, block_start = [], 0
     for block_end in range(1, n + 1):
         if not is_coupled[block_end:, :block_end].any():
-            blocks.append(slice(block_start, block_end))
+            diagonal_blocks.append(slice(block_start, block_end))
             block_start = block_end
     norms = np.linalg.norm(jacobians, axis=(1, 2))
     block_results = [
-        _block_multipliers(triangles, closing_matrix, block, norms, tolerance) for block in blocks
+        _block_multipliers(triangles, closing_matrix, diagonal_block, norms, tolerance)
+        for diagonal_block in diagonal_blocks
     ]
     values, logarithms, relative_error = (
         np.concatenate(x) for x in zip(*block_results, strict=True)
@@ -186,14 +187,17 @@ def product_multipliers(
 def _block_multipliers(
     triangles: np.ndarray,
     closing_matrix: np.ndarray,
-    block: slice,
+    block_slice: slice,
     norms: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the multipliers of one diagonal block, the logarithms of their moduli, and their
     relative errors.
     """
-    diagonal_blocks, block_size = triangles[:, block, block], block.stop - block.start
+    diagonal_blocks, block_size = (
+        triangles[:, block_slice, block_slice],
+        block_slice.stop - block_slice.start,
+    )
     diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
     with np.errstate(divide="ignore", invalid="ignore"):
         log_diagonal = np.log(diagonal)
@@ -206,7 +210,7 @@ def _block_multipliers(
             scaled_product = factor @ scaled_product
             max_entry = np.max(np.abs(scaled_product)) or 1.0
             scaled_product, log_scale = scaled_product / max_entry, log_scale + np.log(max_entry)
-        values = np.linalg.eigvals(closing_matrix[block, block] @ scaled_product)
+        values = np.linalg.eigvals(closing_matrix[block_slice, block_slice] @ scaled_product)
         logarithms = np.log(np.abs(values)) + log_scale
         if block_size == 1:
             logarithms = np.sum(log_diagonal, axis=0)

@@ -371,14 +371,16 @@ def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> StepFn:
     return jax.jit(lambda state, h: rk_step(tableau, phase.evaluate, state, h))
 
 
-def _wrap_phase_functions(phase: BatchPhase, wrap: Callable) -> BatchPhase:
-    """Return the phase with its functions wrapped by `wrap`, so that each is traced once for all
-    its calls.
+def _wrap_phase_functions(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
+    """Return the phase with its functions wrapped by `wrap_function`, so that each is traced once
+    for all its calls.
     """
     margins = phase.margins
     if margins is not None:
-        margins = margins._replace(evaluate_margins=wrap(margins.evaluate_margins))
-    return phase._replace(evaluate=wrap(phase.evaluate), guards=wrap(phase.guards), margins=margins)
+        margins = margins._replace(evaluate_margins=wrap_function(margins.evaluate_margins))
+    return phase._replace(
+        evaluate=wrap_function(phase.evaluate), guards=wrap_function(phase.guards), margins=margins
+    )
 
 
 def _integrate_until_crossing(

@@ -338,9 +338,15 @@ def evaluate_stage(
         ]
         double_sum = _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations)
         single_sum = _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations)
-        drift = float(tableau.nodes[stage_index]) * v0[coordinate]
+        displacement_at_constant_rate = float(tableau.nodes[stage_index]) * v0[coordinate]
         position.append(
-            q0[coordinate] + h * (drift if double_sum is None else drift + h * double_sum)
+            q0[coordinate]
+            + h
+            * (
+                displacement_at_constant_rate
+                if double_sum is None
+                else displacement_at_constant_rate + h * double_sum
+            )
         )
         rate.append(v0[coordinate] + h * single_sum)
     return tuple(position), tuple(rate)

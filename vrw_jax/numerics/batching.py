@@ -138,7 +138,10 @@ def take_rows(tree: PyTree, row_indices: Any) -> PyTree:
 
 def concat_rows(*trees: PyTree) -> PyTree:
     """Return the trees concatenated along the leading axis, as NumPy arrays."""
-    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(p) for p in parts]), *trees)
+    return jax.tree.map(
+        lambda *leaf_parts: np.concatenate([np.asarray(leaf_part) for leaf_part in leaf_parts]),
+        *trees,
+    )
 
 
 def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:

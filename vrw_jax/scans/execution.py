@@ -187,12 +187,12 @@ def _compute_chunks(
     try:
         for chunk_index, results in executor(scan_plan, missing_chunks):
             chunk_shape = chunk_shapes[chunk_index]
-            block = {
+            chunk_results = {
                 name: values.reshape(*chunk_shape, *values.shape[1:])
                 for name, values in results.items()
             }
             with _explain_full_disk(storage, scan_plan.layout.n_chunks):
-                storage.write_chunk(chunk_index, block)
+                storage.write_chunk(chunk_index, chunk_results)
             n_done += math.prod(chunk_shape)
             n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
             if on_progress is not None:

@@ -82,7 +82,8 @@ def _select_spread_samples(design: AbstractDesign, n_selected: int) -> SampleCol
         for index_of_sample in sample_indices
     ]
     return {
-        name: np.concatenate([block[name] for block in single_samples]) for name in design.names
+        name: np.concatenate([sample_columns[name] for sample_columns in single_samples])
+        for name in design.names
     }
 
 

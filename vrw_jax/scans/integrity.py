@@ -88,9 +88,9 @@ class StoredMetadata:
     def __init__(self, path: Path) -> None:
         self._path, self.root_metadata = path, read_metadata(path / METADATA_FILE_NAME)
         root_attrs = self.root_metadata.get("attributes")
-        consolidated = self.root_metadata.get("consolidated_metadata")
+        consolidated_entry = self.root_metadata.get("consolidated_metadata")
         consolidated_arrays = (
-            consolidated.get("metadata") if isinstance(consolidated, dict) else None
+            consolidated_entry.get("metadata") if isinstance(consolidated_entry, dict) else None
         )
         self.consolidated_metadata: dict[str, Any] = (
             consolidated_arrays if isinstance(consolidated_arrays, dict) else {}
@@ -181,14 +181,14 @@ class StoredMetadata:
             for name, metadata in self.consolidated_metadata.items()
             if name not in arrays
         }
-        consolidated = {
+        consolidated_entry = {
             "kind": "inline",
             "must_understand": False,
             "metadata": arrays | other_metadata,
         }
         new_root = intact_metadata.root_metadata | {
             "attributes": self.attributes,
-            "consolidated_metadata": consolidated,
+            "consolidated_metadata": consolidated_entry,
         }
         for name, metadata in [*arrays.items(), ("", new_root)]:
             path = self._path / name / METADATA_FILE_NAME
@@ -347,15 +347,17 @@ def describe_damage(
     location: object, chunks: list[int], coordinates: list[str], metadata: list[str]
 ) -> str:
     """Return a sentence about the damage of a store, or "" if there is none."""
-    parts = []
+    damage_texts = []
     if chunks:
         chunks_text = ", ".join(map(str, chunks[:10])) + (", ..." if len(chunks) > 10 else "")
-        parts.append(f"{len(chunks)} damaged chunk{'s' * (len(chunks) > 1)} (number {chunks_text})")
+        damage_texts.append(
+            f"{len(chunks)} damaged chunk{'s' * (len(chunks) > 1)} (number {chunks_text})"
+        )
     if coordinates:
-        parts.append(f"damaged coordinates ({', '.join(coordinates)})")
+        damage_texts.append(f"damaged coordinates ({', '.join(coordinates)})")
     if metadata:
-        parts.append(f"damaged metadata ({', '.join(metadata)})")
-    return f"{location} has {' and '.join(parts)}" if parts else ""
+        damage_texts.append(f"damaged metadata ({', '.join(metadata)})")
+    return f"{location} has {' and '.join(damage_texts)}" if damage_texts else ""
 
 
 @contextlib.contextmanager

@@ -224,16 +224,16 @@ VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", 
 """Instruction sets that decide which sums the compiler fuses, and thus the last digits."""
 
 
-def describe_difference(stored: object, current: object) -> str:
+def describe_difference(stored_settings: object, current_settings: object) -> str:
     """Return a description of the first setting that differs, or an empty string."""
-    name, old, new = find_first_difference(stored, current)
+    name, stored_value, current_value = find_first_difference(stored_settings, current_settings)
     if not name:
         return ""
     if name == "design.digest":
         return "the values of the swept parameters differ"
     if name == "code":
         return "the library's code differs"
-    return f"{name} is {old!r} there and {new!r} here"
+    return f"{name} is {stored_value!r} there and {current_value!r} here"
 
 
 def _make_layout(

@@ -358,14 +358,16 @@ METADATA_ERRORS = (
 def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) -> zarr.Group:
     """Return the group of a store, opened with the first copy of its metadata that can be read."""
     variables = metadata.mark_attributes.get(VARIABLES_KEY, ())
-    for consolidated in (None, False):
+    for uses_consolidated in (None, False):
         try:
-            group = zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=consolidated)
+            group = zarr.open_group(
+                path, mode=mode, zarr_format=3, use_consolidated=uses_consolidated
+            )
             for name in (*metadata.coordinates, *variables, "outcome"):
                 _get_array(group, name)
             return group
         except METADATA_ERRORS:
-            if consolidated is False:
+            if uses_consolidated is False:
                 raise
     raise AssertionError
 
@@ -376,10 +378,10 @@ def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
     A file name cannot be "d speed / d damping", so the array of that variable in a store has
     another name.
     """
-    requested = dataset.attrs.get(REQUESTED_ATTRIBUTE)
+    requested_text = dataset.attrs.get(REQUESTED_ATTRIBUTE)
     names = (
-        str(requested).split(", ")
-        if requested
+        str(requested_text).split(", ")
+        if requested_text
         else read_manifest(dataset.attrs).get("measures", [])
     )
     requested_names = {
@@ -422,9 +424,13 @@ def read_stored_manifest(path: Path) -> dict | None:
         return None
     attrs = _read_scan_metadata(path).attributes
     try:
-        origin = attrs.get(PROVENANCE_ATTRIBUTE, {})
-        origin = json.loads(origin) if isinstance(origin, str) else origin
-        return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: origin}
+        provenance_record = attrs.get(PROVENANCE_ATTRIBUTE, {})
+        provenance_record = (
+            json.loads(provenance_record)
+            if isinstance(provenance_record, str)
+            else provenance_record
+        )
+        return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: provenance_record}
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{path} has damaged attributes ({error}): give another place for this scan."
@@ -432,21 +438,31 @@ def read_stored_manifest(path: Path) -> dict | None:
 
 
 def find_first_difference(
-    stored: object, current: object, name: str = ""
+    stored_settings: object, current_settings: object, name: str = ""
 ) -> tuple[str, object, object]:
     """Return the name and both values of the first setting that differs, or ("", None, None)."""
-    if isinstance(stored, dict) and isinstance(current, dict):
+    if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
         for key in [
-            *stored,
-            *(setting_name for setting_name in current if setting_name not in stored),
+            *stored_settings,
+            *(
+                setting_name
+                for setting_name in current_settings
+                if setting_name not in stored_settings
+            ),
         ]:
             nested_difference = find_first_difference(
-                stored.get(key), current.get(key), f"{name}.{key}" if name else str(key)
+                stored_settings.get(key),
+                current_settings.get(key),
+                f"{name}.{key}" if name else str(key),
             )
             if nested_difference[0]:
                 return nested_difference
         return "", None, None
-    return ("", None, None) if stored == current else (name, stored, current)
+    return (
+        ("", None, None)
+        if stored_settings == current_settings
+        else (name, stored_settings, current_settings)
+    )
 
 
 def create_store(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:

@@ -100,12 +100,14 @@ def _integer_pow(
     value.
     """
     multiply = lambda x, y: _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, y)
-    result, square, remaining_exponent = None, x, abs(params["y"])
+    result, squared_value, remaining_exponent = None, x, abs(params["y"])
     while remaining_exponent:
         if remaining_exponent & 1:
-            result = square if result is None else multiply(result, square)
+            result = squared_value if result is None else multiply(result, squared_value)
         remaining_exponent >>= 1
-        square = multiply(square, square) if remaining_exponent else square
+        squared_value = (
+            multiply(squared_value, squared_value) if remaining_exponent else squared_value
+        )
     unit_value = emitter.constant(x.type, 1)
     result = unit_value if result is None else result
     return (
@@ -348,11 +350,11 @@ def _emit_exponential(emitter: ValueEmitter, value: Value) -> Value:
         emitter, builder.fsub(exponent_of_two, integer_part), POWER_OF_TWO_COEFFICIENTS
     )
     integer_constant = lambda x: emitter.constant(integer_type, x)
-    scale = builder.shl(
+    power_of_two = builder.shl(
         builder.add(builder.fptosi(integer_part, integer_type), integer_constant(127)),
         integer_constant(23),
     )
-    return builder.fmul(fractional_power, builder.bitcast(scale, llvm_type))
+    return builder.fmul(fractional_power, builder.bitcast(power_of_two, llvm_type))
 
 
 def _is_constant(value: Value, number: int) -> bool:

@@ -319,17 +319,17 @@ class ArrayEmitter:
         """Return the array broadcast to `shape`; `axes` are the positions of its axes in that
         shape.
         """
-        lengths = array.shape
-        if lengths == shape and tuple(axes) == tuple(range(len(shape))):
+        axis_lengths = array.shape
+        if axis_lengths == shape and tuple(axes) == tuple(range(len(shape))):
             return array
         if isinstance(array, np.ndarray):
             new_shape = [1] * len(shape)
-            for axis, length in zip(axes, lengths, strict=True):
+            for axis, length in zip(axes, axis_lengths, strict=True):
                 new_shape[axis] = length
             return np.broadcast_to(array.reshape(new_shape), shape)
 
         def entry_at(index: EntryIndex) -> Value:
-            pairs = zip(axes, lengths, strict=True)
+            pairs = zip(axes, axis_lengths, strict=True)
             return self.get_entry(array, tuple(0 if n == 1 else index[axis] for axis, n in pairs))
 
         return LazyArray(shape, array.entry_type, entry_at)

@@ -94,8 +94,10 @@ def emit_concatenate(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayV
 def emit_stack(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
     """Return arrays of one shape stacked along a new axis."""
     axis = call.params["axis"]
-    longer = [emitter.reshape_array(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
-    return _concatenate_along(emitter, call, axis, longer)
+    expanded_arrays = [
+        emitter.reshape_array(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values
+    ]
+    return _concatenate_along(emitter, call, axis, expanded_arrays)
 
 
 def emit_unstack(
@@ -130,15 +132,17 @@ def _concatenate_along(
 
     def entry_at(index: EntryIndex) -> Value:
         i, selected_value = index[axis], None
-        for part, start in zip(part_offsets, starts, strict=False):
-            local_index, last_index = emitter.shift_index(i, -start), part.shape[axis] - 1
+        for part_array, start in zip(part_offsets, starts, strict=False):
+            local_index, last_index = emitter.shift_index(i, -start), part_array.shape[axis] - 1
             if isinstance(i, int):
                 if 0 <= local_index <= last_index:
-                    return emitter.get_entry(part, (*index[:axis], local_index, *index[axis + 1 :]))
+                    return emitter.get_entry(
+                        part_array, (*index[:axis], local_index, *index[axis + 1 :])
+                    )
                 continue
             # Beyond the end of a part any entry is valid, because the select below discards it.
             local_index = 0 if last_index == 0 else emitter.clamp_index(local_index, last_index)
-            value = emitter.get_entry(part, (*index[:axis], local_index, *index[axis + 1 :]))
+            value = emitter.get_entry(part_array, (*index[:axis], local_index, *index[axis + 1 :]))
             is_inside = emitter.builder.icmp_signed(">=", i, ir.Constant(I64, start))
             if selected_value is None:
                 selected_value = value

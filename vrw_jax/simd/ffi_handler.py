@@ -24,13 +24,13 @@ def read_api_version() -> tuple[int, int]:
 
     It is (0, 0), which XLA rejects, if the header is missing or has another form.
     """
-    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    header_path = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     try:
-        text = header.read_text(encoding="utf-8")
+        header_text = header_path.read_text(encoding="utf-8")
     except OSError:
         return 0, 0
-    numbers = dict(re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", text))
-    return int(numbers.get("MAJOR", 0)), int(numbers.get("MINOR", 0))
+    version_numbers = dict(re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header_text))
+    return int(version_numbers.get("MAJOR", 0)), int(version_numbers.get("MINOR", 0))
 
 
 def add_handler(

@@ -107,7 +107,9 @@ def reduction_rule(name: str) -> Callable[..., ArrayValue]:
             )
 
         def reduce_entry(kept_index: EntryIndex) -> Value:
-            entry_at = lambda inner: emitter.get_entry(array, combine_indices(kept_index, inner))
+            entry_at = lambda reduced_index: emitter.get_entry(
+                array, combine_indices(kept_index, reduced_index)
+            )
             n_terms = math.prod(reduced_lengths)
             if isinstance(array, np.ndarray) or n_terms <= emitter.limits.max_unrolled_terms:
                 return functools.reduce(combine, map(entry_at, np.ndindex(*reduced_lengths)))
@@ -123,7 +125,7 @@ def reduction_rule(name: str) -> Callable[..., ArrayValue]:
                 [initial_value],
             )[0]
 
-        values = [reduce_entry(outer) for outer in np.ndindex(*kept_lengths)]
+        values = [reduce_entry(kept_index) for kept_index in np.ndindex(*kept_lengths)]
         if reduces_lanes:
             values = [_reduce_over_lanes(emitter, name, value) for value in values]
         return make_array(tuple(kept_lengths), values)

@@ -22,17 +22,17 @@ from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 class StepTolerances:
     """Tolerances of the solver in steps with unilateral contact.
 
-    - `tight`: tolerance of most steps, chosen because looser ones save a seventh of the time but
-      miss events;
-    - `very_tight`: tolerance for measures with a small error, which costs a third more;
+    - `tight_tolerance`: tolerance of most steps, chosen because looser ones save a seventh of the
+      time but miss events;
+    - `very_tight_tolerance`: tolerance for measures with a small error, which costs a third more;
     - `walk`: tolerance of walks by Tsit5, whose steps cost a quarter. It is chosen because at 1e-5
       three of 118 gaits are missed;
     - `tight_comparisons`, `very_tight_comparisons`: other tolerances, with which steps are compared
       if feet may graze the ground.
     """
 
-    tight: float = 1e-10
-    very_tight: float = 1e-12
+    tight_tolerance: float = 1e-10
+    very_tight_tolerance: float = 1e-12
     walk: float = 3e-6
     tight_comparisons: tuple[float, ...] = (1e-12, 1e-11, 3e-11)
     very_tight_comparisons: tuple[float, ...] = (1e-13, 3e-12, 1e-11)
@@ -105,7 +105,7 @@ class GroundBatch:
 
     def list_with_other_tolerances(self) -> list["GroundBatch"]:
         """Return copies of the batch with other step tolerances, for comparison."""
-        is_very_tight = float(self.options.rtol) < 0.5 * self.tolerances.tight
+        is_very_tight = float(self.options.rtol) < 0.5 * self.tolerances.tight_tolerance
         comparison_tolerances = (
             self.tolerances.very_tight_comparisons
             if is_very_tight

@@ -148,10 +148,10 @@ class MeasureResult(AbstractPrintable):
     @property
     def title(self) -> str:
         if self.models.ndim:
-            milliseconds = _format_short(1e3 * self.seconds)
+            milliseconds = _format_rounded(1e3 * self.seconds)
             return f"MeasureResult, {self.models.size} wheels, {milliseconds} ms"
         measures_text = "; ".join(self._format_measure(i) for i in range(len(self.names)))
-        return f"{measures_text}: {self.why}. {_format_short(1e3 * self.seconds)} ms"
+        return f"{measures_text}: {self.why}. {_format_rounded(1e3 * self.seconds)} ms"
 
     def summary_rows(self) -> list[TextRow]:
         if not self.models.ndim:
@@ -162,7 +162,8 @@ class MeasureResult(AbstractPrintable):
         )
         max_error = lambda i: np.max(self.errors[self.found][:, i], initial=0.0)
         error_rows = [
-            (f"largest error of {n}", _format_short(max_error(i))) for i, n in enumerate(self.names)
+            (f"largest error of {n}", _format_rounded(max_error(i)))
+            for i, n in enumerate(self.names)
         ]
         return [
             ("models", counts_text),
@@ -178,12 +179,12 @@ class MeasureResult(AbstractPrintable):
         value, error = float(self.values[measure_index]), float(self.errors[measure_index])
         digits = max(0, math.ceil(-math.log10(max(error, 1e-15))))
         value_text = f"{value:.{digits}f} {measure.display_unit}".strip()
-        parts_text = f"numerical {_format_short(self.numerical_errors[measure_index])}"
+        parts_text = f"numerical {_format_rounded(self.numerical_errors[measure_index])}"
         if MODEL_NAMES[int(self.models)] != MODEL_NAMES[-1]:
             parts_text = (
-                f"model {_format_short(abs(self.model_errors[measure_index]))}, {parts_text}"
+                f"model {_format_rounded(abs(self.model_errors[measure_index]))}, {parts_text}"
             )
-        return f"{value_text} ± {_format_short(error)} ({parts_text})"
+        return f"{value_text} ± {_format_rounded(error)} ({parts_text})"
 
 
 def _describe_selection(
@@ -201,9 +202,9 @@ def _describe_selection(
     return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {meaning}"
 
 
-def _format_short(value: float) -> str:
+def _format_rounded(value: float) -> str:
     """Return a value as one digit and a power of ten, or as a number of up to three digits."""
     if value == 0.0 or 0.1 <= abs(value) < 1e4:
         return f"{value:.3g}"
-    digit, power = f"{value:.0e}".split("e")
-    return f"{digit}e{int(power)}"
+    digit, exponent = f"{value:.0e}".split("e")
+    return f"{digit}e{int(exponent)}"

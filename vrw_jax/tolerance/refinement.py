@@ -145,7 +145,7 @@ class BroydenIteration:
     has_current_matrices: np.ndarray  # whether the matrices are those of this motion
     is_free: np.ndarray
     has_previous: np.ndarray  # whether the previous step had the same codes
-    previous: tuple[np.ndarray, ...]  # start, defect and quantities of the previous step
+    previous_step_data: tuple[np.ndarray, ...]  # start, defect and quantities of the previous step
     correction: np.ndarray
 
     @classmethod
@@ -167,7 +167,7 @@ class BroydenIteration:
             plane_indices = ground.plane_indices()
             newton_matrix[:, plane_indices[:, None], plane_indices] = lower_gaits.newton_matrix
             quantity_jacobian[:, :, plane_indices] = lower_gaits.quantity_jacobian
-        previous = (
+        previous_step_data = (
             np.zeros((n_elements, n_numbers)),
             np.zeros((n_elements, n_numbers)),
             np.zeros((n_elements, N_STEP_QUANTITIES)),
@@ -182,7 +182,7 @@ class BroydenIteration:
             has_current_matrices=np.full(n_elements, lower_gaits is not None),
             is_free=ground.find_free_coordinates(section_states),
             has_previous=np.zeros(n_elements, bool),
-            previous=previous,
+            previous_step_data=previous_step_data,
             correction=np.zeros((n_elements, n_numbers)),
         )
 
@@ -215,7 +215,9 @@ class BroydenIteration:
         )
         self.correction[positions] = correction
         for previous_values, current_values in zip(
-            self.previous, (section_states[:, :n_numbers], defect, step.quantities), strict=True
+            self.previous_step_data,
+            (section_states[:, :n_numbers], defect, step.quantities),
+            strict=True,
         ):
             previous_values[positions] = current_values
         with np.errstate(all="ignore"):
@@ -256,7 +258,7 @@ class BroydenIteration:
         comparable.
         """
         previous_states, previous_defect, previous_quantities = (
-            previous_values[positions] for previous_values in self.previous
+            previous_values[positions] for previous_values in self.previous_step_data
         )
         state_change = np.where(self.is_free[positions], states - previous_states, 0.0)
         defect_change = previous_defect - defect
@@ -504,14 +506,14 @@ class _ErrorBound:
             )
             # With differences across a change of contacts, shorter corrections change measures as
             # much as before.
-            effect_rate = np.max(
+            effect_contraction_rate = np.max(
                 estimate.correction_effect
                 / np.maximum(self.correction_effect[positions], options.min_resolved_change),
                 axis=1,
             )
             is_stalled = (
                 estimate.same_codes
-                & (np.maximum(contraction_rate, effect_rate) > options.refresh_above)
+                & (np.maximum(contraction_rate, effect_contraction_rate) > options.refresh_above)
                 & np.isfinite(previous_length)
             )
             is_stalled &= (
@@ -535,7 +537,7 @@ class _ErrorBound:
                 np.maximum(contraction_rate, self.contraction_rate[positions]), min_rate
             )
             pessimistic_rate = np.maximum(
-                pessimistic_rate, np.where(contraction_rate > 0.0, effect_rate, 0.0)
+                pessimistic_rate, np.where(contraction_rate > 0.0, effect_contraction_rate, 0.0)
             )
             value_change = np.abs(estimate.values - self.measures[positions])
             largest_effect = np.fmax(

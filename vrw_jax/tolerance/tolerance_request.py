@@ -140,8 +140,12 @@ def measure_to_tolerance(
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
     rank = None if which is None else parse_gait_choice(which)
-    is_tight = tol >= REQUEST_OPTIONS.very_tight_below
-    tolerance = STEP_TOLERANCES.tight if is_tight else STEP_TOLERANCES.very_tight
+    uses_very_tight_steps = tol >= REQUEST_OPTIONS.very_tight_below
+    tolerance = (
+        STEP_TOLERANCES.tight_tolerance
+        if uses_very_tight_steps
+        else STEP_TOLERANCES.very_tight_tolerance
+    )
     options = StepOptions(rtol=tolerance, atol=tolerance)
     request = _MeasureRequest(
         names,
@@ -227,7 +231,7 @@ class _MeasureRequest:
         return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
 
     @property
-    def find_unanswered_indices(self) -> np.ndarray:
+    def find_indices_without_result(self) -> np.ndarray:
         """Return the indices of the elements without a result."""
         return np.flatnonzero(self.results["models"] == ModelIndex.NONE)
 
@@ -250,7 +254,7 @@ class _MeasureRequest:
         """Try the paper's gaits, or else the gaits with unilateral contact near them, and record
         accepted results.
         """
-        indices = self.find_unanswered_indices
+        indices = self.find_indices_without_result
         if not len(indices):
             return
         replace_gaits(
@@ -265,7 +269,7 @@ class _MeasureRequest:
 
     def walk_to_gaits(self) -> None:
         """Walk to the gaits with unilateral contact of wheels without a result, and record them."""
-        indices = self.find_unanswered_indices
+        indices = self.find_indices_without_result
         if not len(indices):
             return
         has_lower_gait = self.lower_gaits.model_index[indices] != ModelIndex.NONE
@@ -279,15 +283,19 @@ class _MeasureRequest:
         if not len(indices):
             return
         for start in compute_walk_starts(self._take_wheels(indices))[: self.options.n_cold_starts]:
-            is_unanswered = self.results["models"][indices] == ModelIndex.NONE
-            start_states = self.ground.embed_states(indices[is_unanswered], start[is_unanswered])
+            has_no_result = self.results["models"][indices] == ModelIndex.NONE
+            start_states = self.ground.embed_states(indices[has_no_result], start[has_no_result])
             self._walk_and_correct(
-                indices[is_unanswered], start_states, MeasureStatus.REACHED_FROM_START
+                indices[has_no_result], start_states, MeasureStatus.REACHED_FROM_START
             )
 
     def select_by_rank(self, rank: int) -> None:
         """Record the gait of this rank, slowest first, among the ends of walks from all starts."""
-        indices, empty_results, results_of_starts = self.find_unanswered_indices, self.results, []
+        indices, empty_results, results_of_starts = (
+            self.find_indices_without_result,
+            self.results,
+            [],
+        )
         for start in compute_walk_starts(self.params):
             self.results = {
                 name: starts_array.copy() for name, starts_array in empty_results.items()
@@ -437,7 +445,9 @@ class _MeasureRequest:
         """Record the results of gaits with unilateral contact."""
         self.results["n_steps"][indices] += refinement.n_steps
         indices = indices[refinement.is_done]
-        refinement = RefinementResult(*(part[refinement.is_done] for part in refinement))
+        refinement = RefinementResult(
+            *(result_array[refinement.is_done] for result_array in refinement)
+        )
         has_lower_gait = (self.lower_gaits.model_index[indices] != ModelIndex.NONE)[:, None]
         values = evaluate_measures(
             self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)

@@ -111,10 +111,12 @@ def explore_starts(
             + penalty_gradient
         )
         ascent_direction = np.where(is_active[:, None], ascent_direction, 0.0)
-        update, optimizer_state = optimizer.update(jnp.asarray(ascent_direction), optimizer_state)
+        adam_update, optimizer_state = optimizer.update(
+            jnp.asarray(ascent_direction), optimizer_state
+        )
         step_sizes = learning_rates * 0.5 * (1.0 + np.cos(np.pi * step_index / options.n_steps))
         trial_parameters = np.clip(
-            normalized_parameters + step_sizes * np.asarray(update), 0.0, 1.0
+            normalized_parameters + step_sizes * np.asarray(adam_update), 0.0, 1.0
         )
         trial_evaluation = evaluate(trial_parameters, evaluation)
         is_accepted = (
@@ -132,8 +134,8 @@ def explore_starts(
         normalized_parameters = np.where(
             is_accepted[:, None], trial_parameters, normalized_parameters
         )
-        select_accepted = lambda new, old, accepted=is_accepted: jnp.where(
-            accepted.reshape(-1, *(1,) * (jnp.ndim(new) - 1)), new, old
+        select_accepted = lambda new_leaf, old_leaf, accepted=is_accepted: jnp.where(
+            accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf
         )
         evaluation = jax.tree.map(select_accepted, trial_evaluation, evaluation)
     slacks, _ = _slack_and_jacobian(evaluation, free_indices, widths, min_constraint_values)
@@ -180,10 +182,15 @@ def _slack_and_jacobian(
 
 
 def _stays_on_branch(
-    previous: GaitEvaluation, trial: GaitEvaluation, parameter_changes: np.ndarray
+    previous_evaluation: GaitEvaluation,
+    trial_evaluation: GaitEvaluation,
+    parameter_changes: np.ndarray,
 ) -> np.ndarray:
     """Return whether each trial's gait is on the branch of the previous gait of its start."""
-    previous_points, trial_points = previous.gait.branch_point, trial.gait.branch_point
+    previous_points, trial_points = (
+        previous_evaluation.gait.branch_point,
+        trial_evaluation.gait.branch_point,
+    )
     point_pairs = (
         (*take_rows((previous_points, trial_points), start_index), parameter_change)
         for start_index, parameter_change in enumerate(parameter_changes)

@@ -392,8 +392,8 @@ class TuneProblem:
                 self.free, bound_values, prices, self.widths, strict=True
             ):
                 if price > 0.0:
-                    unit, cost = get_measure(name).unit, float(price / width)
-                    active.append(ActiveConstraint(name, float(limit), unit, cost))
+                    unit, price_per_unit = get_measure(name).unit, float(price / width)
+                    active.append(ActiveConstraint(name, float(limit), unit, price_per_unit))
         end_seconds = time.perf_counter()
         validation = self._validate_by_walking(params, gait)
         measures = gait.step.measures()
@@ -508,8 +508,8 @@ class TuneProblem:
             "upper": [float(bound) for bound in self.upper],
             "ending": maximization.status.name,
         }
-        origin = provenance(self.params, self.finder.model, self.finder.step_options)
-        return xr.Dataset(data, labels, attrs | origin)
+        provenance_attrs = provenance(self.params, self.finder.model, self.finder.step_options)
+        return xr.Dataset(data, labels, attrs | provenance_attrs)
 
 
 def make_tune_problem(

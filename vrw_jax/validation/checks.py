@@ -193,11 +193,10 @@ def _check_device() -> None:
         jax.devices()
     # A plugin raises an AssertionError if its device is missing.
     except (RuntimeError, AssertionError) as error:
-        requested = os.environ.get("JAX_PLATFORMS")
+        requested_platforms = os.environ.get("JAX_PLATFORMS")
         raise OSError(
-            f"JAX_PLATFORMS is {requested!r}, but JAX finds no device of that kind: unset it, "
-            f"or set it"
-            " to cpu, before Python starts."
+            f"JAX_PLATFORMS is {requested_platforms!r}, but JAX finds no device of that kind: "
+            "unset it, or set it to cpu, before Python starts."
         ) from error
 
 

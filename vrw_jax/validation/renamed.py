@@ -54,11 +54,11 @@ def raise_for_renamed_numerics(name: str) -> Any:
 FunctionType = TypeVar("FunctionType", bound=Callable)
 
 
-def describe_renamed(module: str, name: str, renamed: Mapping[str, str]) -> str | None:
+def describe_renamed(module: str, name: str, new_name_by_old: Mapping[str, str]) -> str | None:
     """Return a sentence with the present name of a renamed attribute, or None."""
-    if name not in renamed:
+    if name not in new_name_by_old:
         return None
-    return f"{module} has no {name!r}: it is called {renamed[name]} now."
+    return f"{module} has no {name!r}: it is called {new_name_by_old[name]} now."
 
 
 def raise_for_renamed_arguments(**renamed: str) -> Callable[[FunctionType], FunctionType]:
