@@ -136,7 +136,7 @@ def sound_calls() -> dict[str, Call]:
         "return_map": make_sound(vrw.return_map, wheel, start),
         "walk": make_sound(vrw.walk, wheel, start, 2),
         "simulate": make_sound(vrw.simulate, wheel, start),
-        "steps": make_sound(vrw.step_batch, wheel, states),
+        "step_batch": make_sound(vrw.step_batch, wheel, states),
         "limit_cycle": make_sound(vrw.limit_cycle, wheel),
         "limit_cycles": make_sound(vrw.limit_cycles, two),
         "choose_model": make_sound(vrw.choose_model, wheel, start),
@@ -149,7 +149,7 @@ def sound_calls() -> dict[str, Call]:
         "scan": make_sound(vrw.scan, vrw.grid(damping=[150.0]), ["speed"]),
         "open_scan": make_sound(vrw.open_scan, "nowhere"),
         "sobol_indices": make_sound(vrw.sobol_indices, None),
-        "newton_cycle": make_sound(
+        "solve_fixed_point": make_sound(
             functools.partial(vrw.solve_fixed_point, lambda x: 0.5 * x), np.array([0.5])
         ),
     }

@@ -24,7 +24,7 @@ def read_table(path: Path) -> list[Row]:
 
 def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", errors="backslashreplace") as file:
         csv.writer(file).writerows([header, *rows])
 
 

@@ -587,7 +587,7 @@ def register_wrong_calls() -> None:
         "solve_fixed_point of a map elsewhere",
         lambda: vrw.solve_fixed_point(lambda x: x[:1], start),
         "ValueError",
-        "its like",
+        "an array of that shape",
     )
     add_wrong_call(
         "contacts that are no number",

@@ -151,12 +151,12 @@ def _solve_checked(
     start: Any,
     period_n: int,
     tolerance: float | Scalar,
-    iterations: int,
+    max_iterations: int,
 ) -> FixedPointResult:
     """Check the arguments, and return the fixed point by one of the two methods below."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
-    iterations = check_int("iterations", iterations)
+    max_iterations = check_int("max_iterations", max_iterations)
     if start.ndim != 1 or not start.size:
         raise ValueError(
             f"start has shape {start.shape}, but it is a vector: give an array of shape (n,)."
@@ -170,10 +170,10 @@ def _solve_checked(
         description = getattr(output, "shape", type(output).__name__)
         raise ValueError(
             f"the map gives {description} for a start of shape {start.shape}, but it must give "
-            "its like: take a map of a state to the next."
+            "an array of that shape: take a map of a state to the next state."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
-    map_and_iterations = (run_newton, function, period_n, iterations)
+    map_and_iterations = (run_newton, function, period_n, max_iterations)
     arguments = start, tolerance
     uses_program_cache = isinstance(function, ReturnMap)
     program = find_program(_solve, map_and_iterations, *arguments) if uses_program_cache else None

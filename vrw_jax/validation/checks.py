@@ -213,7 +213,7 @@ def check_choice(name: str, value: Any, allowed_names: Sequence[str]) -> str:
     raise_if_forked()
     if not isinstance(value, str):
         raise TypeError(
-            f"{name} is {format_value(value)}, but it is a word: give '{allowed_names[0]}', say."
+            f"{name} is {format_value(value)}, but it must be text: give '{allowed_names[0]}', say."
         )
     if value not in allowed_names:
         raise ValueError(
