@@ -217,7 +217,7 @@ class _LoopCarry:
                 continue
             if (
                 isinstance(array, PendingUpdate)
-                and getattr(array.base_array, "base", None) is memory.base_pointer
+                and getattr(array.base_array, "base_pointer", None) is memory.base_pointer
             ):
                 pending_copies.append((memory, array.materialize_update()))
             elif isinstance(array, MemoryArray) and self._has_separate_memory(array):
