@@ -13,6 +13,7 @@ import functools
 import inspect
 import json
 import math
+import os
 import sys
 import time
 import traceback
@@ -213,6 +214,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     chosen = parse_and_start_jax(parser)
     chosen.folder.mkdir(parents=True, exist_ok=True)
+    chosen.folder = chosen.folder.resolve()
+    os.chdir(chosen.folder)  # a hostile value may name a store, which a scan then writes
     generator, rows = np.random.default_rng(chosen.seed), []
     with (chosen.folder / "random_calls.log").open("w") as log:
         for number in range(chosen.calls):
