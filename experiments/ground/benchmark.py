@@ -97,7 +97,7 @@ def jacobians() -> None:
         for factor in FACTORS:
             run = functools.partial(step, solver, tolerance, factor, DIFFERENTIATED_INPUTS)
             away = error(shift(run()), shift(truth))
-            speed = N_DERIVATIVE_WHEELS / measure_cpu_seconds(run, REPEATS, result=min)
+            speed = N_DERIVATIVE_WHEELS / measure_cpu_seconds(run, REPEATS, reduction=min)
             rows.append(
                 [solver, *(f"{x:.3g}" for x in (tolerance, factor, speed, of_values, away))]
             )

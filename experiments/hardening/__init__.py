@@ -1,1 +1,1 @@
-"""Hardening: damaged files, and random calls of the public functions."""
+"""Test the library with damaged files and with random calls of the public functions."""

@@ -1,13 +1,13 @@
-"""Damage stores, cached code, cached traces and configs, and write the results as a table.
+"""Damage stores, cached code, cached traces and configs, and write how the library ends.
 
-Each row is a kind of file and a fault. It ends as
+Each row of the table is a kind of file and a fault. Its ending is one of these:
 
-- "reported": the damage is named, and nothing wrong is returned;
-- "repaired": it is named, and computed or compiled again to bitwise the same;
-- "rejected": the file is refused by one sentence;
+- "reported": the library names the damage, and returns no wrong number;
+- "repaired": it names the damage, and computes or compiles bitwise the same again;
+- "rejected": it rejects the file with one sentence;
 - "harmless": the results are bitwise the same, or the config is read as written;
 
-or as a fault of the library: "silently wrong", "traceback", "crash". Each row runs in a process of
+or a fault of the library: "silently wrong", "traceback", "crash". Each row runs in a process of
 its own.
 
     python -m experiments.hardening.damage results
@@ -29,9 +29,9 @@ from experiments.shared.command import make_parser
 from experiments.shared.tables import write_table
 
 ENDINGS = ("reported", "repaired", "rejected", "harmless")
-"""Endings of a row in which the library behaves as it should."""
+"""Endings of rows without a fault of the library."""
 MAX_ROW_SECONDS = 300
-"""Longest time of a row, chosen because a store's row compiles a scan where nothing is cached."""
+"""Longest time of a row, chosen because a row of a store may compile a scan."""
 
 CONFIG = """\
 [wheel]
@@ -42,10 +42,11 @@ slope = [0.28, 0.3]
 [scan]
 measures = ["speed"]
 """
+"""Valid config that the rows of the family "config" damage."""
 
 
 class Kind(NamedTuple):
-    """A kind of file: where the files of that kind lie."""
+    """A kind of damaged file: the program that reads it and the pattern of its names."""
 
     family: str
     pattern: str
@@ -68,10 +69,11 @@ KINDS = {
     "JAX's executable": Kind("cache", "*-cache"),
     "config": Kind("config", "*.toml"),
 }
+"""Kinds of files by the names in the table."""
 
 
 def flip_bit(path: Path, others: list[Path]) -> None:
-    """Change one bit in the middle."""
+    """Change one bit in the middle of the file."""
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(content)
@@ -85,42 +87,42 @@ def change_last_byte(path: Path, others: list[Path]) -> None:
 
 
 def cut_in_half(path: Path, others: list[Path]) -> None:
-    """Keep the first half."""
+    """Keep the first half of the file."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def put_noise(path: Path, others: list[Path]) -> None:
-    """Put random bytes in its place, as many as there were."""
+    """Replace the content by as many random bytes."""
     noise = np.random.default_rng(0).bytes(path.stat().st_size)
     path.write_bytes(noise)
 
 
 def rotate_contents(path: Path, others: list[Path]) -> None:
-    """Give each file the content of the next of its kind."""
+    """Give each file the content of the next file of its kind."""
     contents = [other.read_bytes() for other in others]
     for other, content in zip(others, contents[1:] + contents[:1], strict=True):
         other.write_bytes(content)
 
 
 def put_folder(path: Path, others: list[Path]) -> None:
-    """Put an empty folder in its place."""
+    """Replace the file by an empty folder."""
     path.unlink()
     path.mkdir()
 
 
 def put_loop(path: Path, others: list[Path]) -> None:
-    """Put a link to itself in its place."""
+    """Replace the file by a link to itself."""
     path.unlink()
     path.symlink_to(path.name)
 
 
 def append_text(path: Path, others: list[Path]) -> None:
-    """Append a line."""
+    """Append a line to the file."""
     path.write_bytes(path.read_bytes() + b"\nand more\n")
 
 
 def let_others_write(path: Path, others: list[Path]) -> None:
-    """Let every user write it."""
+    """Allow every user to write the file."""
     path.chmod(0o666)
 
 
@@ -141,6 +143,7 @@ FOLDER_FAULTS = {
     ("folder of the cache", "writable by others"): 0o777,
     ("folder of the cache", "writable by its group"): 0o770,
 }
+"""File modes of the cache folder that some rows set."""
 QUICK_ROWS = (
     ("chunk of speed", "a bit flipped"), ("chunk of speed", "another's content"),
     ("mark of a chunk", "deleted"), ("mark of a chunk", "noise"),
@@ -154,15 +157,16 @@ QUICK_ROWS = (
 
 
 def list_rows() -> list[tuple[str, str]]:
-    """Return all rows, a kind and a fault each."""
+    """Return all rows, each a kind and a fault."""
     return [(kind, fault) for kind in KINDS for fault in FAULTS] + list(FOLDER_FAULTS)
 
 
-# What a row does, in a process of its own
+# The functions below run in the process of one row.
 
 
 def compute() -> list[list[float]]:
-    """Return numbers by machine code, by a trace that calls some, and by a program of JAX."""
+    """Return numbers of machine code, of a cached trace that calls it, and of a compiled JAX
+    program."""
     import jax
     import jax.numpy as jnp
 
@@ -182,7 +186,7 @@ def compute() -> list[list[float]]:
 
 
 def use_cache(cache: Path) -> list[list[float]]:
-    """Start JAX with that cache, and compute."""
+    """Start JAX with a cache folder, and return the numbers of `compute`."""
     import vrw_jax as vrw
 
     vrw.start_jax(cache)
@@ -190,7 +194,7 @@ def use_cache(cache: Path) -> list[list[float]]:
 
 
 def scan_into(store: Path) -> "object":
-    """Scan four wheels into a store, or go on with it."""
+    """Scan four wheels into a store, or continue the scan of the store."""
     import vrw_jax as vrw
 
     design = vrw.grid(damping=[120.0, 150.0], slope=[0.29, 0.3])
@@ -198,7 +202,7 @@ def scan_into(store: Path) -> "object":
 
 
 def run_store_row(place: Path, store: Path, fault: str, pattern: str) -> str:
-    """Return the ending of a damaged store: it is opened, then the scan continues."""
+    """Open a damaged store, continue its scan, and return the ending."""
     import vrw_jax as vrw
 
     vrw.start_jax()
@@ -214,18 +218,18 @@ def run_store_row(place: Path, store: Path, fault: str, pattern: str) -> str:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            again = scan_into(store)
+            continued = scan_into(store)
         except (ValueError, OSError) as error:
             check_sentence(error)
             return "rejected"
-    if not again.identical(intact) or not vrw.open_scan(store).load().identical(intact):
+    if not continued.identical(intact) or not vrw.open_scan(store).load().identical(intact):
         return "silently wrong"
     is_reported = message or any("damaged" in str(warning.message) for warning in caught)
     return "repaired" if is_reported else "harmless"
 
 
 def run_cache_row(place: Path, cache: Path, fault: str, pattern: str) -> str:
-    """Return the ending of a process with a damaged cache."""
+    """Return the ending of a process that uses a damaged cache."""
     expected = json.loads((place / "expected.json").read_text())
     if (pattern, fault) in FOLDER_FAULTS:
         cache.chmod(FOLDER_FAULTS[pattern, fault])
@@ -245,7 +249,7 @@ def run_cache_row(place: Path, cache: Path, fault: str, pattern: str) -> str:
 
 
 def run_config_row(place: Path, folder: Path, fault: str, pattern: str) -> str:
-    """Return the ending of a damaged config: refused, or read as written."""
+    """Return the ending of a damaged config: rejected, or read as written."""
     from vrw_jax.cli.config import load_config
 
     (folder / "second.toml").write_text("[wheel]\ndamping = 120.0\n")
@@ -277,28 +281,28 @@ PROGRAMS = {"store": run_store_row, "cache": run_cache_row, "config": run_config
 
 
 def run_row(kind: str, fault: str, prepared: Path) -> tuple[str, str]:
-    """Run a row in a process of its own; return its ending, and the last line of an error."""
+    """Run a row in a process of its own, and return its ending and the last line of an error."""
     family, pattern = KINDS.get(kind, Kind("cache", kind))
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        shutil.copytree(prepared / family, place / family)
-        (place / family).chmod(0o700)
-        shutil.copy(prepared / "expected.json", place)
-        row = [sys.executable, "-m", __spec__.name, str(place), "--row", family, pattern, fault]
+        folder = Path(name)
+        shutil.copytree(prepared / family, folder / family)
+        (folder / family).chmod(0o700)
+        shutil.copy(prepared / "expected.json", folder)
+        row = [sys.executable, "-m", __spec__.name, str(folder), "--row", family, pattern, fault]
         try:
             process = subprocess.run(row, capture_output=True, text=True, timeout=MAX_ROW_SECONDS)
         except subprocess.TimeoutExpired:
             return "crash", f"it ran for {MAX_ROW_SECONDS} s"
-    last = process.stderr.strip().splitlines()[-1:]
+    last_line = process.stderr.strip().splitlines()[-1:]
     if process.returncode < 0:
         return "crash", f"signal {-process.returncode}"
     if process.returncode:
-        return "traceback", "".join(last)
+        return "traceback", "".join(last_line)
     return process.stdout.split("\n")[-2], ""
 
 
 def prepare(folder: Path) -> None:
-    """Make an intact cache and the results with it, once for all rows."""
+    """Compute an intact cache and the results with it, once for all rows."""
     for family in PROGRAMS:
         (folder / family).mkdir(mode=0o700)
     row = [sys.executable, "-m", __spec__.name, str(folder), "--row", "intact", "", ""]
@@ -306,36 +310,36 @@ def prepare(folder: Path) -> None:
 
 
 def run_rows(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str, str, str]]:
-    """Run rows, each in a process of its own; return kind, fault, ending and error."""
-    found = []
+    """Run each row in a process of its own, and return kind, fault, ending and error of each."""
+    results = []
     with tempfile.TemporaryDirectory() as name:
         prepare(Path(name))
         for kind, fault in rows:
             ending = run_row(kind, fault, Path(name))
-            found.append((kind, fault, *ending))
-            print(*found[-1], sep=" | ", flush=True)
-    return found
+            results.append((kind, fault, *ending))
+            print(*results[-1], sep=" | ", flush=True)
+    return results
 
 
 def main() -> None:
-    """Run all rows, the rows of the tests, or one row in this process."""
+    """Run all rows, the rows that the tests select, or one row in this process."""
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=Path("results"))
     parser.add_argument("--quick", action="store_true", help="run only the rows of the tests")
     parser.add_argument("--row", nargs=3, metavar=("FAMILY", "PATTERN", "FAULT"), help="one row")
-    chosen = parser.parse_args()
-    if chosen.row:
-        family, pattern, fault = chosen.row
+    arguments = parser.parse_args()
+    if arguments.row:
+        family, pattern, fault = arguments.row
         if family == "intact":
-            results = use_cache(chosen.folder / "cache")
-            (chosen.folder / "expected.json").write_text(json.dumps(results))
+            results = use_cache(arguments.folder / "cache")
+            (arguments.folder / "expected.json").write_text(json.dumps(results))
             return
-        inside = chosen.folder / family
-        inside = inside / "scan.zarr" if family == "store" else inside
-        print(PROGRAMS[family](chosen.folder, inside, fault, pattern))
+        damaged_folder = arguments.folder / family
+        damaged_folder = damaged_folder / "scan.zarr" if family == "store" else damaged_folder
+        print(PROGRAMS[family](arguments.folder, damaged_folder, fault, pattern))
         return
-    rows = run_rows(QUICK_ROWS if chosen.quick else list_rows())
-    write_table(chosen.folder / "damage.csv", ("kind", "fault", "ending", "error"), rows)
+    rows = run_rows(QUICK_ROWS if arguments.quick else list_rows())
+    write_table(arguments.folder / "damage.csv", ("kind", "fault", "ending", "error"), rows)
     sys.exit(any(ending not in ENDINGS for _, _, ending, _ in rows))
 
 

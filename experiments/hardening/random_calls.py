@@ -1,9 +1,9 @@
-"""Random calls of the public functions with values that nobody means, by a seed.
+"""Call public functions with random invalid arguments, and classify how each call ends.
 
-Each call takes a sound one and puts a hostile value in the place of one or two of its arguments. It
+Each call replaces one or two arguments of a valid call by values that are meant for nothing. It
 ends as "answered", as "one sentence" (a TypeError, ValueError or OSError of this library, of one
-line), or as a fault: "foreign error", "NaN without a code", "too slow". A crash ends the process,
-and the last line of the log names the call.
+line), or as a fault: "foreign error", "NaN without a code", "too slow". If the process crashes,
+the last line of the log names the call. A seed makes the calls reproducible.
 
     python -m experiments.hardening.random_calls results 20000 --seed 1
 """
@@ -32,27 +32,28 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import write_table
 
 MAX_CALL_SECONDS = 60.0
-"""Longest time of a call, compiling included, chosen because a user would stop it then."""
+"""Longest time of a call, including compilation, chosen because a user would stop it then."""
 FAULTS = ("foreign error", "NaN without a code", "too slow")
+"""Endings that are faults of the library."""
 
 
 class Call(NamedTuple):
-    """A public function and arguments that it takes."""
+    """A public function and valid arguments of it."""
 
     function: Callable[..., Any]
     arguments: dict[str, Any]
 
 
 class Ending(NamedTuple):
-    """What came of a call."""
+    """Kind of ending of a call, its error message and its duration."""
 
     kind: str
     error: str
     seconds: float
 
 
-class Obstinate:
-    """An object that refuses whatever it is asked for."""
+class RaisingObject:
+    """Object whose conversion to text, array or comparison raises an error."""
 
     def __repr__(self) -> str:
         raise RuntimeError("no text")
@@ -68,7 +69,7 @@ class Obstinate:
 
 @functools.cache
 def hostile_values() -> dict[str, Any]:
-    """Return values that can be given for any argument, by a name."""
+    """Return the values that replace arguments, by a name."""
     integers = {
         name: np.dtype(name).type(3) for name in ("int8", "uint8", "int16", "uint16", "uint64")
     }
@@ -84,7 +85,7 @@ def hostile_values() -> dict[str, Any]:
         "list with nan": [1.0, math.nan],
         "tuple": (1, 2), "empty tuple": (), "set": {1.0, 2.0}, "set of text": {"speed"},
         "table": {"a": 1}, "empty table": {}, "range": range(3), "slice": slice(None),
-        "object": object(), "obstinate": Obstinate(), "class": int, "function": math.sin,
+        "object": object(), "obstinate": RaisingObject(), "class": int, "function": math.sin,
         "module": math, "dtype": np.dtype(float), "float type": np.float32,
         "array": np.array([0.1, 0.2]), "empty array": np.array([]), "matrix": np.eye(3),
         "0-d array": np.array(0.3), "jax array": jnp.array([0.1, 0.2, 0.3]),
@@ -101,29 +102,33 @@ def hostile_values() -> dict[str, Any]:
     }  # fmt: skip
 
 
-LEFT_OUT = ("dask", "report")
-"""Arguments that are not drawn: each call would wait for a cluster, and a user's function may raise
-what it likes. The tests of the command line give hostile addresses."""
+UNCHANGED_ARGUMENTS = ("dask", "report")
+"""Arguments that keep their values. A random `dask` would wait for a cluster, and a user's `report`
+may raise any error. The tests of the command line give invalid addresses."""
 
 
-def make_sound(function: Callable[..., Any], *given: Any, **named: Any) -> Call:
-    """Return a sound call: what has no default is given in order, the rest as usual."""
+def make_valid_call(function: Callable[..., Any], *given: Any, **named: Any) -> Call:
+    """Return a valid call: `given` fills required arguments, and `named` replaces others."""
     parameters = inspect.signature(function).parameters.values()
-    usual = {p.name: p.default for p in parameters if p.default is not p.empty}
+    defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
     required = [p.name for p in parameters if p.default is p.empty and p.kind != p.VAR_KEYWORD]
-    arguments = usual | dict(zip(required, given, strict=False)) | named
-    return Call(function, {name: x for name, x in arguments.items() if name not in LEFT_OUT})
+    arguments = defaults | dict(zip(required, given, strict=False)) | named
+    return Call(
+        function, {name: x for name, x in arguments.items() if name not in UNCHANGED_ARGUMENTS}
+    )
 
 
-def make_sound_settings(kind: type) -> Call:
-    """Return a sound call of a class whose fields all have defaults."""
-    made = kind()
-    return Call(kind, {field.name: getattr(made, field.name) for field in dataclasses.fields(kind)})
+def make_valid_construction(kind: type) -> Call:
+    """Return a valid construction of a class whose fields all have defaults."""
+    instance = kind()
+    return Call(
+        kind, {field.name: getattr(instance, field.name) for field in dataclasses.fields(kind)}
+    )
 
 
 @functools.cache
-def sound_calls() -> dict[str, Call]:
-    """Return sound calls of the public functions that take less than a second once compiled."""
+def valid_calls() -> dict[str, Call]:
+    """Return valid calls of the public functions, each shorter than a second after compilation."""
     wheel, start = vrw.WheelParams(), vrw.paper_start()
     two, states = vrw.WheelParams(damping=np.array([120.0, 150.0])), np.tile(start, (2, 1))
     box = {"damping": (100.0, 200.0)}
@@ -133,58 +138,59 @@ def sound_calls() -> dict[str, Call]:
         vrw.ViscoelasticWheel, vrw.RigidWheel, vrw.UnilateralWheel, vrw.LadderWheel,
     )  # fmt: skip
     functions = {
-        "step": make_sound(vrw.step, wheel, start),
-        "return_map": make_sound(vrw.return_map, wheel, start),
-        "walk": make_sound(vrw.walk, wheel, start, 2),
-        "simulate": make_sound(vrw.simulate, wheel, start),
-        "step_batch": make_sound(vrw.step_batch, wheel, states),
-        "limit_cycle": make_sound(vrw.limit_cycle, wheel),
-        "limit_cycles": make_sound(vrw.limit_cycles, two),
-        "choose_model": make_sound(vrw.choose_model, wheel, start),
-        "basin": make_sound(vrw.basin, wheel, post),
-        "grid": make_sound(vrw.grid, damping=[100.0], slope=[0.3]),
-        "samples": make_sound(vrw.samples, {"damping": [100.0], "slope": [0.3]}),
-        "sobol": make_sound(vrw.sobol, box, 4),
-        "uniform": make_sound(vrw.uniform, box, 4),
-        "saltelli": make_sound(vrw.saltelli, box, 4),
-        "scan": make_sound(vrw.scan, vrw.grid(damping=[150.0]), ["speed"]),
-        "open_scan": make_sound(vrw.open_scan, "nowhere"),
-        "sobol_indices": make_sound(vrw.sobol_indices, None),
-        "solve_fixed_point": make_sound(
+        "step": make_valid_call(vrw.step, wheel, start),
+        "return_map": make_valid_call(vrw.return_map, wheel, start),
+        "walk": make_valid_call(vrw.walk, wheel, start, 2),
+        "simulate": make_valid_call(vrw.simulate, wheel, start),
+        "step_batch": make_valid_call(vrw.step_batch, wheel, states),
+        "limit_cycle": make_valid_call(vrw.limit_cycle, wheel),
+        "limit_cycles": make_valid_call(vrw.limit_cycles, two),
+        "choose_model": make_valid_call(vrw.choose_model, wheel, start),
+        "basin": make_valid_call(vrw.basin, wheel, post),
+        "grid": make_valid_call(vrw.grid, damping=[100.0], slope=[0.3]),
+        "samples": make_valid_call(vrw.samples, {"damping": [100.0], "slope": [0.3]}),
+        "sobol": make_valid_call(vrw.sobol, box, 4),
+        "uniform": make_valid_call(vrw.uniform, box, 4),
+        "saltelli": make_valid_call(vrw.saltelli, box, 4),
+        "scan": make_valid_call(vrw.scan, vrw.grid(damping=[150.0]), ["speed"]),
+        "open_scan": make_valid_call(vrw.open_scan, "nowhere"),
+        "sobol_indices": make_valid_call(vrw.sobol_indices, None),
+        "solve_fixed_point": make_valid_call(
             functools.partial(vrw.solve_fixed_point, lambda x: 0.5 * x), np.array([0.5])
         ),
     }
-    return {kind.__name__: make_sound_settings(kind) for kind in settings} | functions
+    return {kind.__name__: make_valid_construction(kind) for kind in settings} | functions
 
 
 def make_call(name: str, changes: dict[str, Any]) -> Ending:
-    """Call a public function with some of its sound arguments replaced; return what came of it."""
-    function, arguments = sound_calls()[name]
-    began = time.perf_counter()
+    """Call a public function with some arguments replaced, and return how the call ended."""
+    function, arguments = valid_calls()[name]
+    start_time = time.perf_counter()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             result = function(**arguments | changes)
-            lost = find_uncoded_nan(result)
+            nan_field = find_uncoded_nan(result)
     except Exception as error:
-        return classify(error, time.perf_counter() - began)
-    seconds = time.perf_counter() - began
+        return classify(error, time.perf_counter() - start_time)
+    seconds = time.perf_counter() - start_time
     if seconds > MAX_CALL_SECONDS:
         return Ending("too slow", "", seconds)
-    return Ending("NaN without a code" if lost else "answered", lost, seconds)
+    return Ending("NaN without a code" if nan_field else "answered", nan_field, seconds)
 
 
 def classify(error: Exception, seconds: float) -> Ending:
-    """Return whether an error is a sentence of this library, or somebody else's."""
-    text, where = str(error), traceback.extract_tb(error.__traceback__)[-1].filename
-    description = f"{type(error).__name__}: {text[:300]} [{where.rpartition('/')[2]}]"
-    ours = "vrw_jax" in where and isinstance(error, TypeError | ValueError | OSError)
-    sentence = ours and text.endswith(".") and "\n" not in text
-    return Ending("one sentence" if sentence else "foreign error", description, seconds)
+    """Return whether an error is one sentence of this library or an error of other code."""
+    text, file_name = str(error), traceback.extract_tb(error.__traceback__)[-1].filename
+    description = f"{type(error).__name__}: {text[:300]} [{file_name.rpartition('/')[2]}]"
+    is_of_library = "vrw_jax" in file_name and isinstance(error, TypeError | ValueError | OSError)
+    is_sentence = is_of_library and text.endswith(".") and "\n" not in text
+    return Ending("one sentence" if is_sentence else "foreign error", description, seconds)
 
 
 def find_uncoded_nan(result: Any) -> str:
-    """Return what of a step or gait is not finite although its outcome says that it went well."""
+    """Return the name of a field of a step or gait that is NaN despite a good outcome, or an empty
+    text."""
     outcome = getattr(result, "outcome", None)
     if outcome is None or not hasattr(result, "measures"):
         return ""
@@ -198,35 +204,36 @@ def find_uncoded_nan(result: Any) -> str:
 
 
 def draw_changes(generator: np.random.Generator) -> tuple[str, dict[str, str]]:
-    """Return a call by name, and names of hostile values for one or two of its arguments."""
-    calls, values = list(sound_calls()), list(hostile_values())
+    """Return the name of a random call, and for one or two of its arguments names of invalid
+    values."""
+    calls, values = list(valid_calls()), list(hostile_values())
     name = calls[generator.integers(len(calls))]
-    arguments = list(sound_calls()[name].arguments)
-    some = generator.permutation(arguments)[: generator.integers(1, 3)]
-    return name, {str(x): values[generator.integers(len(values))] for x in some}
+    arguments = list(valid_calls()[name].arguments)
+    arguments_to_replace = generator.permutation(arguments)[: generator.integers(1, 3)]
+    return name, {str(x): values[generator.integers(len(values))] for x in arguments_to_replace}
 
 
 def main() -> None:
-    """Make so many calls, log each before it is made, and write a table of the endings."""
+    """Log and make the given number of calls, and write a table of the endings."""
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=Path("results"))
     parser.add_argument("calls", type=int, nargs="?", default=20_000)
     parser.add_argument("--seed", type=int, default=1)
-    chosen = parse_and_start_jax(parser)
-    chosen.folder.mkdir(parents=True, exist_ok=True)
-    chosen.folder = chosen.folder.resolve()
-    os.chdir(chosen.folder)  # a hostile value may name a store, which a scan then writes
-    generator, rows = np.random.default_rng(chosen.seed), []
-    with (chosen.folder / "random_calls.log").open("w") as log:
-        for number in range(chosen.calls):
-            name, drawn = draw_changes(generator)
-            log.write(f"{number} {name} {json.dumps(drawn)}\n")
+    arguments = parse_and_start_jax(parser)
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    arguments.folder = arguments.folder.resolve()
+    os.chdir(arguments.folder)  # An invalid value may be the name of a store.
+    generator, rows = np.random.default_rng(arguments.seed), []
+    with (arguments.folder / "random_calls.log").open("w") as log:
+        for number in range(arguments.calls):
+            name, changes = draw_changes(generator)
+            log.write(f"{number} {name} {json.dumps(changes)}\n")
             log.flush()
-            ending = make_call(name, {x: hostile_values()[value] for x, value in drawn.items()})
-            rows.append((number, name, json.dumps(drawn), *ending))
+            ending = make_call(name, {x: hostile_values()[value] for x, value in changes.items()})
+            rows.append((number, name, json.dumps(changes), *ending))
     faults = [row for row in rows if row[3] in FAULTS]
     header = ("number", "call", "hostile", "ending", "error", "seconds")
-    write_table(chosen.folder / "random_calls.csv", header, rows)
+    write_table(arguments.folder / "random_calls.csv", header, rows)
     for row in faults:
         print(*row[:5], sep=" | ")
     print(dict(Counter(row[3] for row in rows)), f"longest {max(row[5] for row in rows):.1f} s")

@@ -1,1 +1,1 @@
-"""What every experiment needs: its command, its tables, its clock, its wheels."""
+"""Helpers of all experiments: command lines, tables, timing and random wheels."""

@@ -1,8 +1,9 @@
-"""Simulate pictures for readers without green cones, to whom different colors must not look alike.
+"""Simulate how a reader with deuteranopia sees a picture, to check that different colors stay
+distinct.
 
     python -m experiments.shared.color_vision PICTURE.png ... [--out FOLDER]
 
-Deuteranopia by Machado, Oliveira and Fernandes (2009), on linear light.
+The matrix of Machado, Oliveira and Fernandes (2009) acts on linear light.
 """
 
 from pathlib import Path
@@ -19,14 +20,14 @@ DEUTERANOPIA_MATRIX = np.array([
 ])  # fmt: skip
 
 
-def simulate_color_vision(colours: np.ndarray) -> np.ndarray:
-    """Colours, (..., 3) from 0 to 1 as pictures hold them, without green cones."""
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    observed_values = np.clip(linear @ DEUTERANOPIA_MATRIX.T, 0.0, 1.0)
+def simulate_color_vision(colors: np.ndarray) -> np.ndarray:
+    """Return colors as a reader with deuteranopia sees them, sRGB from 0 to 1, shape (..., 3)."""
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    simulated_light = np.clip(linear @ DEUTERANOPIA_MATRIX.T, 0.0, 1.0)
     return np.where(
-        observed_values <= 0.0031308,
-        12.92 * observed_values,
-        1.055 * observed_values ** (1.0 / 2.4) - 0.055,
+        simulated_light <= 0.0031308,
+        12.92 * simulated_light,
+        1.055 * simulated_light ** (1.0 / 2.4) - 0.055,
     )
 
 
@@ -34,12 +35,12 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("pictures", type=Path, nargs="+", metavar="PICTURE.png")
     parser.add_argument("--out", type=Path, default=Path("results/color_vision"))
-    chosen = parser.parse_args()
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    for path in chosen.pictures:
-        colours = np.asarray(Image.open(path).convert("RGB")) / 255.0
-        Image.fromarray(np.uint8(np.round(255.0 * simulate_color_vision(colours)))).save(
-            chosen.out / path.name
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for path in arguments.pictures:
+        colors = np.asarray(Image.open(path).convert("RGB")) / 255.0
+        Image.fromarray(np.uint8(np.round(255.0 * simulate_color_vision(colors)))).save(
+            arguments.out / path.name
         )
 
 

@@ -1,4 +1,4 @@
-"""How an experiment is called, and what it says where a package is missing."""
+"""Command lines of the experiments, and the error if a package is missing."""
 
 import argparse
 import importlib
@@ -8,11 +8,12 @@ from types import ModuleType
 
 import vrw_jax as vrw
 
-EXTRA = 'pip install -e ".[experiments]"'
+INSTALL_COMMAND = 'pip install -e ".[experiments]"'
+"""Command that installs the packages of the experiments."""
 
 
 def make_parser(doc: str | None) -> argparse.ArgumentParser:
-    """A parser that tells the script's own docstring."""
+    """Return a parser whose help shows the docstring of the script."""
     spec = sys.modules["__main__"].__spec__
     return argparse.ArgumentParser(
         f"python -m {spec.name}" if spec else None,
@@ -22,21 +23,22 @@ def make_parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def parse_and_start_jax(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What is asked for, and JAX as the library's users start it."""
-    chosen = parser.parse_args()
+    """Return the parsed arguments, after starting JAX as users of the library do."""
+    arguments = parser.parse_args()
     vrw.start_jax()
-    return chosen
+    return arguments
 
 
 def parse_folder_and_start_jax(doc: str | None) -> Path:
-    """The folder that a script writes to: the one given, or `results`."""
+    """Return the folder for the results, `results` by default, after starting JAX."""
     parser = make_parser(doc)
     parser.add_argument("folder", type=Path, nargs="?", default="results")
     return parse_and_start_jax(parser).folder
 
 
-def require_extra(name: str, install: str = EXTRA) -> ModuleType:
-    """A package that the library does without, or one sentence that says how to get it."""
+def require_extra(name: str, install: str = INSTALL_COMMAND) -> ModuleType:
+    """Import and return an optional package; if it is missing, exit with one sentence that names
+    the remedy."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as missing:

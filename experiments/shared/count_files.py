@@ -1,10 +1,10 @@
-"""Number of files of the library of which functions run in four calls, for the architecture page.
+"""Count the files of the library of which functions run in four calls, for the architecture page.
 
     python -m experiments.shared.count_files [CALL]
 
-Counts the files of which at least one function runs, without the packages that check, print, cache
-and compile. Without CALL, each call runs in a process of its own, without a cache on disk, because
-a trace from a cache runs no functions.
+A file counts if at least one of its functions runs. The packages that check, print, cache and
+compile do not count. Without CALL, each call runs in a process of its own without a cache on disk,
+because a trace from a cache runs no functions.
 """
 
 import os
@@ -20,33 +20,35 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser
 
-LIBRARY = Path(vrw.__file__).parent
+LIBRARY_FOLDER = Path(vrw.__file__).parent
+"""Folder of the package `vrw_jax`."""
 UNCOUNTED_PACKAGES = ("validation", "printing", "runtime", "simd")
+"""Packages of which no file is counted."""
 
 
-def step() -> object:
+def run_step() -> object:
     return vrw.step(vrw.WheelParams(), vrw.paper_start())
 
 
-def limit_cycle() -> object:
+def run_limit_cycle() -> object:
     return vrw.limit_cycle(vrw.WheelParams())
 
 
-def gradient() -> object:
+def run_gradient() -> object:
     return jax.grad(lambda params: vrw.limit_cycle(params).dls_fraction)(vrw.WheelParams())
 
 
-def contact_batch() -> object:
+def run_contact_batch() -> object:
     params = vrw.WheelParams(damping=np.full(4, 150.0))
     starts = np.tile(vrw.paper_start(), (4, 1))
     return vrw.step_batch(params, starts, model=vrw.UnilateralWheel())
 
 
 CALLS: dict[str, Callable[[], object]] = {
-    "step": step,
-    "limit_cycle": limit_cycle,
-    "gradient": gradient,
-    "contact_batch": contact_batch,
+    "step": run_step,
+    "limit_cycle": run_limit_cycle,
+    "gradient": run_gradient,
+    "contact_batch": run_contact_batch,
 }
 
 
@@ -55,10 +57,11 @@ def list_files(call: Callable[[], object]) -> list[str]:
     files: dict[str, None] = {}
 
     def record(frame: FrameType, event: str, _: object) -> None:
+        """Add the file of a called function of the library to `files`."""
         path = Path(frame.f_code.co_filename)
         is_function = event == "call" and frame.f_code.co_name != "<module>"
-        if is_function and path.is_relative_to(LIBRARY) and path.name != "__init__.py":
-            relative_path = path.relative_to(LIBRARY)
+        if is_function and path.is_relative_to(LIBRARY_FOLDER) and path.name != "__init__.py":
+            relative_path = path.relative_to(LIBRARY_FOLDER)
             if relative_path.parts[0] not in UNCOUNTED_PACKAGES:
                 files[str(relative_path)] = None
 
@@ -74,7 +77,7 @@ if __name__ == "__main__":
     call_name = parser.parse_args().call
     if call_name:
         if call_name == "gradient":
-            limit_cycle()  # The count is that of what the gradient adds.
+            run_limit_cycle()  # The gradient's count then holds only the files that it adds.
         files = list_files(CALLS[call_name])
         print(f"{call_name}: {len(files)} files\n  " + "\n  ".join(files))
     else:

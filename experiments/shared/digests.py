@@ -1,10 +1,10 @@
-"""A change that moves code leaves every bit of what is computed: digests of results, by engine.
+"""Print digests of results by engine, which show whether a change of the code keeps every bit.
 
     python -m experiments.shared.digests FILE [--only GROUP ...] [--numbers FOLDER]
 
-Writes one line a result; run it before and after, on one machine, and compare by `diff`.
-`--numbers` keeps the numbers too, for changes that move last digits: `--against FOLDER` says by how
-much.
+The command writes one line per result to FILE. Run it before and after the change on one machine,
+and compare the files with `diff`. With `--numbers FOLDER` it also stores the numbers. With
+`--against FOLDER` it prints their largest relative change.
 """
 
 import hashlib
@@ -20,17 +20,22 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 
-LANES, CYCLES = 4096, 1024
-Numbers = dict[str, np.ndarray]
+N_STEP_WHEELS = 4096
+"""Number of wheels of the batches of steps."""
+N_CYCLE_WHEELS = 1024
+"""Number of wheels of the batch of limit cycles."""
+NumberTable = dict[str, np.ndarray]
+"""Arrays of a result by their names."""
 
 
-def collect_numbers(tree: object) -> Numbers:
-    """Every array of a result, by its place in it."""
+def collect_numbers(tree: object) -> NumberTable:
+    """Return all arrays of a result, by their path in it."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
 
 def draw_wheels(n: int, seed: int) -> vrw.WheelParams:
+    """Return `n` random wheels."""
     draw = np.random.default_rng(seed).uniform
     return vrw.WheelParams(
         damping=draw(20.0, 215.0, n),
@@ -40,15 +45,16 @@ def draw_wheels(n: int, seed: int) -> vrw.WheelParams:
     )
 
 
-def digest_steps() -> Iterator[tuple[str, Numbers]]:
-    params = draw_wheels(LANES, 1)
+def digest_steps() -> Iterator[tuple[str, NumberTable]]:
+    """Yield steps of a batch by each engine, and steps with unilateral contact."""
+    params = draw_wheels(N_STEP_WHEELS, 1)
     draw = np.random.default_rng(2)
     states = np.asarray(vrw.limit_cycle(vrw.WheelParams()).section_state)
-    states = states * draw.uniform(0.98, 1.02, (LANES, 3))
-    lanes = vrw.step_batch(params, states)
-    yield "steps by lanes", collect_numbers(lanes)
+    states = states * draw.uniform(0.98, 1.02, (N_STEP_WHEELS, 3))
+    batch_result = vrw.step_batch(params, states)
+    yield "steps by lanes", collect_numbers(batch_result)
     yield "steps by diffrax", collect_numbers(vrw.step_batch(params, states, engine="diffrax"))
-    expected = np.asarray(lanes.durations) * draw.uniform(0.98, 1.02, (LANES, 3))
+    expected = np.asarray(batch_result.durations) * draw.uniform(0.98, 1.02, (N_STEP_WHEELS, 3))
     by_collocation = vrw.step_batch(params, states, engine="collocation", durations=expected)
     yield "steps by collocation", collect_numbers(by_collocation)
     ground = vrw.UnilateralWheel(friction=2.0)
@@ -59,39 +65,42 @@ def digest_steps() -> Iterator[tuple[str, Numbers]]:
     )
 
 
-def digest_single_wheel() -> Iterator[tuple[str, Numbers]]:
+def digest_single_wheel() -> Iterator[tuple[str, NumberTable]]:
+    """Yield a step of one wheel, its Jacobian, a trajectory and a walk with unilateral contact."""
     table_1 = vrw.WheelParams()
     x = vrw.limit_cycle(table_1).section_state
     yield "step", collect_numbers(vrw.step(table_1, x))
-    by_input = jax.jacfwd(vrw.return_map, argnums=(0, 1))(table_1, x)
-    yield "return map's Jacobian", collect_numbers(by_input)
+    jacobians = jax.jacfwd(vrw.return_map, argnums=(0, 1))(table_1, x)
+    yield "return map's Jacobian", collect_numbers(jacobians)
     walk = vrw.simulate(table_1, x, n_steps=2)
     yield "trajectory", {str(name): np.asarray(walk[name]) for name in walk.data_vars}
     ground = vrw.UnilateralWheel(friction=1.5)
     yield "walk on real ground", collect_numbers(vrw.walk(table_1, x, 5, model=ground))
 
 
-def digest_cycles() -> Iterator[tuple[str, Numbers]]:
+def digest_cycles() -> Iterator[tuple[str, NumberTable]]:
+    """Yield a scan of limit cycles with derivatives of their measures."""
     names = ("dls_fraction", "speed", "period", "lambda_I4", "lambda_4_plus")
     design = vrw.samples(
         {
-            name: np.asarray(getattr(draw_wheels(CYCLES, 3), name))
+            name: np.asarray(getattr(draw_wheels(N_CYCLE_WHEELS, 3), name))
             for name in ("damping", "stiffness", "natural_length", "slope")
         }
     )
-    slopes = [
-        f"d {name} / d {by_input}"
+    derivatives = [
+        f"d {name} / d {input_name}"
         for name in names
-        for by_input in ("damping", "slope", "leg_mass")
+        for input_name in ("damping", "slope", "leg_mass")
     ]
-    scan_result = vrw.scan(design, [*names, *slopes])
+    scan_result = vrw.scan(design, [*names, *derivatives])
     yield (
         "cycles with derivatives",
         {str(name): np.asarray(scan_result[name]) for name in scan_result},
     )
 
 
-def digest_quickstart() -> Iterator[tuple[str, Numbers]]:
+def digest_quickstart() -> Iterator[tuple[str, NumberTable]]:
+    """Yield the scan of `configs/quickstart.toml`, computed into a store."""
     text = (Path(__file__).parents[2] / "configs" / "quickstart.toml").read_text()
     config = tomllib.loads(text)
     with TemporaryDirectory() as folder:
@@ -110,26 +119,34 @@ def digest_quickstart() -> Iterator[tuple[str, Numbers]]:
         )
 
 
-def digest_branch() -> Iterator[tuple[str, Numbers]]:
+def digest_branch() -> Iterator[tuple[str, NumberTable]]:
+    """Yield a branch along the damping with its special points."""
     branch_result = vrw.continue_branch(vrw.WheelParams(), "damping", (4.0, 230.0))
-    borders = {
-        f"border {border.name}": np.asarray(border.value) for border in branch_result.special_points
+    special_points = {
+        f"border {special_point.name}": np.asarray(special_point.value)
+        for special_point in branch_result.special_points
     }
     points = {
         str(name): np.asarray(branch_result.dataset[name])
         for name in branch_result.dataset.variables
     }
-    yield "branch", borders | points
+    yield "branch", special_points | points
 
 
-def digest_tuning() -> Iterator[tuple[str, Numbers]]:
+def digest_tuning() -> Iterator[tuple[str, NumberTable]]:
+    """Yield the result and the path of a tuning."""
     bounds = {"damping": (20.0, 215.0), "slope": (0.26, 0.34)}
-    tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", list(bounds), bounds)
-    path = {f"path {name}": np.asarray(tuned.path[name]) for name in tuned.path.data_vars}
-    yield "tuning", collect_numbers((tuned.params, tuned.value, tuned.kkt_residual)) | path
+    tune_result = vrw.tune(vrw.WheelParams(), "dls_fraction", list(bounds), bounds)
+    path = {
+        f"path {name}": np.asarray(tune_result.path[name]) for name in tune_result.path.data_vars
+    }
+    yield (
+        "tuning",
+        collect_numbers((tune_result.params, tune_result.value, tune_result.kkt_residual)) | path,
+    )
 
 
-GROUPS: dict[str, Callable[[], Iterator[tuple[str, Numbers]]]] = {
+GROUPS: dict[str, Callable[[], Iterator[tuple[str, NumberTable]]]] = {
     "steps": digest_steps,
     "one_wheel": digest_single_wheel,
     "cycles": digest_cycles,
@@ -140,7 +157,8 @@ GROUPS: dict[str, Callable[[], Iterator[tuple[str, Numbers]]]] = {
 """Functions that compute results, by the names of `--only`."""
 
 
-def compute_digest(numbers: Numbers) -> str:
+def compute_digest(numbers: NumberTable) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 hash of a result."""
     result = hashlib.sha256()
     for name in sorted(numbers):
         value = numbers[name]
@@ -149,25 +167,25 @@ def compute_digest(numbers: Numbers) -> str:
     return result.hexdigest()[:16]
 
 
-def compute_distance(values_here: Numbers, values_there: Numbers) -> str:
-    """The largest relative difference, of which number; names that only one side has."""
-    worst, where = 0.0, "none"
+def compute_distance(values_here: NumberTable, values_there: NumberTable) -> str:
+    """Return as text the largest relative difference and the names that only one side has."""
+    worst, worst_name = 0.0, "none"
     for name in values_here.keys() & values_there.keys():
         x, y = values_here[name], values_there[name]
         if x.shape != y.shape:
-            return f"{name} has shape {x.shape}, and had {y.shape}"
+            return f"{name} has shape {x.shape}, previously {y.shape}"
         if x.dtype.kind != "f":
             if not np.array_equal(x, y):
                 return f"{np.sum(x != y)} of {x.size} values of {name} differ"
             continue
         scale = 1e-300 + np.max(np.abs(y), initial=0.0, where=np.isfinite(y))
-        away = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y)) / scale
-        if away.size and not np.max(away) <= worst:
-            worst, where = float(np.max(away)), name
-    sorted_items = sorted(values_here.keys() ^ values_there.keys())
+        relative_change = np.where(np.isnan(x) & np.isnan(y), 0.0, np.abs(x - y)) / scale
+        if relative_change.size and not np.max(relative_change) <= worst:
+            worst, worst_name = float(np.max(relative_change)), name
+    unshared_names = sorted(values_here.keys() ^ values_there.keys())
     return (
         f"largest relative difference {worst:.1e} "
-        f"({where}){f'; alone: {sorted_items}' * bool(sorted_items)}"
+        f"({worst_name}){f'; on one side only: {unshared_names}' * bool(unshared_names)}"
     )
 
 
@@ -183,12 +201,12 @@ def main() -> None:
         for name, numbers in GROUPS[group]():
             line = f"{compute_digest(numbers)}  {name}"
             lines.append(line)
-            place = f"{name.replace(' ', '_')}.npz"
+            file_name = f"{name.replace(' ', '_')}.npz"
             if arguments.numbers:
                 arguments.numbers.mkdir(parents=True, exist_ok=True)
-                np.savez(arguments.numbers / place, **numbers)
+                np.savez(arguments.numbers / file_name, **numbers)
             if arguments.against:
-                with np.load(arguments.against / place) as values_there:
+                with np.load(arguments.against / file_name) as values_there:
                     line += f"  {compute_distance(numbers, dict(values_there))}"
             print(line, flush=True)
     arguments.file.write_text("\n".join(lines) + "\n")

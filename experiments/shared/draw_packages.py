@@ -1,10 +1,10 @@
-"""The graph of the packages, drawn from their imports, with the number of names per import.
+"""Draw the graph of the packages from their imports, with the number of imported names.
 
     python -m experiments.shared.draw_packages [folder]
 
-Writes `package_graph.svg` and `package_graph.png` to `docs/figures` or the given folder. The
-package is read, not run. Every import counts: inside functions, through `__init__` files and for
-type checkers.
+The command writes `package_graph.svg` and `package_graph.png` to `docs/figures` or the given
+folder. It reads the sources and does not run them. It counts every import, also those inside
+functions, through `__init__` files and for type checkers.
 """
 
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Tables of numbers as csv files and in pages."""
+"""Read and write tables as csv files and as blocks of pages."""
 
 import csv
 import subprocess
@@ -12,41 +12,47 @@ import numpy as np
 from experiments.shared.timing import describe_processor
 
 DOCS = Path(__file__).parents[2] / "docs"
+"""Folder of the pages."""
 FIGURES = DOCS / "figures"
+"""Folder of the figures and of their data."""
 SOURCE_LINE_START = "Command:"
+"""First word of the line below a measured block."""
 Row = dict[str, str]
+"""Cells of one line of a table, by the names of the columns."""
 
 
 def read_table(path: Path) -> list[Row]:
+    """Return the rows of a csv file."""
     with path.open() as file:
         return list(csv.DictReader(file))
 
 
 def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a csv file, and create its folder if necessary."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", errors="backslashreplace") as file:
         csv.writer(file).writerows([header, *rows])
 
 
 def write_named_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Rows by names of columns; a row may lack some."""
+    """Write rows given by column names to a csv file; a missing cell stays empty."""
     header = dict.fromkeys(name for row in rows for name in row)
     write_table(path, header, [[row.get(name, "") for name in header] for row in rows])
 
 
 def read_column(rows: Iterable[Row], name: str) -> np.ndarray:
-    """A column."""
+    """Return one column as an array of floats."""
     return np.array([float(row[name]) for row in rows])
 
 
 def group_rows(rows: Sequence[Row], name: str) -> dict[str, list[Row]]:
-    """Rows by one of their columns, in order."""
+    """Return the rows by their value in one column, in order of first appearance."""
     keys = dict.fromkeys(map(itemgetter(name), rows))
     return {key: [row for row in rows if row[name] == key] for key in keys}
 
 
 def format_markdown(header: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
-    """A table of a page."""
+    """Return a table in Markdown."""
     names = list(header)
     lines = [" | ".join(map(str, cells)) for cells in (names, *rows)]
     lines.insert(1, "|".join("---" for _ in names))
@@ -66,8 +72,8 @@ def describe_run(module: str) -> str:
 def replace_block(page: Path, name: str, text: str, source: str | None = None) -> None:
     """Replace the text between two marks of a page.
 
-    The block ends with `source`, the line of `describe_run`. Without it the line that stands there
-    is kept: a table drawn again from stored numbers still belongs to the run that measured them.
+    The block ends with `source`, the line of `describe_run`. Without `source` the present last line
+    stays: a table drawn again from stored numbers belongs to the run that measured them.
     """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     head, rest = page.read_text().split(begin)

@@ -1,4 +1,4 @@
-"""Clocks of one core, and a start with nothing compiled before."""
+"""Measure CPU time on one core, and start JAX without compiled programs."""
 
 import contextlib
 import os
@@ -18,14 +18,15 @@ from vrw_jax.simd import code_cache as code
 
 @contextlib.contextmanager
 def use_one_core() -> Iterator[None]:
-    """All threads on one core: two that wait for each other would both be counted."""
-    if not hasattr(os, "sched_setaffinity"):  # Linux alone has it
+    """Run all threads on one core, because two threads that wait for each other would both be
+    counted."""
+    if not hasattr(os, "sched_setaffinity"):  # Only Linux has the function.
         yield
         return
     cores = os.sched_getaffinity(0)
     threads = [int(name) for name in os.listdir("/proc/self/task")]
     for thread in threads:
-        with contextlib.suppress(ProcessLookupError):  # it has ended since
+        with contextlib.suppress(ProcessLookupError):  # The thread may have ended.
             os.sched_setaffinity(thread, {max(cores)})
     try:
         yield
@@ -36,7 +37,7 @@ def use_one_core() -> Iterator[None]:
 
 
 def start_without_cache() -> None:
-    """JAX as users start it, on a CPU's one thread, its cache thrown away with what it held."""
+    """Start JAX as users do, on one thread of the CPU, with empty caches on disk and in memory."""
     global _cache
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_platforms", "cpu")
@@ -44,34 +45,35 @@ def start_without_cache() -> None:
     code._code_by_name.clear()
     _cache = tempfile.TemporaryDirectory()
     vrw.start_jax(_cache.name)
-    compilation_cache.reset_cache()  # it may have opened another folder
+    compilation_cache.reset_cache()  # The cache may have opened another folder.
 
 
 def measure_cpu_seconds(
     call: Callable[[], object],
     repeats: int = 5,
-    enough: float = float("inf"),
-    result: Callable[[list[float]], float] = statistics.median,
+    max_seconds: float = float("inf"),
+    reduction: Callable[[list[float]], float] = statistics.median,
 ) -> float:
-    """CPU time of a call that has been made before: the median of repeats, or what else is told.
+    """Return the CPU time of a call that has run before, s; by default the median of the repeats.
 
-    Repeats end once they have taken `enough` seconds.
+    Repeats end when they have taken `max_seconds` together. `reduction` converts the times of the
+    repeats to one number.
     """
-    used_values: list[float] = []
-    while not used_values or (len(used_values) < repeats and sum(used_values) < enough):
-        began = time.process_time()
+    seconds: list[float] = []
+    while not seconds or (len(seconds) < repeats and sum(seconds) < max_seconds):
+        start_time = time.process_time()
         jax.block_until_ready(call())
-        used_values.append(time.process_time() - began)
-    return result(used_values)
+        seconds.append(time.process_time() - start_time)
+    return reduction(seconds)
 
 
 def describe_processor() -> str:
-    """The CPU's own name, and how wide its vectors are."""
+    """Return the name of the CPU and its widest vector instructions."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
     name = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), "a CPU")
     flags = next((x for x in lines if x.startswith("flags")), "")
-    wide = " AVX-512" if "avx512f" in flags else " AVX2" if "avx2" in flags else ""
-    return name + wide
+    vector_instructions = " AVX-512" if "avx512f" in flags else " AVX2" if "avx2" in flags else ""
+    return name + vector_instructions

@@ -34,9 +34,9 @@ def main() -> None:
     print(f"{len(curves)} curves, {n} points, {sum(len(c.codim2_points) for c in curves)} meetings")
     with use_one_core():
         duration_seconds = measure_cpu_seconds(
-            lambda: tracer.trace_curves(seeds, ()), repeats, result=min
+            lambda: tracer.trace_curves(seeds, ()), repeats, reduction=min
         )
-        both_values = duration_seconds + measure_cpu_seconds(begin, repeats, result=min)
+        both_values = duration_seconds + measure_cpu_seconds(begin, repeats, reduction=min)
     print(
         f"{duration_seconds:.2f} s, {n / duration_seconds:.0f} points a second; with the "
         f"branches {n / both_values:.0f}"

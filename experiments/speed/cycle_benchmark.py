@@ -49,7 +49,7 @@ def measure_least_seconds(function: Callable, *arguments: object) -> float:
     """CPU seconds of a call on one core."""
     jax.block_until_ready(function(*arguments))
     with use_one_core():
-        return measure_cpu_seconds(lambda: function(*arguments), result=min)
+        return measure_cpu_seconds(lambda: function(*arguments), reduction=min)
 
 
 STARTS = {

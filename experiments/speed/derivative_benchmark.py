@@ -91,7 +91,7 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
         run = lambda: vrw.step_batch(params, states, options=options, derivatives=requested_2)
         result = run()
         with use_one_core():
-            return result, 1e6 * measure_cpu_seconds(run, repeats, result=min) / n
+            return result, 1e6 * measure_cpu_seconds(run, repeats, reduction=min) / n
 
     for tolerance in (1e-6, 1e-8, 1e-10):
         choose = lambda factor, at=tolerance: vrw.StepOptions(

@@ -19,7 +19,7 @@ from vrw_jax.wheel import transitions
 hy = require_extra("heyoka")
 
 COLUMNS = 7
-"""Section state, then c, k, L*, phi: the order of `experiments.shared.wheels.BOX`."""
+"""Section state, then c, k, L*, phi: the order of `experiments.shared.wheels.PARAMETER_BOX`."""
 
 
 def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:

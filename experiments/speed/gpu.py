@@ -23,7 +23,7 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
-from experiments.shared.wheels import BOX, draw_parameter_rows, make_wheels
+from experiments.shared.wheels import PARAMETER_BOX, draw_parameter_rows, make_wheels
 
 COLUMNS = ("section_state", "damping", "stiffness", "natural_length", "slope")
 LARGEST_ERROR = 1e-8
@@ -60,7 +60,7 @@ def _cycles(rows: np.ndarray) -> np.ndarray:
 
 def _scan(rows: np.ndarray) -> np.ndarray:
     names = ("speed", "dls_fraction", "spectral_radius")
-    design = vrw.samples(dict(zip(BOX, rows.T, strict=True)))
+    design = vrw.samples(dict(zip(PARAMETER_BOX, rows.T, strict=True)))
     scan_result = vrw.scan(design, names)
     return np.stack([np.nan_to_num(scan_result[name].values) for name in names], 1)
 
@@ -78,7 +78,9 @@ def measure_job(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
     """(job, numbers, lanes a second, seconds of compiling) on the default device."""
     result_list = []
     for name, (job, share) in JOBS.items():
-        rows = draw_parameter_rows(BOX, max(16, int(share * lanes)), np.random.default_rng(3))
+        rows = draw_parameter_rows(
+            PARAMETER_BOX, max(16, int(share * lanes)), np.random.default_rng(3)
+        )
         times = []
         for _ in range(2):
             began = time.perf_counter()

@@ -23,7 +23,7 @@ import pytest
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, require_extra
 from experiments.shared.timing import start_without_cache, use_one_core
-from experiments.shared.wheels import BOX, draw_parameter_rows, make_wheels
+from experiments.shared.wheels import PARAMETER_BOX, draw_parameter_rows, make_wheels
 
 START = (0.1, 1.6, -0.1)
 RUNNING = {
@@ -45,7 +45,7 @@ FIRST_CALLS = {
 
 def rows(n: int) -> np.ndarray:
     """Parameters of some wheels, the same each time."""
-    return draw_parameter_rows(BOX, n, np.random.default_rng(0))
+    return draw_parameter_rows(PARAMETER_BOX, n, np.random.default_rng(0))
 
 
 many_cycles = jax.jit(jax.vmap(lambda row: vrw.limit_cycle(make_wheels(row)).period))

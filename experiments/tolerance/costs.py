@@ -24,7 +24,7 @@ from experiments.shared.tables import (
     show_table,
     write_table,
 )
-from experiments.shared.wheels import BOX
+from experiments.shared.wheels import PARAMETER_BOX
 from vrw_jax.tolerance.measure_result import MeasureStatus
 from vrw_jax.tolerance.multifidelity import SAMPLING_OPTIONS
 
@@ -32,7 +32,7 @@ TOL, FRICTION = 1e-3, (15.0, 100.0)
 TABLE = FIGURES / "answers_means.csv"
 N_MEAN, N_SCAN = 1000, 128
 NARROW_BOX = {"damping": (140.0, 160.0), "stiffness": (480.0, 520.0), "slope": (0.29, 0.31)}
-DESIGNS = {"around Table 1": (NARROW_BOX, (2e-3, 2e-4)), "box": (BOX, (1e-2,))}
+DESIGNS = {"around Table 1": (NARROW_BOX, (2e-3, 2e-4)), "box": (PARAMETER_BOX, (1e-2,))}
 """With tolerances of means."""
 
 
@@ -43,7 +43,7 @@ def draw_wheels(box: dict[str, tuple[float, float]], n: int) -> dict[str, np.nda
 
 def compare_with_unilateral_model(n: int, repeats: int) -> None:
     """Of all wheels, and of those that begin at a gait of the paper's and end near it."""
-    columns = draw_wheels(BOX, n)
+    columns = draw_wheels(PARAMETER_BOX, n)
     columns["friction"] = np.exp(np.random.default_rng(2).uniform(*np.log(FRICTION), n))
     design = vrw.samples(columns)
     scan_result = vrw.scan(design, ["speed"], model=vrw.UnilateralWheel(), tol=TOL)

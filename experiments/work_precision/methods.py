@@ -23,13 +23,13 @@ import numpy as np
 import optimistix as optx
 
 import vrw_jax as vrw
-from experiments.shared.wheels import BOX, make_wheels
+from experiments.shared.wheels import PARAMETER_BOX, make_wheels
 from experiments.speed import peers
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.wheel import make_phases, transitions
 
-VARIED_PARAMETERS = tuple(BOX)
+VARIED_PARAMETERS = tuple(PARAMETER_BOX)
 Run = Callable[[], np.ndarray]
 
 

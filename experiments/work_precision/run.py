@@ -45,7 +45,7 @@ TABLE, BATCH_TABLE = FIGURES / "work_precision.csv", FIGURES / "work_precision_b
 KEY = ("group", "family", "name", "precision", "setting", "lanes")
 SHARES = {"p50": 0.5, "p99": 0.99, "worst": 1.0}
 REFERENCE_TOLERANCE = 1e-8
-measure_repeated = functools.partial(measure_cpu_seconds, repeats=5, enough=0.5)
+measure_repeated = functools.partial(measure_cpu_seconds, repeats=5, max_seconds=0.5)
 MAX_REPEATED_SECONDS = (
     20.0  # s: a first call that compiles nothing and lasts as long is not repeated
 )

@@ -18,7 +18,7 @@ from rich.progress import track
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
-from experiments.shared.wheels import BOX, draw_wheels_near_gaits, make_wheels
+from experiments.shared.wheels import PARAMETER_BOX, draw_wheels_near_gaits, make_wheels
 
 require_extra("heyoka")
 from tests.oracle import multiprecision  # noqa: E402  the oracle needs heyoka
@@ -31,7 +31,7 @@ LANES, CHECKED_EVERY = 256, 16
 BITS, DIGITS = 100, 29
 SIZE = mp.mpf("1e-10")
 NEWTON_TOLERANCE = mp.mpf("1e-22")  # the last change leaves an error far below it
-VARIED_PARAMETERS = tuple(BOX)
+VARIED_PARAMETERS = tuple(PARAMETER_BOX)
 SHAPES = {
     "step": (6,),  # section state and durations after one step from `start`
     "post_impact": (2,),  # after the landing that follows
