@@ -12,6 +12,9 @@ from jax import lax
 
 from vrw_jax import simd
 from vrw_jax.simd import lowering
+from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL
+from vrw_jax.simd.code_cache import trace_for_machine_code
+from vrw_jax.simd.kernel import write_module
 
 KEYS = itertools.count()
 N_ARRAYS = 3
@@ -94,3 +97,12 @@ def test_loops_in_place_compute_what_loops_with_copies_compute(operations, reads
     np.testing.assert_array_equal(in_place, run_as_machine_code(program, x, forces_copies=True))
     # Reference: XLA, to the rounding of fused products.
     np.testing.assert_allclose(in_place, jax.jit(program)(x), rtol=1e-12, atol=1e-12)
+
+
+def test_a_loop_that_updates_an_array_allocates_it_once():
+    double_row = lambda i, y: lax.dynamic_update_index_in_dim(y, 2.0 * y[i], i, 0)
+    program = lambda x: lax.fori_loop(0, N_ROWS, double_row, 3.0 * x)
+    limits = simd.RegisterLimits(1, 1, max_registers=2, max_registers_inner=2)
+    shape = jax.ShapeDtypeStruct((N_ROWS, LANE_AXIS_SENTINEL), np.float64)
+    text = write_module(trace_for_machine_code(program, shape), 4, limits)
+    assert text.count(f"alloca <4 x double>, i64 {N_ROWS}") == 1
