@@ -31,7 +31,9 @@ from vrw_jax.integrator import (
 from vrw_jax.models.phase_sequence import (
     PAPER_START,
     PhaseResult,
+    PhaseRunner,
     PhaseSequenceResult,
+    finish_step,
     make_advance_result,
     make_step_result,
     make_trajectory,
@@ -284,6 +286,21 @@ def run_batch_phases(
     - `is_noinline`: see `BatchPhase`;
     - `land`: function of the landing that opens the step.
     """
+    run_phase = _make_phase_runner(
+        options, tableau, records_margins, straggler_count, is_noinline, stiff_start
+    )
+    return run_phases(run_phase, params, x, options, stop_at_lift_off, with_batched_jvp(land))
+
+
+def _make_phase_runner(
+    options: StepOptions,
+    tableau: ButcherTableau,
+    records_margins: bool,
+    straggler_count: Array | None,
+    is_noinline: bool,
+    stiff_start: StiffStartOptions,
+) -> PhaseRunner:
+    """Return a function that integrates one phase of every lane to its end."""
 
     def run_phase(
         phase: AbstractPhase,
@@ -334,7 +351,7 @@ def run_batch_phases(
             engine_carry=_PhaseCarry(phase_end.next_dt, is_active, phase_end.is_unfinished),
         )
 
-    return run_phases(run_phase, params, x, options, stop_at_lift_off, with_batched_jvp(land))
+    return run_phase
 
 
 def can_use_lanes(options: StepOptions) -> bool:
@@ -429,6 +446,27 @@ def build_step_function(
     config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
     cache_key = ("gait step", *config.cache_key)
     return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
+
+
+def build_step_finisher(
+    argument_structure: Any, phase_index: int, stop_at_lift_off: bool
+) -> BatchFunction:
+    """Return a function from the leaves of (params, distance, state, options) to the floats and
+    others of `finish_step`.
+    """
+
+    def compute_outputs(*leaves: Array) -> tuple:
+        params, distance, state, options = jax.tree.unflatten(argument_structure, leaves)
+        tableau = load_explicit_tableau(options.solver)
+        assert tableau is not None  # checked by `can_use_lanes`
+        run_phase = _make_phase_runner(options, tableau, False, None, True, STIFF_START_OPTIONS)
+        settings = options, stop_at_lift_off, "lanes"
+        result = finish_step(run_phase, params, phase_index, distance, tuple(state), *settings)
+        return eqx.partition(result, eqx.is_inexact_array)
+
+    config = _StaticConfig(argument_structure, stop_at_lift_off, None)
+    cache_key = ("end of a step", phase_index, *config.cache_key)
+    return unbatch(cached_lane_function(compute_outputs, config.make_template, cache_key))
 
 
 def build_step_sampler(

@@ -47,6 +47,8 @@ class AbstractWheel(eqx.Module):
     """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
     is_compliant: ClassVar[bool] = True
     """Whether springs and dampers affect the motion. Tuning and scans vary them only then."""
+    can_begin_within_step: ClassVar[bool] = False
+    """Whether the model has `finish_step`, so that a step can be disturbed at any instant."""
 
     def __repr__(self) -> str:
         if is_traced(self):
@@ -119,6 +121,24 @@ class AbstractWheel(eqx.Module):
 
         The type is `Trajectory`, or its counterpart for the model.
         """
+
+    def finish_step(
+        self,
+        params: WheelParams,
+        phase_index: int,
+        distance: Elementwise,
+        state: Float[Array, " 6"],
+        options: StepOptions,
+    ) -> AdvanceResult:
+        """Return the end of a step on flat ground, from a state within one of its phases.
+
+        - `phase_index`: index of the paper's phase;
+        - `distance`: distance between both feet in the double support of the step, m;
+        - `state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
+
+        Only models with `can_begin_within_step` have it.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
 
     @abc.abstractmethod
     def default_start(self, params: WheelParams) -> SectionState:

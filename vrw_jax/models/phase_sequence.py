@@ -5,6 +5,8 @@ the phases that take place, their starts, the end of the step and its results. A
 elementwise, for one wheel or a batch.
 """
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +24,7 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.numerics import Elementwise, StepOptions, Vector, sine_cosine, tree_where
 from vrw_jax.wheel import (
+    MAX_SI_VALUE,
     AbstractPhase,
     Landing,
     Motion,
@@ -94,9 +97,37 @@ def run_phases(
     landing = land(s, *x)
     tilt_sin_cos = () if tilt is None else sine_cosine(tilt)
     phases = make_phases(s, landing.distance, stop_at_lift_off, tilt_sin_cos)
-    theta, motion = landing.theta, landing.motion
     # A landing that releases the rear foot continues in SLS-I.
     is_active = is_valid & landing.keeps_rear_foot
+    last_phases = _run_last_phases(
+        run_phase, phases, landing.theta, landing.motion, is_valid, is_active, options
+    )
+    return PhaseSequenceResult(s, landing, phases, *last_phases, tilt)
+
+
+class _LastPhases(NamedTuple):
+    """Starts and ends of the last phases of a step; see `PhaseSequenceResult`."""
+
+    phase_starts: tuple[tuple[Vector, Vector], ...]
+    phase_ends: tuple[PhaseResult, ...]
+    phases_happened: tuple[Bool[Array, "..."], ...]
+    outcome: Int[Array, "..."]
+
+
+def _run_last_phases(
+    run_phase: PhaseRunner,
+    phases: tuple[AbstractPhase, ...],
+    theta: Elementwise,
+    motion: Motion,
+    is_valid: Array,
+    is_active: Array,
+    options: StepOptions,
+) -> _LastPhases:
+    """Return the results of the last phases of a step, from a motion in the first of them.
+
+    - `is_valid`: whether a step takes place;
+    - `is_active`: whether the first of the phases takes place.
+    """
     outcome = jnp.where(is_valid, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
     phase_starts, phases_happened = [], []
     phase_ends: list[PhaseResult] = []
@@ -129,15 +160,44 @@ def run_phases(
         phases_happened.append(
             is_active if phase is phases[-1] else is_active & (phase_end.duration > 0.0)
         )
-    return PhaseSequenceResult(
-        s,
-        landing,
-        phases,
-        tuple(phase_starts),
-        tuple(phase_ends),
-        tuple(phases_happened),
-        outcome,
-        tilt,
+    return _LastPhases(tuple(phase_starts), tuple(phase_ends), tuple(phases_happened), outcome)
+
+
+def finish_step(
+    run_phase: PhaseRunner,
+    params: WheelParams,
+    phase_index: int,
+    distance: Elementwise,
+    state: Vector,
+    options: StepOptions,
+    stop_at_lift_off: bool,
+    engine: str,
+) -> AdvanceResult:
+    """Return the end of a step on flat ground, from a state within one of its phases.
+
+    - `phase_index`: index of the phase in the step;
+    - `distance`: distance between both feet in the double support of the step, m;
+    - `state`: (theta, L1, L2) and their rates; those that follow from others in the phase are
+      ignored.
+    """
+    is_bounded = [jnp.abs(value) < MAX_SI_VALUE for value in (*state, distance)]
+    is_valid = params.is_in_domain() & functools.reduce(operator.and_, is_bounded)
+    is_valid = is_valid & (jnp.abs(state[0]) < 0.5 * jnp.pi)
+    params, (theta, *lengths_and_rates) = replace_invalid(
+        is_valid, params, state, SAFE_SINGLE_SUPPORT_STATE
+    )
+    phases = make_phases(params.symbols(), distance, stop_at_lift_off)[phase_index:]
+    motion = Motion.from_angle(theta, *lengths_and_rates)
+    last_phases = _run_last_phases(run_phase, phases, theta, motion, is_valid, is_valid, options)
+    phase_ends, has_stepped = last_phases.phase_ends, last_phases.outcome == Outcome.STEPPED
+    section_state = phase_ends[-1].q[0], *phase_ends[-1].v
+    durations = [jnp.zeros_like(theta)] * phase_index + [end.duration for end in phase_ends]
+    return AdvanceResult(
+        section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
+        durations=jnp.stack(durations),
+        outcome=last_phases.outcome,
+        solver_steps=functools.reduce(operator.add, [end.n_solver_steps for end in phase_ends]),
+        engine=engine,
     )
 
 

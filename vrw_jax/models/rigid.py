@@ -90,6 +90,7 @@ class RigidWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False
+    can_begin_within_step: ClassVar[bool] = True
 
     friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(
@@ -218,6 +219,40 @@ class RigidWheel(AbstractWheel):
             solver_steps=jnp.zeros_like(outcome),
         )
 
+    def finish_step(
+        self,
+        params: WheelParams,
+        phase_index: int,
+        distance: Elementwise,
+        state: Float[Array, " 6"],
+        options: StepOptions,
+    ) -> AdvanceResult:
+        """Return the end of the step from theta and its rate; other arguments have no effect."""
+        theta, rate = state[0], state[3]
+        s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, theta.dtype)
+        rolling_motion = RollingMotion(s, params.slope, rate, given_first_angle=theta)
+        apex_angle = jnp.maximum(theta, -params.slope)
+        passes_apex = (rate > 0.0) & (rolling_motion.rate_squared_at_angle(apex_angle) > 0.0)
+        angles = theta + (half_angle - theta) * jnp.linspace(
+            0.0, 1.0, MINIMUM_SEARCH_OPTIONS.n_angles
+        )
+        lowest_force = jnp.min(rolling_motion.foot_force_at_angle(angles).normal)
+        has_lifted_off = passes_apex & (lowest_force <= 0.0) & self.stop_at_lift_off
+        outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        has_stepped, zero = outcome == Outcome.STEPPED, jnp.zeros_like(rate)
+        safe_rate = jnp.where(has_stepped, rate, 10.0)
+        safe_motion = RollingMotion(s, params.slope, safe_rate, given_first_angle=theta)
+        end_rate = jnp.sqrt(safe_motion.rate_squared_at_angle(half_angle))
+        section_state = jnp.stack([half_angle + zero, end_rate, zero])
+        durations = jnp.stack([zero, zero, safe_motion.time_at_angle(half_angle)])
+        return AdvanceResult(
+            section_state=jnp.where(has_stepped, section_state, 0.0),
+            durations=jnp.where(has_stepped, durations, 0.0),
+            outcome=outcome,
+            solver_steps=jnp.zeros_like(outcome),
+        )
+
     def _landing_impulses(
         self, s: Symbols, x: StateValues, rolling_motion: "RollingMotion", friction: Elementwise
     ) -> tuple:
@@ -317,24 +352,32 @@ class VerticalMap(NamedTuple):
 
 
 class RollingMotion(eqx.Module):
-    """Rolling over one foot from theta = -alpha/2 at a given rate, by conservation of energy."""
+    """Rolling over one foot from a first angle at a given rate, by conservation of energy."""
 
     s: Symbols
     phi: Elementwise  # slope, rad
-    initial_rate: Elementwise  # at theta = -alpha/2, rad/s
+    initial_rate: Elementwise  # at the first angle, rad/s
     end_angle: Elementwise | None = None
     """Angle theta at the next landing, rad; None means alpha/2, as on flat ground."""
+    given_first_angle: Elementwise | None = None
+    """First angle theta, rad; None means -alpha/2, as just after a landing."""
+
+    @property
+    def first_angle(self) -> Elementwise:
+        """Return the first angle theta, rad."""
+        is_after_landing = self.given_first_angle is None
+        return -0.5 * self.s.alpha if is_after_landing else self.given_first_angle
 
     def rate_squared_at_angle(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta, rad^2/s^2; negative if the wheel does not
         arrive.
         """
         s = self.s
-        height_drop = _cos_from_vertical(s, -0.5 * s.alpha) - _cos_from_vertical(s, theta)
+        height_drop = _cos_from_vertical(s, self.first_angle) - _cos_from_vertical(s, theta)
         return self.initial_rate**2 + 2.0 * _gravity_stiffness(s) * height_drop
 
     def time_at_angle(self, theta: Elementwise) -> Elementwise:
-        """Return the time from theta = -alpha/2 to theta, s, by Carlson's R_F.
+        """Return the time from the first angle to theta, s, by Carlson's R_F.
 
         Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
         function of t. So time is the complete cubic form of the elliptic integral.
@@ -342,7 +385,7 @@ class RollingMotion(eqx.Module):
         s = self.s
         kappa = 2.0 * _gravity_stiffness(s)
         begin_half_angle, end_half_angle = (
-            0.5 * (self.phi - 0.5 * s.alpha),
+            0.5 * (self.phi + self.first_angle),
             0.5 * (self.phi + theta),
         )
         # This is the squared rate at the vertical.

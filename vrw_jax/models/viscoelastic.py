@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from vrw_jax.hybrid import (
     MonitoredFunctions,
@@ -19,6 +19,7 @@ from vrw_jax.hybrid import (
     sample_in_units,
 )
 from vrw_jax.models.batch_step import (
+    build_step_finisher,
     build_step_function,
     build_step_jacobian,
     build_step_sampler,
@@ -28,7 +29,9 @@ from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
+    PhaseRunner,
     PhaseSequenceResult,
+    finish_step,
     make_advance_result,
     make_step_result,
     make_trajectory,
@@ -36,7 +39,7 @@ from vrw_jax.models.phase_sequence import (
 )
 from vrw_jax.models.step_inputs import PAPER_START, SectionState
 from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
-from vrw_jax.numerics import ForwardFunction, StepOptions, Vector, enable_all_ad_modes
+from vrw_jax.numerics import Elementwise, ForwardFunction, StepOptions, Vector, enable_all_ad_modes
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -112,6 +115,7 @@ class ViscoelasticWheel(AbstractWheel):
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     batch_kernel: ClassVar[str] = "phases"
+    can_begin_within_step: ClassVar[bool] = True
 
     friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(
@@ -169,32 +173,54 @@ class ViscoelasticWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
         """Return the result of all phases of a step, integrated by diffrax."""
-
-        def run_phase(
-            phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
-        ) -> PhaseResult:
-            diffrax_phase = make_diffrax_phase(phase, records_margins)
-            phase_end = integrate_in_units(
-                diffrax_phase.vector_field,
-                diffrax_phase.guards,
-                jnp.stack([*q, *v]),
-                is_active,
-                options,
-                jnp.stack(phase.coordinate_units),
-                compute_wheel_units(phase.s).time,
-            )
-            end_state = tuple(phase_end.state)
-            return PhaseResult(
-                end_state[: phase.n_dof],
-                end_state[phase.n_dof :],
-                phase_end.duration,
-                phase_end.guard,
-                phase_end.timed_out,
-                phase_end.solver_steps,
-                phase_end.minima if records_margins else None,
-            )
-
+        run_phase = _make_diffrax_runner(options, records_margins)
         return run_phases(run_phase, params, tuple(x), options, self.stop_at_lift_off)
+
+    def finish_step(
+        self,
+        params: WheelParams,
+        phase_index: int,
+        distance: Elementwise,
+        state: Float[Array, " 6"],
+        options: StepOptions,
+    ) -> AdvanceResult:
+        leaves, structure = jax.tree.flatten((params, jnp.asarray(distance), state, options))
+        if can_use_lanes(options):
+            finish = build_step_finisher(structure, phase_index, self.stop_at_lift_off)
+            return eqx.combine(*finish(*leaves))
+        run_phase = _make_diffrax_runner(options, records_margins=False)
+        settings = options, self.stop_at_lift_off, "diffrax"
+        return finish_step(run_phase, params, phase_index, distance, tuple(state), *settings)
+
+
+def _make_diffrax_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
+    """Return a function that integrates one phase to its end by diffrax."""
+
+    def run_phase(
+        phase: AbstractPhase, q: Vector, v: Vector, is_active: Array, _: PhaseResult | None
+    ) -> PhaseResult:
+        diffrax_phase = make_diffrax_phase(phase, records_margins)
+        phase_end = integrate_in_units(
+            diffrax_phase.vector_field,
+            diffrax_phase.guards,
+            jnp.stack([*q, *v]),
+            is_active,
+            options,
+            jnp.stack(phase.coordinate_units),
+            compute_wheel_units(phase.s).time,
+        )
+        end_state = tuple(phase_end.state)
+        return PhaseResult(
+            end_state[: phase.n_dof],
+            end_state[phase.n_dof :],
+            phase_end.duration,
+            phase_end.guard,
+            phase_end.timed_out,
+            phase_end.solver_steps,
+            phase_end.minima if records_margins else None,
+        )
+
+    return run_phase
 
 
 @functools.cache
