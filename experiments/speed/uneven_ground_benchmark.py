@@ -18,11 +18,8 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
 
 N_STEPS, N_TRANSIENT_STEPS = 10, 20
-MODELS: dict[str, tuple[vrw.AbstractWheel | None, int]] = {
-    "paper's": (None, 4096),
-    "unilateral contact": (vrw.UnilateralWheel(friction=0.7), 1024),
-}
-"""Each model, and the number of its wheels."""
+N_PAPER_WHEELS, N_CONTACT_WHEELS = 4096, 1024
+"""Numbers of wheels with the paper's model and with unilateral contact."""
 
 
 def measure_rates(
@@ -56,8 +53,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--sd", type=float, default=0.002)
     chosen = parse_and_start_jax(parser)
+    cases: tuple[tuple[str, vrw.AbstractWheel | None, int], ...] = (
+        ("paper's", None, N_PAPER_WHEELS),
+        ("unilateral contact", vrw.UnilateralWheel(friction=0.7), N_CONTACT_WHEELS),
+    )
     table = []
-    for name, (model, n_wheels) in MODELS.items():
+    for name, model, n_wheels in cases:
         flat, uneven = measure_rates(model, n_wheels, chosen.sd, chosen.repeats)
         table.append((name, f"{flat:,.0f}", f"{uneven:,.0f}", f"{uneven / flat:.2f}"))
     text = format_markdown(("model", "flat ground", "uneven ground", "ratio"), table)
