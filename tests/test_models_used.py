@@ -61,6 +61,9 @@ FRICTION = {
 }
 """By function: the margin to the friction needed at the fore foot that it tells."""
 SLOW_FUNCTIONS = {
+    "basin_share",
+    "measure_basins",
+    "smallest_disturbance",
     "sensitivities",
     "continue_branch",
     "continue_branches",
@@ -126,6 +129,7 @@ def test_the_return_map_continues_after_lift_off_if_allowed():
 
 PULLED_WHEEL = vrw.WheelParams(damping=41.2, stiffness=684.0, natural_length=1.066, slope=0.124)
 """In its gait the ground would have to pull on Leg 1 for a while in double support."""
+PULLED_BOX = {"theta_touchdown": 0.1, "dtheta_touchdown": (1.0, 2.0), "dL1_touchdown": 0.0}
 STIFFNESS_BOUNDS = (683.0, 685.0)
 
 
@@ -159,6 +163,21 @@ GAITS = {
     ),
     "gait_sensitivity": lambda m: is_successful(
         lambda: vrw.gait_sensitivity(PULLED_WHEEL, ("period",), model=m)
+    ),
+    "basin_share": lambda m: is_successful(
+        lambda: vrw.basin_share(PULLED_WHEEL, PULLED_BOX, model=m, n_starts=2)
+    ),
+    "smallest_disturbance": lambda m: is_successful(
+        lambda: vrw.smallest_disturbance(PULLED_WHEEL, model=m)
+    ),
+    "measure_basins": lambda m: is_successful(
+        lambda: vrw.measure_basins(
+            vrw.continue_branch(PULLED_WHEEL, "stiffness", STIFFNESS_BOUNDS, model=m),
+            PULLED_BOX,
+            model=m,
+            n_points=1,
+            n_starts=2,
+        )
     ),
     "continue_branch": lambda m: is_branch_found(
         vrw.continue_branch(PULLED_WHEEL, "stiffness", STIFFNESS_BOUNDS, model=m)
@@ -204,6 +223,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     assert taking - {"return_map"} == set(OUTCOMES) | set(GAITS)
     # These report no margin of friction, or only how it varies.
     measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
+    measured |= {"basin_share", "smallest_disturbance", "measure_basins"}
     assert taking - measured == set(FRICTION)
 
 

@@ -36,7 +36,17 @@ from vrw_jax.models import (
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness import FirstPassage, GaitSensitivity, first_passage, gait_sensitivity
+from vrw_jax.robustness import (
+    BasinShare,
+    FirstPassage,
+    GaitSensitivity,
+    SmallestDisturbance,
+    basin_share,
+    first_passage,
+    gait_sensitivity,
+    measure_basins,
+    smallest_disturbance,
+)
 from vrw_jax.runtime import start_jax
 from vrw_jax.scans import (
     SpecialPointMap,
@@ -76,6 +86,7 @@ __all__ = (
     "MEASURES",
     "AbstractWheel",
     "ArclengthOptions",
+    "BasinShare",
     "Branch",
     "CycleOptions",
     "DoubleSupportIndicators",
@@ -94,6 +105,7 @@ __all__ = (
     "ParameterSet",
     "ReturnMapCycle",
     "RigidWheel",
+    "SmallestDisturbance",
     "SpecialPoint",
     "SpecialPointCurve",
     "SpecialPointMap",
@@ -107,6 +119,7 @@ __all__ = (
     "Walk",
     "WheelParams",
     "basin",
+    "basin_share",
     "choose_model",
     "continue_branch",
     "continue_branches",
@@ -120,6 +133,7 @@ __all__ = (
     "limit_cycle",
     "limit_cycles",
     "map_special_points",
+    "measure_basins",
     "measure_to_tolerance",
     "multifidelity_mean",
     "open_scan",
@@ -132,6 +146,7 @@ __all__ = (
     "scan",
     "sensitivities",
     "simulate",
+    "smallest_disturbance",
     "sobol",
     "sobol_indices",
     "solve_fixed_point",

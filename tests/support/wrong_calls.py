@@ -377,6 +377,7 @@ def register_wrong_calls() -> None:
         "sensitivities": lambda p: vrw.sensitivities(p),
         "continue_branch": lambda p: vrw.continue_branch(p, "damping", (100.0, 300.0)),
         "basin": lambda p: vrw.basin(p, {}),
+        "smallest_disturbance": lambda p: vrw.smallest_disturbance(p),
     }.items():  # fmt: skip
         add_wrong_call(
             f"{name} under jit", lambda c=call: jax.jit(c)(table_1), "TypeError", "outside"
@@ -732,6 +733,46 @@ def register_wrong_calls() -> None:
     )
     add_wrong_call(
         "basin of single numbers", lambda: vrw.basin(single, grid), "ValueError", "start_jax"
+    )
+    box = {"theta_touchdown": 0.1, "dtheta_touchdown": (1.0, 2.0), "dL1_touchdown": 0.0}
+    add_wrong_call(
+        "basin_share of half a box",
+        lambda: vrw.basin_share(table_1, {"theta_touchdown": 0.1}),
+        "ValueError",
+        "must contain all",
+    )
+    add_wrong_call(
+        "basin_share of unknown sampling",
+        lambda: vrw.basin_share(table_1, box, sampling="sobel"),
+        "ValueError",
+        "did you mean 'sobol'",
+    )
+    add_wrong_call(
+        "basin_share of a batch", lambda: vrw.basin_share(several, box), "ValueError", "one wheel"
+    )
+    add_wrong_calls(
+        "basin_share max_steps",
+        lambda v: vrw.basin_share(table_1, box, max_steps=v),
+        full_values,
+        "max_steps",
+    )
+    add_wrong_call(
+        "smallest_disturbance from a state",
+        lambda: vrw.smallest_disturbance(table_1, cycle=start),
+        "TypeError",
+        "cycle is",
+    )
+    add_wrong_call(
+        "smallest_disturbance with contact",
+        lambda: vrw.smallest_disturbance(table_1, model=vrw.UnilateralWheel()),
+        "ValueError",
+        "cannot begin within a step",
+    )
+    add_wrong_call(
+        "basins along no branch",
+        lambda: vrw.measure_basins(table_1),
+        "TypeError",
+        "continue_branch",
     )
 
     # Tuning

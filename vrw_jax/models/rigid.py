@@ -363,10 +363,11 @@ class RollingMotion(eqx.Module):
     """First angle theta, rad; None means -alpha/2, as just after a landing."""
 
     @property
-    def first_angle(self) -> Elementwise:
+    def first_angle(self) -> Elementwise | float:
         """Return the first angle theta, rad."""
-        is_after_landing = self.given_first_angle is None
-        return -0.5 * self.s.alpha if is_after_landing else self.given_first_angle
+        if self.given_first_angle is None:
+            return -0.5 * self.s.alpha
+        return self.given_first_angle
 
     def rate_squared_at_angle(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta, rad^2/s^2; negative if the wheel does not

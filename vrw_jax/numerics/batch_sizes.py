@@ -19,6 +19,8 @@ ATTRACTOR_BATCH_SIZE = 128
 """Number of walks toward attractors; after each round, the remaining walks are gathered in new
 batches.
 """
+DISTURBANCE_BATCH_SIZES = (64, 1024)
+"""Numbers of disturbed steps, for one size at each instant or for many."""
 GAIT_BATCH_SIZES = (8, 64, 512, 4096)
 """Numbers of limit cycles of the paper's wheel, which one Newton iteration computes together."""
 CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)

@@ -1,4 +1,7 @@
-"""Robustness of gaits on uneven ground: sensitivity norms, mean first-passage times."""
+"""Robustness of gaits: uneven ground, first passage, basins of attraction, disturbances."""
 
+from vrw_jax.robustness.basin_share import BasinShare, basin_share
+from vrw_jax.robustness.branch_basins import measure_basins
 from vrw_jax.robustness.first_passage import FirstPassage, first_passage
 from vrw_jax.robustness.gait_sensitivity import GaitSensitivity, gait_sensitivity
+from vrw_jax.robustness.smallest_disturbance import SmallestDisturbance, smallest_disturbance

@@ -1,6 +1,11 @@
 """Simulation of one step, a walk, a trajectory, attractors and basins."""
 
-from vrw_jax.simulation.basins import PRE_TOUCHDOWN_NAMES, basin
+from vrw_jax.simulation.basins import (
+    POST_LANDING_NAMES,
+    PRE_TOUCHDOWN_NAMES,
+    basin,
+    invert_landing,
+)
 from vrw_jax.simulation.stepping import (
     ModelLike,
     Walk,

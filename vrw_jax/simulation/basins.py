@@ -106,7 +106,7 @@ def basin(
     starts = (
         grid_points
         if component_names == PRE_TOUCHDOWN_NAMES
-        else _invert_landing(params, grid_points)
+        else invert_landing(params, grid_points)
     )
     is_reachable = np.isfinite(starts).all(-1)
     starts = np.where(is_reachable[:, None], starts, np.nan)
@@ -182,7 +182,7 @@ def _parse_grid(grid: StartGrid) -> dict[str, np.ndarray]:
     return {component_name: np.atleast_1d(value) for component_name, value in values.items()}
 
 
-def _invert_landing(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
+def invert_landing(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
     """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+); NaN without
     one.
 
