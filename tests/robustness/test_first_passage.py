@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 import vrw_jax as vrw
-from vrw_jax.robustness.sampled_passage import SamplingOptions, WalkerGroups, sample_passage
+from vrw_jax.robustness.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
 
 DEGREE = np.pi / 180.0
 BYL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=1.0, slope=8.0 * DEGREE)
@@ -92,7 +92,7 @@ def test_samples_agree_with_quadrature_within_their_error(degrees):
     from_gait = sample.mean_steps_from_gait / float(exact.mean_steps_from_gait)
     assert abs(from_gait - 1.0) < 1.5 * sample.relative_error
     assert abs(sample.kappa_2 - float(exact.kappa_2)) < 0.01
-    assert tuple(sample.share_by_outcome) == ("FELL_BACK",)
+    assert tuple(sample.fraction_by_outcome) == ("FELL_BACK",)
 
 
 @pytest.mark.parametrize(("slope_sd", "steps", "error"), [(0.015, 13.23, 0.06), (0.02, 6.9, 0.05)])
@@ -142,7 +142,9 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     passage = vrw.first_passage(params, slope_sd)
     gait = vrw.limit_cycle(params)
     start, random = np.asarray(gait.section_state), np.random.default_rng(11)
-    options = SamplingOptions(forgotten_effect=3e-4, min_forgetting_steps=14, n_groups=64)
+    options = PassageSamplingOptions(
+        negligible_line_effect=3e-4, min_forgetting_steps=14, n_groups=64
+    )
     groups = WalkerGroups(
         params, start, slope_sd, vrw.ViscoelasticWheel(), vrw.StepOptions(), 8192, random, options
     )

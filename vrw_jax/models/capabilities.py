@@ -19,10 +19,10 @@ class GaitMethod(enum.StrEnum):
 
 
 class PassageMethod(enum.StrEnum):
-    """Ways to compute mean first-passage times of a model on uneven ground."""
+    """Methods that compute mean first-passage times of a model on uneven ground."""
 
     QUADRATURE = enum.auto()
-    """Quadrature of the kernel that the model's `vertical_map` gives in closed form."""
+    """Quadrature of the closed-form kernel of the model's `vertical_map`."""
     SAMPLING = enum.auto()
     """Importance sampling of many walks."""
 

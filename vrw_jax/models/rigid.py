@@ -314,24 +314,29 @@ class RigidWheel(AbstractWheel):
 
 
 class VerticalMap(NamedTuple):
-    """Map x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) over the next line's slope.
+    """Map x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) at the slope of the next
+    line.
 
-    x is the squared rate with the stance leg vertical, 1/s^2. The wheel falls back if x' < 0, for a
-    slope below h. As a function of the slope, x' = offset(x) + amplitude cos(slope - peak).
+    Here x is the squared rate with the stance leg vertical, 1/s^2. The wheel falls back if x' < 0,
+    for a slope below h. As a function of the slope, x' = offset(x) + amplitude cos(slope -
+    slope_of_maximum).
     """
 
-    retained_share: Elementwise  # r, of the squared rate in a landing
+    retained_fraction: Elementwise  # r, retained fraction of the squared rate in a landing
     gravity: Elementwise  # G, twice the gravity stiffness, 1/s^2
-    half_angle: float  # h, between two legs, rad
+    half_angle: float  # h, half of the angle between two legs, rad
 
     @property
     def _components(self) -> tuple[Elementwise, Elementwise]:
-        r, h = self.retained_share, self.half_angle
+        """Return the coefficients of x' for the cosine and the sine of the slope, divided by G."""
+        r, h = self.retained_fraction, self.half_angle
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
     @property
-    def peak(self) -> Elementwise:
-        """Return the slope at which x' is largest, rad; x' grows with the slope below it."""
+    def slope_of_maximum(self) -> Elementwise:
+        """Return the slope at which x' is largest, rad. At smaller slopes, x' grows with the
+        slope.
+        """
         cosine, sine = self._components
         return jnp.arctan2(sine, cosine)
 
@@ -343,12 +348,12 @@ class VerticalMap(NamedTuple):
 
     def offset(self, x: Elementwise) -> Elementwise:
         """Return the part of x' that does not depend on the slope, 1/s^2."""
-        return self.retained_share * x - self.gravity * (1.0 - self.retained_share)
+        return self.retained_fraction * x - self.gravity * (1.0 - self.retained_fraction)
 
     def fixed_point(self, slope: Elementwise) -> Elementwise:
-        """Return the x that repeats on lines of this slope, 1/s^2."""
-        swing = self.amplitude * jnp.cos(slope - self.peak)
-        return swing / (1.0 - self.retained_share) - self.gravity
+        """Return the x that repeats on lines of this slope (rad), 1/s^2."""
+        periodic_part = self.amplitude * jnp.cos(slope - self.slope_of_maximum)
+        return periodic_part / (1.0 - self.retained_fraction) - self.gravity
 
 
 class RollingMotion(eqx.Module):

@@ -20,15 +20,15 @@ from vrw_jax.validation import check_int, check_not_traced, check_positive, is_t
 from vrw_jax.wheel import Outcome, WheelParams
 
 MAX_NODES = 3200
-"""Largest number of nodes that are tried, chosen because a matrix of this size takes 80 MB."""
+"""Largest number of quadrature nodes, chosen because a matrix of this size takes 80 MB."""
 
 SAMPLED_STEP_TOLERANCE = 1e-6
-"""Tolerance of sampled steps, chosen because the error of an event's time is then a ten-thousandth
-of its standard deviation on slopes that matter."""
+"""Tolerance of sampled steps. The value is chosen because the error of an event's time is then a
+ten-thousandth of its standard deviation on slopes that matter."""
 
 
 class PassageStatus(StatusCode):
-    """Status of a computation of first passages."""
+    """Status of a computation of first-passage times."""
 
     CONVERGED = 0, "The error estimate is within the tolerance."
     TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."
@@ -38,19 +38,23 @@ class PassageStatus(StatusCode):
 class FirstPassage(AbstractPrintable):
     """Mean numbers of steps until failure, with the eigenvalues of the survival operator.
 
-    Means count the random lines on which the wheel lands, the one on which it fails included.
+    Means count the random lines on which the wheel lands, including the line on which the wheel
+    fails.
 
-    - `mean_steps`: 1/(1 - kappa_1), from the quasi-stationary distribution;
-    - `mean_steps_from_gait`: from the gait, before a landing on a line of the mean slope. From
-      samples its relative error is at most 1.5 times that of `mean_steps`;
-    - `failure_probability`: 1 - kappa_1, of one step from the quasi-stationary distribution;
-    - `kappa_2`: rate at which the start is forgotten; from samples to some hundredths;
-    - `error`: estimate of the error of `mean_steps`, from samples with a confidence of 99 %;
-    - `states`: states of the quasi-stationary distribution. With quadrature: squared rate with the
-      stance leg vertical, 1/s^2, shape (n, 1). From samples: section states, the slope last;
-    - `weights`: their weights, whose sum is 1;
+    - `mean_steps`: mean from the quasi-stationary distribution, 1/(1 - kappa_1);
+    - `mean_steps_from_gait`: mean from the gait, before a landing on a line of the mean slope. With
+      samples, the relative error is at most 1.5 times that of `mean_steps`;
+    - `failure_probability`: probability 1 - kappa_1 to fail in one step from the quasi-stationary
+      distribution;
+    - `kappa_2`: second eigenvalue, the rate at which the effect of the start decays. With samples,
+      the error is some hundredths;
+    - `error`: error estimate of `mean_steps`, with samples at a confidence of 99 %;
+    - `states`: states of the quasi-stationary distribution. With quadrature, they are squared rates
+      with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states, the
+      slope last;
+    - `weights`: weights of the states, whose sum is 1;
     - `status`: a `PassageStatus`;
-    - `end_names`, `end_shares`: outcomes that end walks, and their shares;
+    - `end_names`, `end_fractions`: outcomes that end walks, and the fraction of each;
     - `n_steps`: number of sampled steps; 0 with quadrature.
 
     Examples:
@@ -69,13 +73,13 @@ class FirstPassage(AbstractPrintable):
     states: Float[Array, "n n_state"]
     weights: Float[Array, " n"]
     status: Int[Array, ""]
-    end_shares: Float[Array, " n_ends"]
+    end_fractions: Float[Array, " n_ends"]
     end_names: tuple[str, ...] = eqx.field(static=True)
     n_steps: int = eqx.field(static=True, default=0)
 
     @property
     def kappa_1(self) -> Scalar:
-        """Return the leading eigenvalue, the probability to survive a step."""
+        """Return the leading eigenvalue, which is the probability to survive a step."""
         return 1.0 - self.failure_probability
 
     @property
@@ -84,15 +88,19 @@ class FirstPassage(AbstractPrintable):
         return describe_ending(self.status, PassageStatus)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the printed rows."""
-        ends = zip(self.end_names, np.asarray(self.end_shares), strict=True)
-        sampled = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
+        """Return the rows of the printed result as pairs of label and text."""
+        ends = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
+        sampled_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
         return [
             ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
             ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
             ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
-            ("ends", ", ".join(f"{name} {100 * share:.3g} %" for name, share in ends) or "none"),
-            ("sampled steps", sampled),
+            (
+                "ends",
+                ", ".join(f"{end_name} {100 * fraction:.3g} %" for end_name, fraction in ends)
+                or "none",
+            ),
+            ("sampled steps", sampled_text),
             ("status", self.ending),
         ]
 
@@ -154,11 +162,13 @@ def first_passage(
     tol = None if tol is None else check_positive("tol", tol)
     resolved_model: Any = check_model(resolve_model(params, model))
     if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
-        return _integrate(params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8)
+        return _solve_by_quadrature(
+            params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
+        )
     check_not_traced("vrw.first_passage", "take the rigid wheel", params, slope_sd)
     if options is None:
         options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
-    return _sample(
+    return _estimate_by_sampling(
         params,
         float(slope_sd),
         resolved_model,
@@ -170,10 +180,13 @@ def first_passage(
     )
 
 
-def _integrate(
+def _solve_by_quadrature(
     params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, tol: float
 ) -> FirstPassage:
-    """Return the first passage by quadrature; nodes are doubled if values are known."""
+    """Return the first passage of the rigid wheel by quadrature.
+
+    The number of nodes is doubled until the error is within `tol`, unless the arguments are traced.
+    """
     if model.stop_at_lift_off:
         raise ValueError(
             "RigidWheel has stop_at_lift_off=True, but the kernel in closed form has no lift-off: "
@@ -187,31 +200,31 @@ def _integrate(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
-    coarse = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
+    coarse_passage = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
     while True:
-        fine = solve_rigid_passage(params, slope_sd, model, n_nodes)
-        means = [1.0 / x.survival.failure_probability for x in (coarse, fine)]
-        error = lax.stop_gradient(jnp.abs(means[1] - means[0]))
-        is_good = error <= tol * means[1]
-        if is_traced(params, slope_sd) or bool(is_good) or n_nodes >= MAX_NODES:
+        fine_passage = solve_rigid_passage(params, slope_sd, model, n_nodes)
+        mean_steps = [1.0 / x.survival.failure_probability for x in (coarse_passage, fine_passage)]
+        error = lax.stop_gradient(jnp.abs(mean_steps[1] - mean_steps[0]))
+        meets_tolerance = error <= tol * mean_steps[1]
+        if is_traced(params, slope_sd) or bool(meets_tolerance) or n_nodes >= MAX_NODES:
             break
-        coarse, n_nodes = fine, 2 * n_nodes
-    status = jnp.where(is_good, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET)
+        coarse_passage, n_nodes = fine_passage, 2 * n_nodes
+    status = jnp.where(meets_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET)
     return FirstPassage(
-        mean_steps=means[1],
-        mean_steps_from_gait=fine.mean_steps_from_gait,
-        failure_probability=fine.survival.failure_probability,
-        kappa_2=fine.survival.kappa_2,
+        mean_steps=mean_steps[1],
+        mean_steps_from_gait=fine_passage.mean_steps_from_gait,
+        failure_probability=fine_passage.survival.failure_probability,
+        kappa_2=fine_passage.survival.kappa_2,
         error=error,
-        states=fine.nodes[:, None],
-        weights=fine.survival.distribution,
+        states=fine_passage.nodes[:, None],
+        weights=fine_passage.survival.distribution,
         status=status.astype(jnp.int32),
-        end_shares=jnp.ones(1, means[1].dtype),
+        end_fractions=jnp.ones(1, mean_steps[1].dtype),
         end_names=(Outcome.FELL_BACK.name,),
     )
 
 
-def _sample(
+def _estimate_by_sampling(
     params: WheelParams,
     slope_sd: float,
     model: Any,
@@ -222,39 +235,47 @@ def _sample(
     tol: float,
     max_steps: int,
 ) -> FirstPassage:
-    """Return the first passage by sampling walks."""
+    """Return the first passage of a model by sampled walks."""
     cycle: Any = limit_cycle(params, model=model)
     if int(cycle.outcome) != Outcome.STEPPED:
         raise ValueError(
             f"this wheel has no gait from which a walk could begin: {cycle.why} Take a wheel for "
             "which vrw.limit_cycle finds a gait."
         )
-    random = np.random.default_rng(seed)
-    start = np.asarray(cycle.section_state)
-    groups = WalkerGroups(params, start, slope_sd, model, options, n_walkers, random)
+    generator = np.random.default_rng(seed)
+    section_state = np.asarray(cycle.section_state)
+    walker_groups = WalkerGroups(
+        params, section_state, slope_sd, model, options, n_walkers, generator
+    )
     try:
-        sample = sample_passage(groups, float(cycle.spectral_radius), tol, max_steps)
+        sampled_passage = sample_passage(
+            walker_groups, float(cycle.spectral_radius), tol, max_steps
+        )
     except ExtinctGroupError as error:
         raise ValueError(
             f"slope_sd is {slope_sd:g} rad, with which hardly any step of this wheel succeeds: "
             "give a smaller one."
         ) from error
-    probability = sample.failure_probability
-    mean = 1.0 / probability if probability else np.inf
-    is_good = sample.relative_error <= tol
-    status = PassageStatus.CONVERGED if is_good else PassageStatus.TOLERANCE_NOT_MET
-    status = status if probability else PassageStatus.NO_FAILURE
-    number = lambda x: jnp.asarray(x, params.damping.dtype)
+    failure_probability = sampled_passage.failure_probability
+    mean_steps = 1.0 / failure_probability if failure_probability else np.inf
+    meets_tolerance = sampled_passage.relative_error <= tol
+    status = PassageStatus.CONVERGED if meets_tolerance else PassageStatus.TOLERANCE_NOT_MET
+    status = status if failure_probability else PassageStatus.NO_FAILURE
+    convert_to_array = lambda x: jnp.asarray(x, params.damping.dtype)
     return FirstPassage(
-        mean_steps=number(mean),
-        mean_steps_from_gait=number(sample.mean_steps_from_gait),
-        failure_probability=number(probability),
-        kappa_2=number(sample.kappa_2),
-        error=number(mean * sample.relative_error if probability else np.inf),
-        states=number(sample.states),
-        weights=number(np.full(len(sample.states), 1.0 / len(sample.states))),
+        mean_steps=convert_to_array(mean_steps),
+        mean_steps_from_gait=convert_to_array(sampled_passage.mean_steps_from_gait),
+        failure_probability=convert_to_array(failure_probability),
+        kappa_2=convert_to_array(sampled_passage.kappa_2),
+        error=convert_to_array(
+            mean_steps * sampled_passage.relative_error if failure_probability else np.inf
+        ),
+        states=convert_to_array(sampled_passage.states),
+        weights=convert_to_array(
+            np.full(len(sampled_passage.states), 1.0 / len(sampled_passage.states))
+        ),
         status=jnp.asarray(int(status), jnp.int32),
-        end_shares=number(list(sample.share_by_outcome.values())),
-        end_names=tuple(sample.share_by_outcome),
-        n_steps=sample.n_steps,
+        end_fractions=convert_to_array(list(sampled_passage.fraction_by_outcome.values())),
+        end_names=tuple(sampled_passage.fraction_by_outcome),
+        n_steps=sampled_passage.n_steps,
     )
