@@ -116,7 +116,7 @@ def test_which_selects_one_of_the_attracting_gaits():
         abs(slowest.value - vrw.measure_to_tolerance("speed", TABLE_1, 1e-6, friction=20.0).value)
         < 1e-4
     )
-    assert slowest.why.endswith("one of those that attract, 1 in all")
+    assert slowest.why.endswith("one of the attracting gaits, 1 in all")
     none = vrw.measure_to_tolerance("speed", TABLE_1, 1e-4, friction=20.0, which=1)
     assert not none.found
     assert none.why.endswith("gaits that attract: 1")

@@ -52,7 +52,7 @@ class SpecialPoint:
     kink or a jump) or "lost" (the order of events changes, as `name` describes).
 
     - `value`: value of the parameter;
-    - `point`: fixed point beside it, on the side that belongs to the branch;
+    - `point`: fixed point beside the special point, on the side that belongs to the branch;
     - `ends_branch`: whether the branch ends there;
     - `find_cycle`: function that finds the gait there, for the property `cycle`;
     - `n_multipliers`: number of multipliers that cross the unit circle there, 0 for other kinds.

@@ -172,13 +172,13 @@ class FixedPointProblem(AbstractContinuationProblem):
 class ContinuationStatus(StatusCode):
     """Reason why the continuation of a branch ended in one direction."""
 
-    RUNNING = 0, "It was still being followed."
+    RUNNING = 0, "The continuation was still running."
     RANGE_END_REACHED = 1, "The parameter's range ended."
-    POINT_NOT_ADMISSIBLE = 2, "Its points no longer are what they stand for."
+    POINT_NOT_ADMISSIBLE = 2, "The next points do not satisfy the conditions of the branch."
     STEP_SIZE_UNDERFLOW = 3, "Newton's method found no next point, however short the step."
-    MAX_POINTS_REACHED = 4, "It has as many points as were allowed: raise max_points."
-    START_NOT_FOUND = 5, "No point was found to start from."
-    CURVE_CLOSED = 6, "It came back to where it began."
+    MAX_POINTS_REACHED = 4, "The branch has the largest allowed number of points: raise max_points."
+    START_NOT_FOUND = 5, "No starting point was found."
+    CURVE_CLOSED = 6, "The curve returned to its start."
 
 
 class ContinuationPoint(NamedTuple):

@@ -131,7 +131,7 @@ def _monodromy_tangents(
     ) / squared_direction_norm
     time_scale_tangent = (
         jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]
-    )  # of angle and rate
+    )  # tangent of the monodromy over (angle, rate)
     time_scale_tangents = {
         i: time_scale_tangent
         if unit_scale is scales.TIME_SCALING

@@ -160,7 +160,7 @@ def limit_cycle(
         A `LimitCycle`; a `ReturnMapCycle` for other models.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams())
@@ -209,7 +209,7 @@ def limit_cycles(
         A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over wheels.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> cycles = vrw.limit_cycles(vrw.WheelParams(damping=np.array([100.0, 150.0, 300.0])))
@@ -236,7 +236,7 @@ def limit_cycles(
     if is_traced(params):
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
         single_params = jax.tree.map(lambda x: x[0], params)
-    else:  # by numpy, because JAX would compile a program for each batch size
+    else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), shape), params)
         params, single_params = jax.device_put((params, take_rows(params, 0)))
     finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))

@@ -56,19 +56,19 @@ from vrw_jax.wheel import (
 
 
 class LimitCycle(AbstractCycle):
-    """Gait of the paper's model, found by collocation. Batched under vmap.
+    """Gait of the paper's model, found by collocation; batched under vmap.
 
     See `AbstractCycle`. It is differentiable in the parameters, in every mode and to any order.
 
     - `section_state`: (theta-, dtheta-, dL1-) before touchdown, fixed under return_map;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
-    - `durations`: of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1;
+    - `durations`: durations of DLS, SLS-I, SLS-II, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m; (n,) for n > 1;
-    - `indicators`: of the landing; (n,) each for n > 1;
+    - `indicators`: indicators of double support at the landing; (n,) each for n > 1;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: last correction of Newton's method, in the wheel's own units;
     - `n_newton_iterations`: number of linearized passes of the search;
-    - `parameters`: in the order of params.PARAMETER_NAMES;
+    - `parameters`: float parameters in the order of params.PARAMETER_NAMES;
     - `collocation_state`: the solution with its phases, a start for neighbors;
     - `monodromy_value`: monodromy matrix, without derivative;
     - `system`, `model`: the collocation system and the model.

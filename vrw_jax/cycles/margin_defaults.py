@@ -53,7 +53,7 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         Least values by name of the measure, each in the measure's unit.
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)

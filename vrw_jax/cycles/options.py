@@ -24,17 +24,17 @@ from vrw_jax.validation import (
 )
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
-    """Numerical choices of `limit_cycle`. Each change compiles the search again.
+    """Numerical options of `limit_cycle`; each change compiles the search again.
 
     The defaults reach 1e-9 relative in values and 1e-8 in first derivatives.
 
-    - `mesh_intervals`: of order 8, in DLS, SLS-I and SLS-II;
-    - `mesh_grading`: length of the last over the first mesh interval in SLS-I;
-    - `tolerance`: of Newton's last correction, in the wheel's own units;
-    - `max_newton_iterations`: of one attempt;
+    - `mesh_intervals`: numbers of mesh intervals, of order 8, in DLS, SLS-I and SLS-II;
+    - `mesh_grading`: ratio of the lengths of the last and the first mesh interval in SLS-I;
+    - `tolerance`: tolerance of Newton's last correction, in the wheel's own units;
+    - `max_newton_iterations`: limit of Newton iterations in one attempt;
     - `first_newton_iterations`: number after which a batch collects the wheels that need more;
-    - `homotopy_steps`: of a homotopy from Table 1, used if the first attempt fails;
-    - `batch_size`: number of wheels that are solved side by side.
+    - `homotopy_steps`: number of steps of a homotopy from Table 1, used if the first attempt fails;
+    - `batch_size`: number of wheels that are solved together.
 
     Examples:
         >>> vrw.CycleOptions(mesh_intervals=(20, 16, 6)).mesh_intervals  # a finer mesh

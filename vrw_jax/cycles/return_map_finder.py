@@ -48,21 +48,21 @@ def newton_tolerance(options: StepOptions) -> Scalar:
 
 
 class ReturnMapCycle(AbstractCycle):
-    """Gait that repeats after `period_n` steps, a fixed point of the return map. Batched under
+    """Gait that repeats after `period_n` steps, a fixed point of the return map; batched under
     vmap.
 
     It is differentiable in the parameters by the implicit function theorem, to second order. If no
     gait is found, `outcome` gives the reason and every other number is zero.
 
-    - `section_state`: fixed under `period_n` return maps;
+    - `section_state`: fixed point of `period_n` return maps;
     - `post_impact`: (theta, dtheta) after the first landing, rad, rad/s;
-    - `durations`: as the model's step returns them, s; (n, 3) for period_n = n > 1;
+    - `durations`: durations that the model's step returns, s; (n, 3) for period_n = n > 1;
     - `step_length`: distance between the feet at the landing, m;
     - `steps`: the model's step results, with an axis over the steps of one cycle;
     - `monodromy_value`: Jacobian of the return map;
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: largest entry of map(x) - x, in the wheel's own units;
-    - `n_iterations`: of Newton's method.
+    - `n_iterations`: number of iterations of Newton's method.
 
     Examples:
         >>> wheel = vrw.RigidWheel(held_landing=True)

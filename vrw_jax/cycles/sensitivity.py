@@ -44,7 +44,7 @@ def sensitivities(
         A dataset of `value` (measure), `derivative` and `elasticity` (measure, parameter).
 
     Raises:
-        TypeError, ValueError: an invalid argument, described in one sentence.
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
 
     Examples:
         >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["dls_fraction", "speed"])

@@ -24,9 +24,9 @@ linear systems.
 class LCPStatus(StatusCode):
     """Number of solutions of an LCP: none, one or several."""
 
-    NO_SOLUTION = 0, "No force fits: a rigid body would have to jump at once."
-    UNIQUE_SOLUTION = 1, "One answer."
-    MULTIPLE_SOLUTIONS = 2, "Several answers fit: the law of contact does not choose."
+    NO_SOLUTION = 0, "No forces satisfy the conditions: a rigid body would have to jump."
+    UNIQUE_SOLUTION = 1, "There is one solution."
+    MULTIPLE_SOLUTIONS = 2, "There are several solutions: the contact law selects none."
 
 
 class LCPSolutions(NamedTuple):
@@ -56,12 +56,14 @@ def enumerate_lcp_solutions(
     n = free_gap.size
     if free_gap.ndim != 1 or matrix.shape != (n, n) or not 0 < n <= MAX_LCP_CONTACTS:
         raise ValueError(
-            f"matrix has shape {matrix.shape} and free {free_gap.shape}, but they must be (n, "
+            f"matrix has shape {matrix.shape} and free_gap {free_gap.shape}, but they must be (n, "
             f"n) and "
             f"(n,) with n from 1 to {MAX_LCP_CONTACTS}."
         )
     if not is_traced(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
-        raise ValueError("matrix or free holds a number that is not finite: give finite numbers.")
+        raise ValueError(
+            "matrix or free_gap contains a number that is not finite: give finite numbers."
+        )
     max_entry = jnp.max(jnp.abs(matrix))
     entry_scale = jnp.where(max_entry > 0.0, max_entry, 1.0)
     free_gap, matrix = free_gap / entry_scale, matrix / entry_scale

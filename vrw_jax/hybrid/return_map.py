@@ -20,7 +20,7 @@ class ReturnMap:
     The map is NaN if the simulation ends early, so that no method takes its last state for a
     return. `solve_fixed_point` reports the termination with the fixed point.
 
-    - `modes`: as in `simulate_hybrid`;
+    - `modes`: modes of the system, as in `simulate_hybrid`;
     - `embed`: function that returns the state for section coordinates, where the simulation begins;
     - `project`: function that returns the section coordinates of a state after the last event;
     - `events`: number of events of one return;

@@ -61,17 +61,17 @@ class Mode(NamedTuple):
 class Termination(StatusCode):
     """Reason why a simulation ended."""
 
-    MAX_EVENTS_REACHED = 0, "It has as many events as were asked for."
+    MAX_EVENTS_REACHED = 0, "The simulation has the requested number of events."
     MAX_TIME_REACHED = 1, "No guard ended the mode within StepOptions.max_phase_time."
-    ZENO = 2, "Events follow each other so fast that the clock no longer moves (Zeno)."
+    ZENO = 2, "Events follow each other so fast that the time does not advance (Zeno)."
     GUARD_VIOLATED_AT_ENTRY = (
         3,
-        "A mode begins with a guard below zero: begin on it or inside, or elsewhere.",
+        "A mode begins with a guard below zero: start where the guard is zero or positive.",
     )
-    MAX_STEPS_REACHED = 4, "The solver's steps are spent: raise StepOptions.max_solver_steps."
+    MAX_STEPS_REACHED = 4, "The solver steps are exhausted: raise StepOptions.max_solver_steps."
     STEP_SIZE_UNDERFLOW = (
         5,
-        "Steps too short, or no event settled: a singular field or a guard lost in rounding.",
+        "The steps are too short, or an event is not located: a singular field or a noisy guard.",
     )
 
 

@@ -284,7 +284,7 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     """Return the labeled result of a scan, finished or not; values are read when they are used.
 
     In an unfinished scan, samples that are not yet computed have the outcome -1 and the measures
-    NaN. A store with damaged files is refused; `verify=False` opens it without that check.
+    NaN. A store with damaged files raises a ValueError; `verify=False` skips that check.
 
     Args:
         path: folder of the store.

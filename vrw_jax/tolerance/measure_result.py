@@ -26,14 +26,14 @@ class MeasureStatus(StatusCode):
     CONTINUES_LOWER_GAIT = 1, "the gait that continues the lower model's"
     REACHED_FROM_LOWER_GAIT = (
         2,
-        "another gait than the lower model's: a walk from there leads to it",
+        "a gait to which a walk from the lower model's gait leads",
     )
     REACHED_FROM_START = (
         3,
-        "no gait of the paper's wheel was found: a walk from its start leads to this one",
+        "a gait to which a walk from a start leads, as the paper's wheel has no gait",
     )
     NO_GAIT = 4, "no such gait with unilateral contact"
-    SELECTED_BY_RANK = 5, "one of those that attract"
+    SELECTED_BY_RANK = 5, "one of the attracting gaits"
 
 
 MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral contact")
@@ -41,7 +41,8 @@ MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral 
 
 
 class MeasureResult(AbstractPrintable):
-    """Measures of a gait and bounds of their errors. For a batch, every property has its axis.
+    """Measures of a gait and bounds of their errors; for a batch, every property has the batch
+    axis.
 
     For one measure a property is a value, for several a dictionary by name. If there is no gait,
     the value is NaN and the error infinite.

@@ -28,9 +28,9 @@ class TuneStatus(StatusCode):
     """Reason why a maximization ended."""
 
     CONVERGED = 0, "The gait can't be improved nearby without breaking a constraint."
-    BRANCH_ENDED = 1, "The branch ends here: every smaller step on lost the gait or a finite value."
-    MAX_EVALUATIONS_REACHED = 2, "The allowed number of gaits was spent before it converged."
-    NO_FEASIBLE_GAIT = 3, "No gait that keeps every constraint was found from this start."
+    BRANCH_ENDED = 1, "The branch ends here: every smaller step loses the gait or a finite value."
+    MAX_EVALUATIONS_REACHED = 2, "The allowed number of gaits was evaluated before convergence."
+    NO_FEASIBLE_GAIT = 3, "No gait that satisfies every constraint was found from this start."
 
 
 class TrialKind(enum.IntEnum):

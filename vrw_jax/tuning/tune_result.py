@@ -54,20 +54,20 @@ class TuneResult:
     """Result of tuning: the gait, how it was found, and the constraints that are active.
 
     - `params`: the wheel;
-    - `status`: of the maximization at its end;
-    - `objective`, `value`, `start_value`: its name, its value here and at the start;
+    - `status`: reason why the maximization ended;
+    - `objective`, `value`, `start_value`: name of the objective, its value here and at the start;
     - `active`: constraints and bounds that are active, each with its price;
     - `validation`: a walk of ten steps of the wheel;
     - `cycle`: LimitCycle, or ReturnMapCycle with unilateral contact;
     - `step`: StepResult, or UnilateralStep;
-    - `kkt_residual`: of the first-order condition, relative to the objective's gradient;
+    - `kkt_residual`: residual of the first-order condition, relative to the objective's gradient;
     - `violated_margins`: violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
     - `n_evaluations`: number of limit cycles, each with one step;
     - `n_backtracks`: number of trials that lost the gait or its branch, or whose numbers are not
       finite;
-    - `seconds`: total time;
-    - `compile_seconds`: the part for compiling, and for exploring if there are many starts;
+    - `seconds`: total time, s;
+    - `compile_seconds`: time of compilation, and of the exploration if there are many starts;
     - `exploration`: results of many starts before the maximization.
 
     Examples:
