@@ -1,1 +1,2 @@
-"""Which gaits there are: orbits beyond the borders, basins, the surface that guesses them."""
+"""Study which gaits exist: orbits of several steps, basins, special points and the surface of
+guesses."""

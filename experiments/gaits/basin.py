@@ -1,9 +1,10 @@
-"""At c = 100 nearly every start walks; at c = 200 a fast one meets touchdown before the stopper.
+"""Draw the basin of attraction of the gait at two dampings.
 
     python -m experiments.gaits.basin [folder]
 
-Starts differ in θ̇⁻ and L̇1⁻ just before touchdown; θ⁻ is that of the gait. Writes `basin.svg` and
-`.png` to `results/` or the folder given.
+Starts differ in θ̇⁻ and L̇1⁻ just before touchdown, and have the θ⁻ of the gait. At c = 100 nearly
+every start leads to walking. At c = 200 a fast start touches down before Leg 2 meets its stopper.
+The command writes `basin.svg` and `.png` to `results/` or the given folder.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ from vrw_jax.figures.style import format_value_label
 from vrw_jax.simulation.basins import compute_end_fractions
 
 DAMPINGS = (100.0, 200.0)  # N s/m
-RATES = np.linspace(0.4, 3.2, 57)  # rad/s
+ANGULAR_RATES = np.linspace(0.4, 3.2, 57)  # rad/s
 LEG_RATES = np.linspace(-1.0, 0.6, 49)  # m/s
 
 
@@ -27,16 +28,21 @@ def main() -> None:
         gait = vrw.limit_cycle(params)
         theta = float(gait.section_state[0])
         grid = {
-            "theta_touchdown": theta, "dtheta_touchdown": RATES, "dL1_touchdown": LEG_RATES,
+            "theta_touchdown": theta, "dtheta_touchdown": ANGULAR_RATES, "dL1_touchdown": LEG_RATES,
         }  # fmt: skip
-        result = vrw.basin(params, grid, options=vrw.StepOptions(rtol=1e-9, atol=1e-9))
-        results.append(result)
-        shown_values = (
+        basin_result = vrw.basin(params, grid, options=vrw.StepOptions(rtol=1e-9, atol=1e-9))
+        results.append(basin_result)
+        title_parts = (
             format_value_label("damping", damping),
             format_value_label("theta_touchdown", theta),
         )
-        titles.append(", ".join(shown_values))
-        print(damping, compute_end_fractions(result), "periods", result.orbit_period.values)
+        titles.append(", ".join(title_parts))
+        print(
+            damping,
+            compute_end_fractions(basin_result),
+            "periods",
+            basin_result.orbit_period.values,
+        )
     plots.save(plots.basin_figure(results, titles), folder, "basin")
 
 

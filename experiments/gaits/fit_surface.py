@@ -1,8 +1,9 @@
-"""A cubic in four unitless numbers predicts gaits to about one percent: fits the stored surface.
+"""Fit the stored surface of guesses: a cubic in four unitless numbers.
 
     python -m experiments.gaits.fit_surface
 
-Writes `vrw_jax/cycles/surface.npz`, where `limit_cycle` finds its start.
+The cubic predicts gaits to about one percent. The reference is the half of the gaits that the fit
+omits. The command writes `vrw_jax/cycles/surface.npz`, from which `limit_cycle` takes its start.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from vrw_jax.cycles import gait_surface as surface
 from vrw_jax.numerics import make_blockwise
 from vrw_jax.wheel import PARAMETER_NAMES, stack_parameters, wheel_from_parameters
 
-BOX = {
+PARAMETER_BOX = {
     "damping": (15.0, 219.0),
     "stiffness": (390.0, 620.0),
     "natural_length": (1.008, 1.042),
@@ -28,26 +29,28 @@ BOX = {
 }
 N_WHEELS, N_STAGES, SEED = 8192, 80, 5
 GAIT_OF_TABLE_1 = ((-0.6827, 1.0492), (0.4343, 0.3330, 0.0497))
-TARGET = Path(surface.__file__).with_name("surface.npz")
+SURFACE_PATH = Path(surface.__file__).with_name("surface.npz")
 
 
-def reached_by_continuation(problem: search.CollocationSystem, parameters: jax.Array) -> object:
-    """Gaits found by moving the parameters from Table 1 in small stages."""
+def find_gaits_by_continuation(problem: search.CollocationSystem, parameters: jax.Array) -> object:
+    """Return gaits found by a homotopy of the parameters from Table 1."""
 
-    def continued(parameters: jax.Array) -> search.SearchResult:
+    def search_from_table_1(parameters: jax.Array) -> search.SearchResult:
         lanes = parameters.shape[-1:]
-        home = stack_parameters(vrw.WheelParams())[:, None]
+        table_1_parameters = stack_parameters(vrw.WheelParams())[:, None]
         section, durations = (
             jnp.broadcast_to(jnp.asarray(x)[:, None], (len(x), *lanes)) for x in GAIT_OF_TABLE_1
         )
         start = search.make_start(problem, section, durations, jnp.ones(lanes, bool))
-        home = jnp.broadcast_to(home, parameters.shape)
+        table_1_parameters = jnp.broadcast_to(table_1_parameters, parameters.shape)
         stages = jnp.int32(N_STAGES)
         pending = jnp.ones(lanes, bool)
         limit = problem.options.max_newton_iterations
-        return search.run_newton(problem, parameters, start, home, stages, limit, pending)
+        return search.run_newton(
+            problem, parameters, start, table_1_parameters, stages, limit, pending
+        )
 
-    return jax.jit(make_blockwise(continued, 64))(parameters)
+    return jax.jit(make_blockwise(search_from_table_1, 64))(parameters)
 
 
 def main() -> None:
@@ -60,44 +63,49 @@ def main() -> None:
     table_1 = vrw.WheelParams()
     parameters = np.tile(np.asarray(stack_parameters(table_1))[:, None], (1, N_WHEELS))
     generator = np.random.default_rng(SEED)
-    for name, (low, high) in BOX.items():
+    for name, (low, high) in PARAMETER_BOX.items():
         parameters[PARAMETER_NAMES.index(name)] = generator.uniform(low, high, N_WHEELS)
-    finding = reached_by_continuation(problem, jnp.asarray(parameters))
-    solution_values = np.asarray(finding.located.found) > 0.5
-    solution = finding.located.solution
-    unit = float(surface.time_unit(table_1))  # L0 is 1 m
-    rows = [solution.section[0], solution.section[1] * unit, *(solution.durations[0] / unit)]
+    search_result = find_gaits_by_continuation(problem, jnp.asarray(parameters))
+    is_found = np.asarray(search_result.located.found) > 0.5
+    solution = search_result.located.solution
+    time_unit = float(surface.time_unit(table_1))  # L0 = 1 m in Table 1.
+    rows = [
+        solution.section[0],
+        solution.section[1] * time_unit,
+        *(solution.durations[0] / time_unit),
+    ]
     for block in solution.accelerations:
-        rows.extend(np.asarray(block).reshape(-1, N_WHEELS) * unit**2)
-    unknowns = np.stack([np.asarray(row) for row in rows])[:, solution_values]
+        rows.extend(np.asarray(block).reshape(-1, N_WHEELS) * time_unit**2)
+    unknowns = np.stack([np.asarray(row) for row in rows])[:, is_found]
 
-    wheels = wheel_from_parameters(jnp.asarray(parameters[:, solution_values]), 8)
-    places = np.stack([np.asarray(x) for x in surface.surface_coordinates(wheels)])
-    centre, spread = places.mean(1), places.std(1)
+    wheels = wheel_from_parameters(jnp.asarray(parameters[:, is_found]), 8)
+    coordinates = np.stack([np.asarray(x) for x in surface.surface_coordinates(wheels)])
+    centre, spread = coordinates.mean(1), coordinates.std(1)
     features = np.stack(
         [
             np.asarray(x)
-            for x in surface.evaluate_monomials(tuple((places - centre[:, None]) / spread[:, None]))
+            for x in surface.evaluate_monomials(
+                tuple((coordinates - centre[:, None]) / spread[:, None])
+            )
         ]
     )
-    fitted, checked = (np.arange(features.shape[1]) % 2 == k for k in (0, 1))
+    is_fitted, is_checked = (np.arange(features.shape[1]) % 2 == k for k in (0, 1))
     fit = functools.partial(np.linalg.lstsq, rcond=None)
-    half = fit(features[:, fitted].T, unknowns[:, fitted].T)[0]
-    error = np.abs(half.T @ features[:, checked] - unknowns[:, checked])
+    half_fit = fit(features[:, is_fitted].T, unknowns[:, is_fitted].T)[0]
+    error = np.abs(half_fit.T @ features[:, is_checked] - unknowns[:, is_checked])
     print(
-        f"{solution_values.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th "
-        f"percentile:"
+        f"{is_found.sum()} gaits of {N_WHEELS} wheels; errors on those left out, 99th percentile:"
     )
     print("  theta+, dtheta+, durations:", np.quantile(error[:5], 0.99, axis=1).round(4))
     np.savez(
-        TARGET,
+        SURFACE_PATH,
         centre=centre,
         spread=spread,
-        lower=places.min(1),
-        upper=places.max(1),
+        lower=coordinates.min(1),
+        upper=coordinates.max(1),
         coefficients=fit(features.T, unknowns.T)[0].astype(np.float32),
     )
-    print("wrote", TARGET)
+    print("wrote", SURFACE_PATH)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Beyond λ4⁺ = 0 (c = 219.85) gaits of 6, 5, 4 ... steps attract, one landing in each without DLS.
+"""Draw the periodic orbits of the wheel beyond λ4⁺ = 0 (c = 219.85) over the damping.
 
     python -m experiments.gaits.orbit_diagram [folder] [--redraw]
 
-Many starts at each damping are walked until they repeat or fall. Writes `orbit_diagram.svg`, `.png`
-and `.csv` to `results/` or the folder given.
+Many starts at each damping walk until their steps repeat or the wheel falls. Beyond the special
+point attracting orbits have 6, 5, 4 ... steps, and one step of each has no DLS. The command writes
+`orbit_diagram.svg`, `.png` and `.csv` to `results/` or the given folder.
 """
 
 from pathlib import Path
@@ -28,12 +29,12 @@ from vrw_jax.simulation.attractors import (
 DAMPINGS = np.round(np.arange(215.0, 225.001, 0.1), 3)  # N s/m
 N_STARTS = 12
 TABLE = "orbit_diagram.csv"
-MOST_STEPS, LONGEST_PERIOD = 300, 40
-PREMISES = ("clearance_sls1", "clearance_sls2", "locked_stopper_force", "fore_foot_force")
+MAX_STEPS, MAX_PERIOD = 300, 40
+MARGIN_NAMES = ("clearance_sls1", "clearance_sls2", "locked_stopper_force", "fore_foot_force")
 
 
-def starts() -> np.ndarray:
-    """Section states scattered around the gait at c = 219."""
+def draw_starts() -> np.ndarray:
+    """Return random section states around the gait at c = 219."""
     draw = np.random.default_rng(1).uniform
     sizes = (N_STARTS,)
     return np.stack([draw(0.0, 0.2, sizes), draw(1.3, 1.8, sizes), draw(-0.3, 0.0, sizes)], 1)
@@ -42,22 +43,26 @@ def starts() -> np.ndarray:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default="results")
-    parser.add_argument("--redraw", action="store_true", help="walk nothing: draw the table there")
-    chosen = parse_and_start_jax(parser)
-    if not chosen.redraw:
-        compute().to_csv(create_folder(chosen.folder) / TABLE, index=False, float_format="%.7g")
-    table = pd.read_csv(chosen.folder / TABLE)
-    border = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0)).special_points[-1]
-    figure = orbit_figure(table.to_xarray(), border.value)
-    plots.save(figure, chosen.folder, "orbit_diagram")
+    parser.add_argument(
+        "--redraw", action="store_true", help="draw the stored table without walking"
+    )
+    arguments = parse_and_start_jax(parser)
+    if not arguments.redraw:
+        compute().to_csv(create_folder(arguments.folder) / TABLE, index=False, float_format="%.7g")
+    table = pd.read_csv(arguments.folder / TABLE)
+    special_point = vrw.continue_branch(
+        vrw.WheelParams(), "damping", (190.0, 230.0)
+    ).special_points[-1]
+    figure = make_orbit_figure(table.to_xarray(), special_point.value)
+    plots.save(figure, arguments.folder, "orbit_diagram")
 
 
 @plots.figure_style()
-def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
-    """Post-impact rates and periods of all that attracts, a row a step, over damping.
+def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figure:
+    """Return the figure: rates after landing and periods of all attracting orbits over the damping.
 
-    Open: the foot scuffs somewhere in that step; a cross: a step without double support. `border`:
-    where λ4⁺ = 0.
+    An open symbol is a step in which the foot scuffs, and a cross is a step without double support.
+    `special_point_damping` is the damping at which λ4⁺ vanishes.
     """
     value = orbits.damping.values
     lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
@@ -75,26 +80,26 @@ def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
         ),
         (lifts & scuffs, "o", plots.LEG_2_COLOR, "none", "the same, foot 2 scuffs"),
     )
-    for chosen, marker, colour, fill, text in groups:
-        if chosen.any():
+    for is_in_group, marker, colour, fill, text in groups:
+        if is_in_group.any():
             size = 2.4 if marker == "o" else 3.4
-            x, y = value[chosen], orbits.dtheta_post_impact.values[chosen]
+            x, y = value[is_in_group], orbits.dtheta_post_impact.values[is_in_group]
             draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
     periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
     for axes in (rates, periods):
         axes.axvline(
-            border,
+            special_point_damping,
             color=BRANCH_END_COLOR,
             linewidth=0.7,
             linestyle=SPECIAL_POINT_LINE_STYLE,
             zorder=0,
         )
-        for left_part, right in _empty_stretches(orbits):
-            axes.axvspan(left_part, right, color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
-    for left_part, right in _empty_stretches(orbits)[-1:]:
-        rates.text(0.5 * (left_part + right), 0.5, "falls", rotation=90, ha="center", va="center",
+        for left, right in _find_empty_intervals(orbits):
+            axes.axvspan(left, right, color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
+    for left, right in _find_empty_intervals(orbits)[-1:]:
+        rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
                    transform=rates.get_xaxis_transform(), color=plots.DARK_GRAY)  # fmt: skip
-    rates.text(border, 0.4, " $\\lambda_4^+ = 0$", color=BRANCH_END_COLOR,
+    rates.text(special_point_damping, 0.4, " $\\lambda_4^+ = 0$", color=BRANCH_END_COLOR,
                transform=rates.get_xaxis_transform())  # fmt: skip
     rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
     rates.legend(loc="lower left", fontsize=7.5)
@@ -105,8 +110,8 @@ def orbit_figure(orbits: xr.Dataset, border: float) -> Figure:
     return figure
 
 
-def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
-    """Stretches of the damping where no start settled."""
+def _find_empty_intervals(orbits: xr.Dataset) -> list[tuple[float, float]]:
+    """Return the intervals of damping in which no start reaches an orbit."""
     empty = ~np.isin(DAMPINGS, orbits.damping.values)
     half = 0.5 * (DAMPINGS[1] - DAMPINGS[0])
     cuts = np.flatnonzero(np.diff(empty.astype(int))) + 1
@@ -115,49 +120,56 @@ def _empty_stretches(orbits: xr.Dataset) -> list[tuple[float, float]]:
 
 
 def create_folder(folder: Path) -> Path:
-    """The folder, there at the latest now."""
+    """Create the folder if necessary, and return it."""
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def compute() -> pd.DataFrame:
-    """Every step of every orbit that attracts, at each damping."""
-    model = vrw.ViscoelasticWheel(stop_at_lift_off=False)  # λ2 < 0 is told, not a fall
+    """Return every step of every attracting orbit at each damping."""
+    # A negative λ2 is reported, and does not end the step.
+    model = vrw.ViscoelasticWheel(stop_at_lift_off=False)
     options = vrw.StepOptions(rtol=1e-9, atol=1e-9)
     dampings = np.repeat(DAMPINGS, N_STARTS)
     walk_result = walk_until_periodic(
         vrw.WheelParams(damping=dampings),
-        np.tile(starts(), (len(DAMPINGS), 1)),
+        np.tile(draw_starts(), (len(DAMPINGS), 1)),
         model,
         options,
-        MOST_STEPS,
-        LONGEST_PERIOD,
+        MAX_STEPS,
+        MAX_PERIOD,
     )
     rows = []
     for damping in DAMPINGS:
-        values_here = WalkEnds(*(part[dampings == damping] for part in walk_result))
-        fell = [vrw.Outcome(int(c)).name for c in values_here.outcome if c != vrw.Outcome.STEPPED]
-        orbits = find_distinct_orbits(values_here)
+        walk_ends = WalkEnds(*(part[dampings == damping] for part in walk_result))
+        failures = [vrw.Outcome(int(c)).name for c in walk_ends.outcome if c != vrw.Outcome.STEPPED]
+        orbits = find_distinct_orbits(walk_ends)
         for index, orbit in enumerate(orbits.orbits):
-            result = measure_orbits(vrw.WheelParams(damping=damping), orbit, model, options)
+            measured_orbit = measure_orbits(vrw.WheelParams(damping=damping), orbit, model, options)
             for k in range(len(orbit)):
-                broken = [name for name in PREMISES if result[name][k].min() < 0.0]
+                negative_margins = [
+                    name for name in MARGIN_NAMES if measured_orbit[name][k].min() < 0.0
+                ]
                 rows.append(
                     {
                         "damping": damping,
                         "orbit": index,
                         "period": len(orbit),
                         "step": k,
-                        "theta_post_impact": result["theta_post_impact"][k],
-                        "dtheta_post_impact": result["dtheta_post_impact"][k],
-                        "duration_dls": result["duration_dls"][k],
-                        "lambda_4_plus": result["lambda_4_plus"][k],
-                        "clearance": min(result[name][k] for name in PREMISES[:2]),
-                        "broken": " ".join(broken),
+                        "theta_post_impact": measured_orbit["theta_post_impact"][k],
+                        "dtheta_post_impact": measured_orbit["dtheta_post_impact"][k],
+                        "duration_dls": measured_orbit["duration_dls"][k],
+                        "lambda_4_plus": measured_orbit["lambda_4_plus"][k],
+                        "clearance": min(measured_orbit[name][k] for name in MARGIN_NAMES[:2]),
+                        "broken": " ".join(negative_margins),
                         "share_of_starts": np.mean(orbits.orbit_index == index),
                     }
                 )
-        print(damping, sorted({len(o) for o in orbits.orbits}), {n: fell.count(n) for n in fell})
+        print(
+            damping,
+            sorted({len(o) for o in orbits.orbits}),
+            {n: failures.count(n) for n in failures},
+        )
     return pd.DataFrame(rows)
 
 

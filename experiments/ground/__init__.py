@@ -1,1 +1,1 @@
-"""The wheel on real ground, and what the rungs below it miss."""
+"""Study the wheel with unilateral contact, and what simpler models miss."""

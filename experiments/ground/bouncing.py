@@ -1,9 +1,10 @@
-"""Where the paper's wheel bounces (c = 1 ... 4) high friction gives one gait from most starts.
+"""Count the gaits of the wheel at dampings (c = 1 ... 4) at which the paper's wheel bounces.
 
     python -m experiments.ground.bouncing
 
-Wheels from a grid of starts, walked at finite friction and by the rule for infinite friction; told
-are how many are left, and median and spread of their periods and double support.
+Wheels from a grid of starts walk with finite friction and by the rule for infinite friction. The
+table contains the number of wheels that still walk, and median and spread of their periods and of
+their double support. With high friction most starts lead to one gait.
 """
 
 import itertools
@@ -35,14 +36,19 @@ def main() -> None:
             model=vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper"),
             options=options,
         )
-        left_part = np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED
-        durations = np.asarray(batch_result.durations)[left_part]
+        is_walking = np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED
+        durations = np.asarray(batch_result.durations)[is_walking]
         period = durations.sum(-1)
-        result = [np.nan] * 4
-        if left_part.any():
-            share = durations[:, 0] / period
-            result = [np.median(period), np.ptp(period), np.median(share), np.ptp(share)]
-        rows.append([damping, friction, len(STARTS), left_part.sum(), *result])
+        statistics = [np.nan] * 4
+        if is_walking.any():
+            dls_fraction = durations[:, 0] / period
+            statistics = [
+                np.median(period),
+                np.ptp(period),
+                np.median(dls_fraction),
+                np.ptp(dls_fraction),
+            ]
+        rows.append([damping, friction, len(STARTS), is_walking.sum(), *statistics])
         print([f"{value:.5g}" for value in rows[-1]], flush=True)
     header = (*HEADER, "dls_fraction", "dls_spread")
     write_table(

@@ -24,7 +24,7 @@ from experiments.shared.tables import (
 )
 from experiments.shared.timing import measure_cpu_seconds
 
-SCENES = {  # label: friction and what differs from Table 1
+SCENES = {
     "Table 1, feet can't slide": (math.inf, {}),
     "Table 1, μ = 50": (50.0, {}),
     "Table 1, μ = 20": (20.0, {}),
@@ -37,24 +37,27 @@ SCENES = {  # label: friction and what differs from Table 1
     "c = 300, μ = 0.7": (0.7, {"damping": 300.0}),
     "c = 400, μ = 0.7": (0.7, {"damping": 400.0}),
 }
+"""Friction and the parameters that differ from Table 1, by label."""
 N_STEPS, N_TIMED, BATCH_SIZE = 300, 30, 2048
 MEASURES = ("period", "dls_fraction", "speed")
 
 
-def values(cycle: object) -> list[float]:
+def read_measures(cycle: object) -> list[float]:
+    """Return the `MEASURES` of a gait."""
     return [float(getattr(cycle, name)) for name in MEASURES]
 
 
-def wheel(changes: dict[str, float]) -> vrw.WheelParams:
+def make_wheel(changes: dict[str, float]) -> vrw.WheelParams:
+    """Return the wheel of Table 1 with some parameters replaced."""
     return vrw.WheelParams(**{name: jnp.asarray(value) for name, value in changes.items()})
 
 
-def errors() -> None:
-    """Of the lower rungs in every scene."""
-    papers = [vrw.limit_cycle(wheel(changes)) for _, changes in SCENES.values()]
+def measure_errors() -> None:
+    """Write the errors of the simpler models in every scene."""
+    paper_gaits = [vrw.limit_cycle(make_wheel(changes)) for _, changes in SCENES.values()]
     friction = np.array([mu for mu, _ in SCENES.values()])
     damping = np.array([changes.get("damping", 200.0) for _, changes in SCENES.values()])
-    x = [p.section_state if bool(p.found) else vrw.paper_start() for p in papers]
+    x = [p.section_state if bool(p.found) else vrw.paper_start() for p in paper_gaits]
     params = vrw.WheelParams(damping=damping)
     model = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
     batch_result = vrw.step_batch(
@@ -68,14 +71,14 @@ def errors() -> None:
     )
     rows = []
     for i, (label, (mu, changes)) in enumerate(SCENES.items()):
-        second_result = float(jnp.sum(last.durations[i] - batch_result.durations[i]))
+        period_change = float(jnp.sum(last.durations[i] - batch_result.durations[i]))
         outcome = vrw.Outcome(int(last.outcome[i]))
-        good = outcome == vrw.Outcome.STEPPED
-        truth = [float(fields[name][i]) if good else math.nan for name in MEASURES]
-        row = [label, mu, outcome.name, f"{second_result:.1e}", *(f"{v:.6g}" for v in truth)]
-        for cycle in (papers[i], vrw.limit_cycle(wheel(changes), model=vrw.RigidWheel())):
-            solution = values(cycle) if bool(cycle.found) else [math.nan] * 3
-            row += [f"{t - v:.3g}" for t, v in zip(solution, truth, strict=True)]
+        has_stepped = outcome == vrw.Outcome.STEPPED
+        reference = [float(fields[name][i]) if has_stepped else math.nan for name in MEASURES]
+        row = [label, mu, outcome.name, f"{period_change:.1e}", *(f"{v:.6g}" for v in reference)]
+        for cycle in (paper_gaits[i], vrw.limit_cycle(make_wheel(changes), model=vrw.RigidWheel())):
+            gait_measures = read_measures(cycle) if bool(cycle.found) else [math.nan] * 3
+            row += [f"{t - v:.3g}" for t, v in zip(gait_measures, reference, strict=True)]
         rows.append(row)
         print(row, flush=True)
     header = ["scene", "friction", "outcome", "period_change_s", *MEASURES]
@@ -88,36 +91,36 @@ def errors() -> None:
     )
 
 
-def costs() -> None:
-    """Of one step of each rung at Table 1 and μ = 0.7, by itself and in a batch."""
+def measure_costs() -> None:
+    """Write the cost of one step of each model at Table 1 and μ = 0.7, alone and in a batch."""
     params, start = vrw.WheelParams(), vrw.paper_start()
-    rungs = {
+    models = {
         "rigid": (vrw.RigidWheel(), jnp.asarray([math.pi / 8, 1.6, 0.0])),
         "paper": (vrw.ViscoelasticWheel(), start),
         "ground": (vrw.UnilateralWheel(friction=0.7), start),
     }
     rows = []
-    for name, (model, x) in rungs.items():
-        single_result = partial(
+    for name, (model, x) in models.items():
+        take_single_step = partial(
             vrw.return_map, params, x, model=model, options=vrw.StepOptions(**SETTLING_OPTIONS)
         )
         if name == "rigid":
-            mapped = jax.jit(jax.vmap(partial(vrw.return_map, params, model=model)))
-            many = partial(mapped, jnp.tile(x, (BATCH_SIZE, 1)))
+            batched_map = jax.jit(jax.vmap(partial(vrw.return_map, params, model=model)))
+            take_batch_step = partial(batched_map, jnp.tile(x, (BATCH_SIZE, 1)))
         else:
             states = np.tile(x, (BATCH_SIZE, 1))
-            many = partial(
+            take_batch_step = partial(
                 vrw.step_batch,
                 params,
                 states,
                 model=model,
                 options=vrw.StepOptions(**SETTLING_OPTIONS),
             )
-        jax.block_until_ready((single_result(), many()))  # compiled
+        jax.block_until_ready((take_single_step(), take_batch_step()))  # The first call compiles.
         row = [
             name,
-            f"{1e3 * measure_cpu_seconds(single_result, N_TIMED):.3g}",
-            f"{1e6 * measure_cpu_seconds(many, 3) / BATCH_SIZE:.3g}",
+            f"{1e3 * measure_cpu_seconds(take_single_step, N_TIMED):.3g}",
+            f"{1e6 * measure_cpu_seconds(take_batch_step, 3) / BATCH_SIZE:.3g}",
         ]
         rows.append(row)
         print(row, flush=True)
@@ -129,5 +132,5 @@ def costs() -> None:
 
 if __name__ == "__main__":
     parse_and_start_jax(make_parser(__doc__))
-    errors()
-    costs()
+    measure_errors()
+    measure_costs()

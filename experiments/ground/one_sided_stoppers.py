@@ -1,10 +1,10 @@
-"""Stoppers that only push change a gait's period by less than a per cent, for ten times the events.
+"""Compare gaits with one-sided stoppers and with bilateral stoppers.
 
     python -m experiments.ground.one_sided_stoppers
 
-Gaits over friction and damping with stoppers that hold legs in the air whatever it takes, then on
-from there with stoppers that only push (outcome 8: lost on the way there). Last, what a step in
-lanes costs with either (second call).
+Gaits over friction and damping are reached with bilateral stoppers, and then continued with
+one-sided stoppers. The periods differ by less than one percent, and the one-sided stoppers have
+about ten times the events. The command also measures the cost of a batch step in the second call.
 """
 
 import itertools
@@ -23,9 +23,9 @@ from experiments.shared.timing import measure_cpu_seconds
 DAMPING, FRICTION = (200.0, 300.0), (0.4, 0.5, 0.6, 0.7, 1.0, 1.3, 1.7, 2.0, 3.0)
 START = (0.1, 1.6, -0.1)
 N_FIRST, N_STEPS = 300, 60
-LANES = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
-N_TIMED_STEPS, N_TIMED_WHEELS = 5, 1024  # steps and wheels
-NAMES = ("period_s", "dls_fraction", "events", "tried", "last_change_s", "outcome")
+SOLVER_OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
+N_TIMED_STEPS, N_TIMED_WHEELS = 5, 1024
+COLUMN_NAMES = ("period_s", "dls_fraction", "events", "tried", "last_change_s", "outcome")
 
 
 def main() -> None:
@@ -33,15 +33,15 @@ def main() -> None:
     damping, friction = np.array(list(itertools.product(DAMPING, FRICTION))).T
     start = np.tile(START, (len(damping), 1))
     start_result = walk_batch(damping, friction, start, N_FIRST, "bilateral")
-    result_by_name = {}
+    rows_by_stoppers = {}
     for stoppers in ("bilateral", "one-sided"):
         solution = walk_batch(damping, friction, start_result.section_state, N_STEPS, stoppers)
         wheels = damping, friction, solution.section_state, solution.durations, solution.outcome
-        result_by_name[stoppers] = [
+        rows_by_stoppers[stoppers] = [
             measure_gait(*wheel, stoppers) for wheel in zip(*wheels, strict=True)
         ]
         selection = np.resize(np.arange(len(damping)), N_TIMED_WHEELS)
-        many = (
+        timed_wheels = (
             damping[selection],
             friction[selection],
             np.asarray(solution.section_state)[selection],
@@ -49,15 +49,17 @@ def main() -> None:
         speed = (
             N_TIMED_WHEELS
             * N_TIMED_STEPS
-            / measure_cpu_seconds(lambda m=many, s=stoppers: walk_batch(*m, N_TIMED_STEPS, s), 1)
+            / measure_cpu_seconds(
+                lambda m=timed_wheels, s=stoppers: walk_batch(*m, N_TIMED_STEPS, s), 1
+            )
         )
         print(f"{stoppers}: {speed:.0f} steps per second and core", flush=True)
     rows = []
-    for c, mu, a, b in zip(damping, friction, *result_by_name.values(), strict=True):
+    for c, mu, a, b in zip(damping, friction, *rows_by_stoppers.values(), strict=True):
         row = [c, mu, *a, *b, 100.0 * (b[0] / a[0] - 1.0)]
         print([f"{value:.4g}" for value in row], flush=True)
         rows.append([f"{value:.6g}" for value in row])
-    each = [f"{name}_{stoppers}" for stoppers in result_by_name for name in NAMES]
+    each = [f"{name}_{stoppers}" for stoppers in rows_by_stoppers for name in COLUMN_NAMES]
     header = ("damping", "friction", *each, "period_change_percent")
     write_table(FIGURES / "one_sided_stoppers.csv", header, rows)
     shown = "damping", "friction", "period_s_bilateral", "period_s_one-sided"
@@ -67,19 +69,23 @@ def main() -> None:
 
 
 def walk_batch(damping, friction, states, n_steps: int, stoppers: str) -> vrw.StepBatchResult:
+    """Return the result of a walk of all wheels."""
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     params = vrw.WheelParams(damping=damping)
-    return vrw.step_batch(params, states, n_steps, model=model, options=vrw.StepOptions(**LANES))
+    return vrw.step_batch(
+        params, states, n_steps, model=model, options=vrw.StepOptions(**SOLVER_OPTIONS)
+    )
 
 
 def measure_gait(damping, friction, x, durations, outcome, stoppers: str) -> list[float]:
-    """NAMES of one more step; its period less the last one's tells whether the gait repeats."""
+    """Return the `COLUMN_NAMES` of one more step; a small change of the period means that the gait
+    repeats."""
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     step = vrw.step(vrw.WheelParams(damping=damping), x, model=model)
     change = step.period - durations.sum()
-    result = step.period, step.dls_fraction, step.events, step.solver_steps, change
+    measures = step.period, step.dls_fraction, step.events, step.solver_steps, change
     code = int(outcome) or int(step.outcome)
-    return [*(np.nan if code else float(value) for value in result), float(code)]
+    return [*(np.nan if code else float(value) for value in measures), float(code)]
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""The paper's figures, drawn again."""
+"""Draw the figures of the paper from computed gaits."""

@@ -1,8 +1,8 @@
-"""The wheel's coordinates, legs, forces and phases, drawn at instants of Table 1's gait.
+"""Draw the wheel's coordinates, legs, forces and phases at instants of Table 1's gait.
 
     python -m experiments.paper.coordinates [folder]
 
-Writes `coordinates.svg` and `.png` to `results/` or the folder given.
+The command writes `coordinates.svg` and `.png` to `results/` or the given folder.
 """
 
 import numpy as np

@@ -1,22 +1,26 @@
-"""The hub of Table 1's gait rolls over circle after circle; Leg 2 leaves the ground only to rise.
+"""Draw figure 7 of the paper: stick figures of Table 1's gait.
 
     python -m experiments.paper.fig07_sticks [folder]
 
-Writes `fig07_sticks.svg` and `.png` to `results/` or the folder given.
+The hub moves along one circle after another. Leg 2 leaves the ground and then only rises. The
+command writes `fig07_sticks.svg` and `.png` to `results/` or the given folder.
 """
 
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.paper import reproduction
 
-STEPS = 2
-INTERVAL = 0.05  # s, between sticks
+N_STEPS = 2
+INTERVAL_SECONDS = 0.05
+"""Time between two stick figures."""
 
 
 def main() -> None:
     folder = parse_folder_and_start_jax(__doc__)
     plots.save(
-        plots.sticks(reproduction.simulate_table_1_gait(STEPS), INTERVAL), folder, "fig07_sticks"
+        plots.sticks(reproduction.simulate_table_1_gait(N_STEPS), INTERVAL_SECONDS),
+        folder,
+        "fig07_sticks",
     )
 
 

@@ -1,8 +1,9 @@
-"""Foot 2 scuffs in SLS-I where the damping is small (c = 50, and barely at 100), not at 200.
+"""Draw figure 8 of the paper: the height of foot 2 in SLS-I at three dampings.
 
     python -m experiments.paper.fig08_scuffing [folder]
 
-Writes `fig08_scuffing.svg` and `.png` to `results/` or the folder given.
+Foot 2 scuffs at c = 50 and slightly at c = 100. It does not scuff at c = 200. The command writes
+`fig08_scuffing.svg` and `.png` to `results/` or the given folder.
 """
 
 from experiments.shared.command import parse_folder_and_start_jax

@@ -1,8 +1,9 @@
-"""The normal force on foot 2 just after landing approaches zero as the damping grows.
+"""Draw figure 9 of the paper: the normal force on foot 2 after landing.
 
     python -m experiments.paper.fig09_rear_force [folder]
 
-Writes `fig09_rear_force.svg` and `.png` to `results/` or the folder given.
+The force approaches zero as the damping grows. The command writes `fig09_rear_force.svg` and
+`.png` to `results/` or the given folder.
 """
 
 from experiments.shared.command import parse_folder_and_start_jax
