@@ -65,16 +65,22 @@ def repeat_start(params: vrw.WheelParams) -> np.ndarray:
     return np.tile(np.asarray(vrw.paper_start()), (len(params.damping), 1))
 
 
-CONTACT = vrw.UnilateralWheel(friction=0.8)
+def make_contact_model() -> vrw.UnilateralWheel:
+    """Return the model with unilateral contact; a constant would create arrays at import."""
+    return vrw.UnilateralWheel(friction=0.8)
+
+
 BATCH_FUNCTIONS: dict[str, Callable[[vrw.WheelParams], object]] = {
     "step_batch": lambda p: vrw.step_batch(p, repeat_start(p)),
     "step_batch, 3 steps": lambda p: vrw.step_batch(p, repeat_start(p), 3),
     "step_batch, derivatives": lambda p: vrw.step_batch(
         p, repeat_start(p), derivatives=["damping"]
     ),
-    "step_batch, unilateral contact": lambda p: vrw.step_batch(p, repeat_start(p), model=CONTACT),
+    "step_batch, unilateral contact": lambda p: vrw.step_batch(
+        p, repeat_start(p), model=make_contact_model()
+    ),
     "limit_cycles": vrw.limit_cycles,
-    "limit_cycles, unilateral contact": lambda p: vrw.limit_cycles(p, model=CONTACT),
+    "limit_cycles, unilateral contact": lambda p: vrw.limit_cycles(p, model=make_contact_model()),
     "scan": lambda p: vrw.scan(
         vrw.uniform(damping=(100.0, 215.0), n=len(p.damping)),
         measures=["period"],
