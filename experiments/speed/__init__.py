@@ -1,1 +1,2 @@
-"""What steps, cycles, scans and compiling cost, beside others and beside before."""
+"""Measure the cost of steps, cycles, scans and compilation, also against other programs and
+commits."""

@@ -12,16 +12,17 @@ import numpy as np
 
 import vrw_jax as vrw
 
-N_DRAWN_WHEELS, LANES, CYCLES, SAMPLES = 12288, 4096, 1024, (2048, 6144)
-REPEATS, ENOUGH = 25, 1.0  # at most so many calls, s
+N_DRAWN_WHEELS, N_LANES, N_CYCLES, N_SAMPLES = 12288, 4096, 1024, (2048, 6144)
+N_REPEATS, MAX_SECONDS = 25, 1.0
 MEASURES = ("dls_fraction", "speed", "period", "lambda_I4", "lambda_4_plus")
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """CPU time of a call: the least of some, after one that compiles; others share the machine."""
+    """Return the least CPU time of several calls, s; the first call, which compiles, does not
+    count."""
     jax.block_until_ready(call())
     used_values: list[float] = []
-    while not used_values or (len(used_values) < REPEATS and sum(used_values) < ENOUGH):
+    while not used_values or (len(used_values) < N_REPEATS and sum(used_values) < MAX_SECONDS):
         began = time.process_time()
         jax.block_until_ready(call())
         used_values.append(time.process_time() - began)
@@ -29,7 +30,7 @@ def seconds(call: Callable[[], object]) -> float:
 
 
 def draw_wheels() -> dict[str, np.ndarray]:
-    """Random wheels; of these some six in ten have a gait."""
+    """Return random wheels, of which about six in ten have a gait."""
     draw = np.random.default_rng(1).uniform
     return {
         "damping": draw(100.0, 215.0, N_DRAWN_WHEELS),
@@ -40,7 +41,8 @@ def draw_wheels() -> dict[str, np.ndarray]:
 
 
 def turn() -> None:
-    """Prints where the library lies, figures by name, and how many lanes came to an end."""
+    """Print the path of the library, its figures by name, and the number of lanes without a
+    failure."""
     vrw.start_jax()
     find = jax.jit(jax.vmap(lambda rows: vrw.limit_cycle(vrw.WheelParams(**rows))))
     wheels = draw_wheels()
@@ -48,22 +50,22 @@ def turn() -> None:
     with_gait = np.asarray(every.found) & (np.asarray(every.durations)[:, 0] > 0.0)
     wheels = {name: values[with_gait] for name, values in wheels.items()}
     first = lambda n: {name: values[:n] for name, values in wheels.items()}
-    gaits = jax.tree.map(lambda leaf: leaf[with_gait][:LANES], every)
+    gaits = jax.tree.map(lambda leaf: leaf[with_gait][:N_LANES], every)
     draw = np.random.default_rng(3).uniform
-    params, selection = vrw.WheelParams(**first(LANES)), first(CYCLES)
-    states = np.asarray(gaits.section_state) * draw(0.99, 1.01, (LANES, 3))
-    expected = np.asarray(gaits.durations) * draw(0.99, 1.01, (LANES, 3))
+    params, selection = vrw.WheelParams(**first(N_LANES)), first(N_CYCLES)
+    states = np.asarray(gaits.section_state) * draw(0.99, 1.01, (N_LANES, 3))
+    expected = np.asarray(gaits.durations) * draw(0.99, 1.01, (N_LANES, 3))
     by_lanes = lambda: vrw.step_batch(params, states)
     known_by_name = {"engine": "collocation", "durations": expected}
     by_collocation = lambda: vrw.step_batch(params, states, **known_by_name)
     cycles = lambda: find(selection)
     scan = lambda n: vrw.scan(vrw.samples(first(n)), MEASURES)
-    few_items, many = (seconds(lambda n=n: scan(n)) for n in SAMPLES)
+    few_items, many = (seconds(lambda n=n: scan(n)) for n in N_SAMPLES)
     result_by_name = {
-        "gait steps per s, lanes": LANES / seconds(by_lanes),
-        "gait steps per s, collocation": LANES / seconds(by_collocation),
-        "cycles per s, cold guess": CYCLES / seconds(cycles),
-        "samples per s, scan": (SAMPLES[1] - SAMPLES[0]) / (many - few_items),
+        "gait steps per s, lanes": N_LANES / seconds(by_lanes),
+        "gait steps per s, collocation": N_LANES / seconds(by_collocation),
+        "cycles per s, cold guess": N_CYCLES / seconds(cycles),
+        "samples per s, scan": (N_SAMPLES[1] - N_SAMPLES[0]) / (many - few_items),
     }
     ended = {
         "lanes": int(np.sum(np.asarray(by_lanes().outcome) == 0)),

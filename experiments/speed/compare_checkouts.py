@@ -27,7 +27,7 @@ HEADER = ("figure", "A", "B", "B / A", "lowest", "highest")
 
 
 def environment(checkout: Path, cache: Path) -> dict[str, str]:
-    """Where a process finds its library, and keeps what it compiles."""
+    """Return the environment of a process: the path of its library and the folder of its cache."""
     extra_values = {
         "PYTHONPATH": str(checkout),
         "JAX_COMPILATION_CACHE_DIR": str(cache),
@@ -38,7 +38,7 @@ def environment(checkout: Path, cache: Path) -> dict[str, str]:
 
 
 def run_worker(code: str, given: dict[str, str]) -> tuple[str, float]:
-    """What a process prints, and its CPU seconds; the folder it starts in is not on its path."""
+    """Return the output of a process and its CPU seconds; its first folder is not on its path."""
     began = os.times()
     out = subprocess.run(
         [sys.executable, "-P", "-c", code], env=given, stdout=subprocess.PIPE, text=True, check=True
@@ -49,7 +49,7 @@ def run_worker(code: str, given: dict[str, str]) -> tuple[str, float]:
 
 
 def turn(checkout: Path, cache: Path) -> tuple[dict[str, float], dict[str, int]]:
-    """Figures of one turn, and how many lanes of each kind came to an end."""
+    """Return the figures of one turn, and the number of lanes of each kind without a failure."""
     given = environment(checkout, cache)
     lines, _ = run_worker(TURN, given)
     parsed = json.loads(lines.splitlines()[-1])
@@ -60,7 +60,7 @@ def turn(checkout: Path, cache: Path) -> tuple[dict[str, float], dict[str, int]]
 
 
 def compare_versions(checkouts: tuple[Path, Path], caches: Path, turns: int) -> list[tuple]:
-    """A row of HEADER for each figure."""
+    """Return a row of `HEADER` for each figure."""
     places = [(folder, caches / name) for folder, name in zip(checkouts, "ab", strict=True)]
     ended = [turn(*place)[1] for place in places]
     if ended[0] != ended[1]:

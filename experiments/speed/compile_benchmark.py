@@ -1,12 +1,12 @@
-"""What XLA's two ways of making CPU code cost, program by program: to compile and to run.
+"""Measure what XLA's two ways of compiling for the CPU cost per program, in compile and run time.
 
     python -m experiments.speed.compile_benchmark
 
-Compiles programs of this package with and without XLA's fusion emitters, which `vrw.start_jax`
-switches off, and writes `docs/figures/compile_benchmark.csv` and the table of
-`docs/benchmarks/compiling.md`. CPU seconds of one core, no cache; each pair of a program's times is
-taken in turn. Limit cycles are found by machine code that does not come from XLA: making it counts
-as tracing.
+The command compiles programs of this package with and without XLA's fusion emitters, which
+`vrw.start_jax` switches off. It writes `docs/figures/compile_benchmark.csv` and the table of
+`docs/benchmarks/compiling.md`. Times are CPU seconds of one core without a cache. The two ways take
+turns for each program. Limit cycles use machine code that XLA does not make; making this code
+counts as tracing.
 """
 
 import time
@@ -57,7 +57,8 @@ def programs() -> dict[str, Program]:
 
 
 def measure_program(function: Callable, arguments: tuple) -> dict[str, float]:
-    """Seconds to trace, machine code included, and to compile, milliseconds to run, each way."""
+    """Return seconds to trace, with machine code, seconds to compile and milliseconds to run, each
+    way."""
     began = time.process_time()
     lowered = jax.jit(function).lower(*arguments)
     row, compiled = {"trace_s": time.process_time() - began}, {}

@@ -1,10 +1,10 @@
-"""Measure how many points of curves of special points a core traces per second.
+"""Measure the number of points on curves of special points per second and core.
 
     python -m experiments.speed.curve_benchmark [--repeats 10]
 
-The curves are the first ones of the map over damping and stiffness (configs/map_c_k.toml), compiled
-before. The figure is the CPU time of one core, the best of some repetitions, with and without the
-branches that meet the curves.
+The curves are the first ones of the map over damping and stiffness (configs/map_c_k.toml). The
+programs are compiled before. The figure is the least CPU time of some repeats on one core, with and
+without the branches that meet the curves.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
-"""What limit cycles cost: per cycle and core, per gradient, to the first answer; and the hit rate.
+"""Measure the cost of limit cycles and their gradients, the time of a first gait, and the hit rate.
 
     python -m experiments.speed.cycle_benchmark
 
-Writes the block of `docs/benchmarks/cycles.md`. Times are CPU seconds of one core, the least of
-some, unless called wall; take them on an idle machine.
+The command writes the block of `docs/benchmarks/cycles.md`. Times are the least CPU seconds of some
+calls on one core, unless they are called wall times. Run it on an idle machine.
 """
 
 import os
@@ -39,14 +39,14 @@ print(time.time() - began[0], time.process_time() - began[1])
 """
 
 
-def wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
-    """Random wheels, every parameter a lane of its own."""
+def make_random_wheels(generator: np.random.Generator, n: int) -> vrw.WheelParams:
+    """Return random wheels, in which every parameter has an entry per lane."""
     drawn_values = wheels_of_rows(draw_parameter_rows(WIDE_BOX, n, generator))
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n,)), drawn_values)
 
 
 def measure_least_seconds(function: Callable, *arguments: object) -> float:
-    """CPU seconds of a call on one core."""
+    """Return the least CPU time of a call on one core, s."""
     jax.block_until_ready(function(*arguments))
     with use_one_core():
         return measure_cpu_seconds(lambda: function(*arguments), reduction=min)
@@ -61,7 +61,7 @@ STARTS = {
 
 
 def measure_first_gait(measure: str) -> list[tuple[float, float]]:
-    """(wall, CPU) seconds of a process that asks for one gradient, for each of STARTS."""
+    """Return wall and CPU seconds of a process that computes one gradient, for each of `STARTS`."""
     rows = []
     with tempfile.TemporaryDirectory() as cache:
         for start in STARTS.values():
@@ -77,10 +77,10 @@ def measure_first_gait(measure: str) -> list[tuple[float, float]]:
     return rows
 
 
-def reference(params: vrw.WheelParams) -> np.ndarray:
-    """Which wheels natural continuation from Table 1 reaches, in small steps, each from the last.
+def find_reachable_wheels(params: vrw.WheelParams) -> np.ndarray:
+    """Return which wheels natural continuation from Table 1 reaches in small steps.
 
-    A lane whose gait is lost, or jumps, on the way is not reached.
+    A wheel is not reached if its gait is lost or jumps.
     """
     ends = stack_parameters(params)
     starts = jnp.broadcast_to(stack_parameters(vrw.WheelParams())[:, None], ends.shape)
@@ -102,9 +102,10 @@ def reference(params: vrw.WheelParams) -> np.ndarray:
     return reached
 
 
-def hit_rate() -> dict[str, int]:
-    params = wheels(np.random.default_rng(7), N_SETS)
-    reached = reference(params)
+def measure_hit_rate() -> dict[str, int]:
+    """Return the shares of wheels for which a gait is found."""
+    params = make_random_wheels(np.random.default_rng(7), N_SETS)
+    reached = find_reachable_wheels(params)
     cold = jax.jit(jax.vmap(vrw.limit_cycle))(params)
     values_array = np.asarray(cold.found)
     options = vrw.StepOptions.tight()
@@ -122,9 +123,9 @@ def hit_rate() -> dict[str, int]:
     }
 
 
-def throughput() -> dict[str, float]:
-    """Microseconds of one core per cycle, in batches."""
-    params = wheels(np.random.default_rng(3), 8 * LANES)
+def measure_batch_time() -> dict[str, float]:
+    """Return microseconds of one core per cycle, in batches."""
+    params = make_random_wheels(np.random.default_rng(3), 8 * LANES)
     every = jax.jit(jax.vmap(vrw.limit_cycle))
     retained = np.flatnonzero(np.asarray(every(params).found))[:LANES]
     params = jax.tree.map(lambda x: x[retained], params)
@@ -166,8 +167,8 @@ def throughput() -> dict[str, float]:
     return {name: 1e6 * measure_least_seconds(*call) / LANES for name, call in table.items()}
 
 
-def sensitivity_ratio() -> dict[str, float]:
-    """Milliseconds of one gait alone: a return map, a cycle, and a full sensitivity."""
+def measure_single_time() -> dict[str, float]:
+    """Return milliseconds of one wheel: a return map, a cycle, and all its derivatives."""
     params, x = vrw.WheelParams(), vrw.limit_cycle(vrw.WheelParams()).section_state
     names = [name for name in CYCLE_MEASURE_FUNCTIONS if name not in ON_STABILITY]
 
@@ -185,8 +186,8 @@ def sensitivity_ratio() -> dict[str, float]:
     }
 
 
-def compiling() -> str:
-    """Seconds of processes that ask for one gradient."""
+def measure_first_times() -> str:
+    """Return seconds of processes that compute one gradient."""
     answers = [
         (f"gradient of `{measure}`, {state}", f"{wall:.1f}", f"{cpu:.1f}")
         for measure in ("dls_fraction", "spectral_radius")
@@ -196,24 +197,26 @@ def compiling() -> str:
 
 
 def measure_batches() -> str:
-    """Cycles side by side."""
+    """Return the lines of the page about cycles in batches."""
     header = (f"batches of {LANES}", "µs per cycle", "per second and core")
-    costs = throughput().items()
+    costs = measure_batch_time().items()
     return format_markdown(header, [(name, f"{us:.0f}", f"{1e6 / us:,.0f}") for name, us in costs])
 
 
 def measure_single_gait() -> str:
-    """One gait by itself."""
-    costs = sensitivity_ratio()
+    """Return the lines of the page about one gait."""
+    costs = measure_single_time()
     unit = next(iter(costs.values()))
     cells = [(name, f"{ms:.2f}", f"{ms / unit:.2f}") for name, ms in costs.items()]
     return format_markdown(("one gait alone", "ms", "return maps"), cells)
 
 
 def measure_hit_rates() -> str:
-    """How often gaits are found."""
+    """Return the lines of the page about hit rates."""
     box = ", ".join(f"{n} {low:g}…{high:g}" for n, (low, high) in WIDE_BOX.items())
-    table = format_markdown(("", "wheels"), [(name, f"{n:,}") for name, n in hit_rate().items()])
+    table = format_markdown(
+        ("", "wheels"), [(name, f"{n:,}") for name, n in measure_hit_rate().items()]
+    )
     return (
         f"The table counts random wheels from the box {box}. The reference is continuation from "
         f"Table 1 in {N_STAGES} steps.\n\n{table}"
@@ -223,7 +226,7 @@ def measure_hit_rates() -> str:
 def main() -> None:
     parse_and_start_jax(make_parser(__doc__))
     parts = []
-    for section in (compiling, measure_batches, measure_single_gait, measure_hit_rates):
+    for section in (measure_first_times, measure_batches, measure_single_gait, measure_hit_rates):
         parts.append(section())
         print(parts[-1], flush=True)
     source = describe_run("experiments.speed.cycle_benchmark")

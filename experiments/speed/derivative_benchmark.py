@@ -1,13 +1,13 @@
-"""What a step's derivatives cost: in batches over its values, of one wheel, to a first answer.
+"""Measure the cost of a step's derivatives, in batches, for one wheel, and for a first call.
 
     python -m experiments.speed.derivative_benchmark [--lanes 2048] [--repeats 9]
 
-Wheels near their own cycles (1 % off), as in `engine_benchmark`; values and Jacobians of states
-and durations in one run. Errors: 99th percentile over lanes of the largest entry, against the
-diffrax engine at `Options.tight()`. Times in batches are CPU time of one core, the least of the
-repeats; alone and to a first answer they are wall time. Then the seven columns of state, c, k, L*
-and phi beside peers, speed over error. Writes three tables into `docs/benchmarks/steps.md`, and
-a chart.
+Wheels start 1 % off their cycles, as in `engine_benchmark`. One run computes values and Jacobians
+of states and durations. Errors are 99th percentiles over lanes of the largest entry. Their
+reference is the diffrax engine at `StepOptions.tight()`. Times in batches are the least CPU times
+of the repeats on one core. The other times are wall times. The seven columns of state, c, k, L* and
+phi are compared with other programs as speed over error. The command writes three tables into
+`docs/benchmarks/steps.md`, and a chart.
 """
 
 import itertools
@@ -63,7 +63,7 @@ SINGLE_WHEEL_CALLS = {
 
 
 def flatten_derivatives(by_input: dict, names: Sequence[str]) -> np.ndarray:
-    """(lanes, 6, columns): of section state, then durations."""
+    """Return derivatives of section state and durations, shape (lanes, 6, columns)."""
     full_values = [
         np.concatenate([by_input[name].section_state, by_input[name].durations], 1)
         for name in names
@@ -72,7 +72,7 @@ def flatten_derivatives(by_input: dict, names: Sequence[str]) -> np.ndarray:
 
 
 def in_batches(n: int, repeats: int) -> list[tuple]:
-    """(tolerance, columns, microseconds a lane, of the values', errors of values and columns)."""
+    """Return tolerance, columns, microseconds per lane, and the errors of values and columns."""
     rows, states, truth = draw_wheels_near_gaits(n)
     params, selection, every = make_wheels(rows), slice(min(n, 512)), COLUMNS["all twelve"]
     tight = vrw.StepOptions.tight()
@@ -115,7 +115,8 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
 
 
 def candidates(rows: np.ndarray, states: np.ndarray) -> Iterator[tuple[str, str, int, Callable]]:
-    """(method, its tolerance, lanes, a run that tells seven columns of each)."""
+    """Return method, tolerance, number of lanes, and a function that computes seven columns per
+    lane."""
     requested = COLUMNS["state, c, k, L\\*, φ"]
 
     def by_library(engine: str, tolerance: float, n: int) -> Callable:
@@ -140,7 +141,7 @@ def candidates(rows: np.ndarray, states: np.ndarray) -> Iterator[tuple[str, str,
 
 
 def compare_with_others(n: int, repeats: int) -> list[dict]:
-    """Of each candidate its error and the steps with seven columns per second and core."""
+    """Return the error of each candidate, and its steps with seven columns per second and core."""
     rows, states, _ = draw_wheels_near_gaits(n)
     requested, selection = COLUMNS["state, c, k, L\\*, φ"], slice(n // 16)
     exact = flatten_derivatives(
@@ -159,14 +160,16 @@ def compare_with_others(n: int, repeats: int) -> list[dict]:
         )
         runs.append(run)
     with use_one_core():
-        for _ in range(repeats):  # in turns: a shared machine's clock changes
+        for _ in range(
+            repeats
+        ):  # Candidates take turns, because the clock of a shared machine changes.
             for entry, run in zip(table, runs, strict=True):
                 entry["taken"].append(measure_cpu_seconds(run, 1))
     return [x | {"speed": x["lanes"] / np.median(x["taken"])} for x in table]
 
 
 def draw_chart(table: list[dict]) -> None:
-    """Speed over error."""
+    """Draw speed over error."""
     with plots.figure_style():
         figure, axes = plt.subplots(figsize=(plots.PAGE_WIDTH_INCHES, 3.6))
         known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
@@ -185,7 +188,7 @@ def draw_chart(table: list[dict]) -> None:
 
 
 def find_fastest(table: list[dict]) -> list[tuple]:
-    """Rows of each method's quickest entry whose error is at most CLAIMED."""
+    """Return the fastest row of each method with an error of at most `COMPARED_ERROR`."""
     best = {}
     for entry in sorted(table, key=lambda x: x["speed"]):
         if entry["error"] <= COMPARED_ERROR:
@@ -204,9 +207,10 @@ def find_fastest(table: list[dict]) -> list[tuple]:
 
 
 def measure_single_calls() -> list[tuple]:
-    """(call, microseconds, seconds to a first answer with an empty cache, the same cached).
+    """Return call, microseconds, seconds of a first call with an empty cache, and with a filled
+    cache.
 
-    Python has its own bytecode of every module, as after any installation.
+    Python has its bytecode of every module, as after any installation.
     """
     params, x, table = vrw.WheelParams(), vrw.paper_start(), []
     installed = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
@@ -221,7 +225,7 @@ def measure_single_calls() -> list[tuple]:
                 ).stdout
             )
             cold, warm = float(evaluate()), float(evaluate())
-        function = eval(call, {"jax": jax, "vrw": vrw})  # this file's own text
+        function = eval(call, {"jax": jax, "vrw": vrw})  # The source of this file.
         jax.block_until_ready(function(params, x))
         times = []
         for _ in range(300):

@@ -1,8 +1,9 @@
-"""A gait step's derivatives as one would get them elsewhere, beside the library's machine code.
+"""Derivatives of a gait step by other programs, for comparison with the library's machine code.
 
-By the section state, c, k, L* and phi, of section state and durations: heyoka's variational
-equations, with events' and resets' part (saltation) by hand; central differences of numba's steps.
-As in `peers`, each starts just after the landing, whose own derivatives are given.
+The derivatives are those of section state and durations with respect to the section state, c, k, L*
+and phi. heyoka integrates variational equations, and this module adds the parts of events and
+resets (saltation). numba's steps give central differences. As in `peers`, a step starts just after
+the landing, and the derivatives of the landing are given.
 """
 
 from collections.abc import Callable
@@ -23,7 +24,7 @@ COLUMNS = 7
 
 
 def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """(theta, its rate, distance of the feet) after the landing, of each lane."""
+    """Return theta, its rate and the distance of the feet after the landing, for each lane."""
     landing = transitions.land(make_wheels(rows).symbols(), *np.asarray(states).T)
     return np.stack([landing.theta, landing.motion.dtheta, landing.distance], 1)
 
@@ -31,7 +32,7 @@ def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
 def compute_landing_with_tangents(
     rows: np.ndarray, states: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`landed`, and its derivatives (lanes, 3, COLUMNS)."""
+    """Return the result of `compute_landing` and its derivatives, shape (lanes, 3, COLUMNS)."""
 
     def one(given: jax.Array) -> jax.Array:
         landing = transitions.land(make_wheels(given[3:]).symbols(), *given[:3])
@@ -44,7 +45,8 @@ def compute_landing_with_tangents(
 def numba_differences(
     rows: np.ndarray, states: np.ndarray, tolerance: float, share: float
 ) -> Callable[[], np.ndarray]:
-    """Central differences, each number moved by a `share` of its size in Table 1's gait."""
+    """Return central differences, with each number changed by a `share` of its size in Table 1's
+    gait."""
     size = share * np.array([0.3, 1.0, 1.0, 100.0, 500.0, 1.0, 0.3])
     shifted_rows = []
     for column, sign in np.ndindex(COLUMNS, 2):
@@ -63,7 +65,7 @@ def numba_differences(
 
 
 class _Phase:
-    """Flow of one phase with its variational equations, to its event and through what follows."""
+    """Flow of one phase with its variational equations, up to its event and through its reset."""
 
     def __init__(
         self,
@@ -88,7 +90,8 @@ class _Phase:
     def __call__(
         self, x: np.ndarray, dx: np.ndarray, numbers: np.ndarray, dnumbers: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-        """State after it, its columns, the duration and its columns."""
+        """Return the state after the phase with its derivatives, and the duration with its
+        derivatives."""
         flow, n, m = self.flow, self.n, len(self.moving)
         flow.reset_cooldowns()
         flow.time, flow.pars[:] = 0.0, numbers[: len(flow.pars)]
@@ -130,7 +133,8 @@ class HeyokaVariations:
         )  # fmt: skip
 
     def make_run(self, rows: np.ndarray, states: np.ndarray) -> Callable[[], np.ndarray]:
-        """A run over these lanes: columns (lanes, 6, COLUMNS)."""
+        """Return a function that computes the derivatives of these lanes, shape (lanes, 6,
+        COLUMNS)."""
         x, dx = compute_landing_with_tangents(rows, states)
         numbers = np.concatenate([peers.pack(make_wheels(rows)), x[:, 2:]], 1)
         numbers[:, 7] = rows[:, 3]

@@ -1,13 +1,14 @@
-"""The lane engine takes more gait steps per second and core than its peers, at equal error.
+"""Compare gait steps per second and core of the library's engines and other programs, over the
+error.
 
     python -m experiments.speed.engine_benchmark [--lanes 4096] [--repeats 5] [--redraw]
 
-4,096 wheels near their own limit cycles (1 % off) take one gait step each, by every engine and at
-several tolerances, in turns. Error: largest of section state and durations, against the diffrax
-engine at `Options.tight()`; its 99th percentile over lanes counts. Time: CPU time of one core,
-median over turns. Peers start after the landing and watch three events alone; C++ is there where
-g++ is. Writes a table (csv, markdown) and two charts: speed over error, and cost over the share of
-lanes that fail.
+4,096 wheels start 1 % off their limit cycles and take one gait step, with every engine and at
+several tolerances, in turns. The error is the 99th percentile over lanes of the largest error of
+section state and durations. Its reference is the diffrax engine at `StepOptions.tight()`. The time
+is the CPU time of one core, median over turns. Other programs start after the landing and watch
+only three events. C++ runs if g++ is installed. The command writes a table (csv, Markdown) and two
+charts: speed over error, and cost over the share of lanes that fail.
 """
 
 import os
@@ -56,7 +57,7 @@ COMPARED_ERROR = 1e-8
 
 
 def by_library(engine, solver, tolerance):
-    """Runs of the library's engine over rows and states: to states and durations."""
+    """Return a function that prepares runs of an engine of the library."""
     options = vrw.StepOptions(solver=solver, rtol=tolerance, atol=tolerance)
 
     def prepare(rows, states):
@@ -72,7 +73,7 @@ def by_library(engine, solver, tolerance):
 
 
 def by_collocation(options, expected):
-    """Runs in fixed work, lanes that fail their check by the lane engine."""
+    """Return a function that prepares runs by collocation; failed lanes use the lane engine."""
 
     def prepare(rows, states):
         params, near = make_wheels(rows), expected[: len(rows)]
@@ -89,9 +90,10 @@ def by_collocation(options, expected):
 
 
 def by_peer(function, side_by_side=False):
-    """Runs of a peer, which starts after the landing.
+    """Return a function that prepares runs of another program, which starts after the landing.
 
-    One with wheels `side_by_side` gets them in the order in which they wait least, for nothing.
+    With `side_by_side`, the wheels are sorted so that they wait least for each other; the time of
+    the sort does not count.
     """
 
     def prepare(rows, states):
@@ -110,7 +112,7 @@ def by_peer(function, side_by_side=False):
 
 
 def candidates(durations):
-    """(engine, method, tolerance, lanes, prepare): one entry for each row of the table."""
+    """Return engine, method, tolerance, number of lanes and preparation of each table entry."""
     near = durations * np.random.default_rng(3).uniform(0.97, 1.03, durations.shape)
     options = vrw.StepOptions(rtol=6e-8, atol=6e-8)
     yield "collocation", "Gauss-4", 6e-8, 1.0, by_collocation(options, near)
@@ -142,7 +144,7 @@ def candidates(durations):
 
 
 def compare(rows, states, truth, repeats):
-    """The table: engine, method, tolerance, p99 error, gait steps per second, first call."""
+    """Return the table: engine, method, tolerance, p99 error, steps per second and first call."""
     table, runs = [], []
     for engine, method, tolerance, share, make in candidates(truth[:, 3:]):
         n = max(int(share * len(rows)), 16)
@@ -166,7 +168,7 @@ def compare(rows, states, truth, repeats):
 
 
 def at_claimed_error(table):
-    """The fastest entry of each engine with an error of at most CLAIMED."""
+    """Return the fastest entry of each engine with an error of at most `COMPARED_ERROR`."""
     best = {}
     for entry in sorted(table, key=lambda e: e["steps_per_s"]):
         if entry["p99_error"] <= COMPARED_ERROR:
@@ -175,9 +177,13 @@ def at_claimed_error(table):
 
 
 def cost_of_failures(rows, states, repeats):
-    """CPU microseconds per lane over the share of lanes that fall back, by engine."""
+    """Return CPU microseconds per lane over the share of lanes that need the second engine, by
+    engine."""
     failing_rows, failing = rows.copy(), states.copy()
-    failing_rows[:, 3], failing[:, 1] = 0.1, 0.9  # too flat, too slow: they fall back
+    failing_rows[:, 3], failing[:, 1] = (
+        0.1,
+        0.9,
+    )  # These wheels are on a flat slope and slow, and fall back.
     shares, random = np.linspace(0.0, 1.0, 6), np.random.default_rng(2)
     runs = {
         "lanes": (by_library("lanes", "Dopri8", 6e-8), len(rows)),
@@ -198,7 +204,7 @@ def cost_of_failures(rows, states, repeats):
 
 
 def write(table, shares, cost, out):
-    """Table, page and charts."""
+    """Write the table, the page and the charts."""
     figures = out / "figures"
     shown_by_name = {"p99_error": ".2e", "steps_per_s": ".0f", "first_call_s": ".1f"}
     rounded = [
@@ -245,7 +251,7 @@ def draw(table, shares, cost, figures):
 
 
 def redraw(figures):
-    """From the numbers kept."""
+    """Draw the charts from the stored numbers."""
     numbers = ("p99_error", "steps_per_s")
     table = [
         entry | {name: float(entry[name]) for name in numbers}
@@ -258,7 +264,7 @@ def redraw(figures):
 
 
 def draw_charts(table, shares, cost):
-    """Speed over error of every engine, and cost over the share of lanes that fall back."""
+    """Draw speed over error of every engine, and cost over the share of lanes that fall back."""
     figure, (left_part, right) = plt.subplots(1, 2, figsize=(plots.PAGE_WIDTH_INCHES, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
     colours = {

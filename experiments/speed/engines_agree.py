@@ -1,12 +1,12 @@
-"""What the two engines of a step tell apart over random wheels, each difference with its reason.
+"""Compare the two engines of a step over random wheels, and state a reason for each difference.
 
     python -m experiments.speed.engines_agree [--lanes 1000000] [--seed 0]
 
-Wheels and starts of a wide box: many step, others fall in every way. Both engines at the default
-options; lanes whose outcome differs, or whose state or durations do by more than 1e-8, are looked
-at again: at tolerances of 1e-13 by both, whether they come to rest, at 1e-12, then at starts 1e-10
-and 1e-8 away by the lanes alone. Writes a table into `docs/verification/accuracy.md`, and names the
-lanes for which no reason was found.
+Wheels and starts come from a wide box: many step, and others fall in every way. Both engines use
+the default options. If the outcomes of a lane differ, or its state or durations differ by more than
+1e-8, the lane is computed again: by both engines at 1e-13, at 1e-12 to see whether it comes to
+rest, and by the lane engine from starts 1e-10 and 1e-8 away. The command writes a table into
+`docs/verification/accuracy.md`, and prints the lanes without a reason.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ StepValues = tuple[np.ndarray, np.ndarray]  # outcome; state and durations, (lan
 
 
 def draw_wheels(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters, (lanes, 9), and section states."""
+    """Return parameters, shape (lanes, 9), and section states."""
     random = np.random.default_rng(seed)
     rows = np.tile([float(getattr(vrw.WheelParams(), name)) for name in PARAMETER_NAMES], (n, 1))
     for name, limits in BOX.items():
@@ -54,7 +54,7 @@ def draw_wheels(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def compute_steps(
     rows: np.ndarray, states: np.ndarray, engine: str, options: vrw.StepOptions
 ) -> tuple[StepValues, np.ndarray]:
-    """One step of each, and how many steps the solver tried."""
+    """Return one step of each wheel, and the number of tried solver steps."""
     params = wheel_from_parameters(jnp.asarray(rows.T), 8)
     batch_result = vrw.step_batch(params, states, options=options, engine=engine)  # type: ignore[arg-type]
     values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
@@ -64,7 +64,8 @@ def compute_steps(
 def by_diffrax(
     rows: np.ndarray, states: np.ndarray, like: np.ndarray, options: vrw.StepOptions
 ) -> StepValues:
-    """In batches of one size, each of lanes that take about as long: `like` tells how long."""
+    """Return the same by diffrax, in batches of lanes that take similar times; `like` contains the
+    times."""
     n, order = len(rows), np.argsort(like)
     outcome, values = np.empty(n, int), np.empty((n, 6))
     for begin in range(0, n, BATCH):
@@ -77,13 +78,13 @@ def by_diffrax(
 
 
 def compute_difference(one: StepValues, other: StepValues) -> np.ndarray:
-    """How far two engines' results differ; infinite where outcomes do."""
+    """Return the largest difference of two results; infinite if the outcomes differ."""
     away = np.max(np.abs(one[1] - other[1]) / (1.0 + np.abs(other[1])), axis=1)
     return np.where(one[0] == other[0], away, np.inf)
 
 
 def moved_by(by_lanes: Callable, rows: np.ndarray, states: np.ndarray, away: float) -> np.ndarray:
-    """How far the lanes' own results move with a start that much away."""
+    """Return the change of each lane's result if its start moves by a distance."""
     values_here = by_lanes(rows, states)
     signs = np.concatenate([np.eye(3), -np.eye(3)])
     return np.max(
@@ -93,7 +94,8 @@ def moved_by(by_lanes: Callable, rows: np.ndarray, states: np.ndarray, away: flo
 
 
 def reasons(n: int, seed: int) -> tuple[list[tuple[str, int, str]], np.ndarray, str]:
-    """(reason, lanes, their largest difference), lanes without one, and how the rest differs."""
+    """Return reason, lanes and largest difference, lanes without a reason, and all other
+    differences."""
     rows, states = draw_wheels(n, seed)
     default, tight = vrw.StepOptions(), vrw.StepOptions.tight()
     lanes, tried = compute_steps(rows, states, "lanes", default)

@@ -1,12 +1,13 @@
-"""What a GPU makes of the same functions: rates, compile times, and agreement with the CPU.
+"""Measure rates and compile times of the same functions on a GPU, and compare the numbers with the
+CPU.
 
     python -m experiments.speed.gpu [--lanes 1000000] [--rehearse]
 
-Steps, seven columns of their Jacobians, limit cycles and a scan in float64, on JAX's default
-device, where that is a GPU; without one it says so and writes nothing. The same lanes are then
-computed by the CPU in a process of its own. A rate is lanes over the wall time of the second call;
-what the first call took beyond it is compiling. Writes a table into `docs/benchmarks/steps.md`;
-`--rehearse` goes the same way on a CPU and prints the table instead.
+The functions are steps, seven columns of their Jacobians, limit cycles and a scan, in float64 on
+JAX's default device. Without a GPU the command prints a sentence and writes nothing. A second
+process computes the same lanes on the CPU. A rate is the number of lanes over the wall time of the
+second call. Compile time is the additional time of the first call. The command writes a table into
+`docs/benchmarks/steps.md`. With `--rehearse` it runs on a CPU and prints the table.
 """
 
 import os
@@ -75,7 +76,7 @@ JOBS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
 
 
 def measure_job(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
-    """(job, numbers, lanes a second, seconds of compiling) on the default device."""
+    """Return job, numbers, lanes per second and seconds of compilation on the default device."""
     result_list = []
     for name, (job, share) in JOBS.items():
         rows = draw_parameter_rows(
@@ -91,7 +92,7 @@ def measure_job(lanes: int) -> list[tuple[str, np.ndarray, float, float]]:
 
 
 def by_cpu(lanes: int) -> list[np.ndarray]:
-    """The same numbers from a process that sees the CPU alone."""
+    """Return the same numbers from a process that uses only the CPU."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "cpu.npz"
         call = [sys.executable, "-m", "experiments.speed.gpu", f"--lanes={lanes}", f"--to={file}"]

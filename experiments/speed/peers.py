@@ -1,9 +1,9 @@
-"""The same gait step by others: numba, SciPy, heyoka and C++, beside the library's engines.
+"""The same gait step by numba, SciPy, heyoka and C++, for comparison with the library's engines.
 
-Each starts just after the landing and ends at the next touchdown, watching the paper's own three
-events alone: a little less than what the library's engines do. Each returns, lane by lane,
+Each program starts just after the landing and ends at the next touchdown. It watches only the three
+events of the paper, which is a little less than the library's engines do. Each returns per lane
 (theta-, dtheta-, dL1-), the three durations and the number of evaluations. The equations are those
-of docs/explanation/physics.md, written out for numbers and for heyoka's expressions alike.
+of docs/explanation/physics.md, written for numbers and for heyoka's expressions alike.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ SA, CA = math.sin(ALPHA), math.cos(ALPHA)
 
 
 def terms(sin, cos, L1, L2, w, dL1, dL2, P):
-    """M11, M12, M13 and the applied forces; P as made by `pack`."""
+    """Return M11, M12, M13 and the applied forces; P is the result of `pack`."""
     m, a, L0, Ls, k, c, g, sf, cf, Mh = P
     c0, b = L0 - a, L2 - a
     coupling = m * (c0 * (1.0 + CA) - b * CA)
@@ -41,7 +41,7 @@ def terms(sin, cos, L1, L2, w, dL1, dL2, P):
 
 
 def double_support(sin, cos, w, D, P):
-    """(ddtheta, lambda_4, L1, L2, dL1, dL2)."""
+    """Return (ddtheta, lambda_4, L1, L2, dL1, dL2)."""
     m, Mh, scale = P[0], P[9], D / SA
     rs, rc = sin * CA + cos * SA, cos * CA - sin * SA
     L1, L2, G1, G2 = scale * rc, scale * cos, -scale * rs, -scale * sin
@@ -56,7 +56,7 @@ def double_support(sin, cos, w, D, P):
 
 
 def single_support_1(sin, cos, L1, L2, w, dL1, dL2, P):
-    """Second derivatives of (theta, L1, L2)."""
+    """Return the second derivatives of (theta, L1, L2)."""
     m, Mh = P[0], P[9]
     M11, M12, M13, f1, f2, f3 = terms(sin, cos, L1, L2, w, dL1, dL2, P)
     q = SA * L1
@@ -68,13 +68,13 @@ def single_support_1(sin, cos, L1, L2, w, dL1, dL2, P):
 
 
 def single_support_2(sin, cos, L1, w, dL1, P):
-    """Second derivatives of (theta, L1)."""
+    """Return the second derivatives of (theta, L1)."""
     M11, _, _, f1, f2, _ = terms(sin, cos, L1, P[2], w, dL1, 0.0, P)
     return f1 / M11, f2 / P[9]
 
 
 def pack(params):
-    """(lanes, 10) parameters, in the order `terms` unpacks."""
+    """Return the parameters in the order of `terms`, shape (lanes, 10)."""
     get = lambda name: np.asarray(getattr(params, name), float)
     m, slope = get("leg_mass"), get("slope")
     Mh = get("hub_mass") + 7.0 * m
@@ -89,7 +89,7 @@ _names = {"terms": n_terms, "SA": SA, "CA": CA}
 
 
 def _compile_with_terms(function):
-    """`function` with its call of `terms` compiled too."""
+    """Compile a function together with the `terms` that it calls."""
     return _jit(types.FunctionType(function.__code__, {**globals(), **_names}, function.__name__))
 
 
@@ -99,8 +99,8 @@ n_dls, n_sls1, n_sls2 = map(
 
 
 @numba.njit
-def slope(phase, y, D, P, dy):
-    """Right-hand side; returns the phase's guard and its rate (0: not known)."""
+def state_rates(phase, y, D, P, dy):
+    """Write the right-hand side into `dy`; return the phase's guard and its rate (0 if unknown)."""
     sin, cos = math.sin(y[0]), math.cos(y[0])
     if phase == 0:
         x1, force, _, _, _, _ = n_dls(sin, cos, y[1], D, P)
@@ -118,34 +118,34 @@ def slope(phase, y, D, P, dy):
 
 @numba.njit
 def dormand_prince(phase, n, y, k, z, error, h, D, P):
-    """One step into z; k[0] must hold the slope at y, k[6] will hold that at z."""
+    """Take one solver step into z; k[0] holds the rates at y, and k[6] those at z."""
     for i in range(n):
         z[i] = y[i] + h * 0.2 * k[0, i]
-    slope(phase, z, D, P, k[1])
+    state_rates(phase, z, D, P, k[1])
     for i in range(n):
         z[i] = y[i] + h * (3 / 40 * k[0, i] + 9 / 40 * k[1, i])
-    slope(phase, z, D, P, k[2])
+    state_rates(phase, z, D, P, k[2])
     for i in range(n):
         z[i] = y[i] + h * (44 / 45 * k[0, i] - 56 / 15 * k[1, i] + 32 / 9 * k[2, i])
-    slope(phase, z, D, P, k[3])
+    state_rates(phase, z, D, P, k[3])
     for i in range(n):
         z[i] = y[i] + h * (
             19372 / 6561 * k[0, i] - 25360 / 2187 * k[1, i] + 64448 / 6561 * k[2, i]
             - 212 / 729 * k[3, i]
         )  # fmt: skip
-    slope(phase, z, D, P, k[4])
+    state_rates(phase, z, D, P, k[4])
     for i in range(n):
         z[i] = y[i] + h * (
             9017 / 3168 * k[0, i] - 355 / 33 * k[1, i] + 46732 / 5247 * k[2, i]
             + 49 / 176 * k[3, i] - 5103 / 18656 * k[4, i]
         )  # fmt: skip
-    slope(phase, z, D, P, k[5])
+    state_rates(phase, z, D, P, k[5])
     for i in range(n):
         z[i] = y[i] + h * (
             35 / 384 * k[0, i] + 500 / 1113 * k[2, i] + 125 / 192 * k[3, i]
             - 2187 / 6784 * k[4, i] + 11 / 84 * k[5, i]
         )  # fmt: skip
-    guard = slope(phase, z, D, P, k[6])
+    guard = state_rates(phase, z, D, P, k[6])
     for i in range(n):
         error[i] = h * (
             71 / 57600 * k[0, i] - 71 / 16695 * k[2, i] + 71 / 1920 * k[3, i]
@@ -156,8 +156,9 @@ def dormand_prince(phase, n, y, k, z, error, h, D, P):
 
 @numba.njit(error_model="numpy")
 def numba_phase(phase, n, y, h, D, P, tol, k, z, error):
-    """To the phase's guard, in place; returns its duration, the next step and steps tried."""
-    before, _ = slope(phase, y, D, P, k[0])
+    """Integrate to the phase's guard in place; return duration, next solver step and number of
+    tries."""
+    before, _ = state_rates(phase, y, D, P, k[0])
     time, tried = 0.0, 0
     while True:
         tried += 1
@@ -198,7 +199,7 @@ def numba_phase(phase, n, y, h, D, P, tol, k, z, error):
 
 @numba.njit
 def numba_steps(starts, parameters, tol):
-    """Dormand-Prince 5(4) with adaptive steps."""
+    """Return gait steps by Dormand-Prince 5(4) with adaptive solver steps."""
     out = np.empty((len(starts), 7))
     k, z, error, y = np.empty((7, 6)), np.empty(6), np.empty(6), np.empty(6)
     for lane in range(len(starts)):
@@ -219,7 +220,7 @@ def numba_steps(starts, parameters, tol):
 
 
 def hit(y, P):
-    """Stopper impact: (theta, L1, L2, rates) to (theta, L1, dtheta, dL1), in place."""
+    """Apply the stopper impact in place: (theta, L1, L2, rates) becomes (theta, L1, rates)."""
     M11 = terms(0.0, 1.0, y[1], P[2], 0.0, 0.0, 0.0, P)[0]
     dtheta, dL1 = y[3] - P[0] * SA * y[1] * y[5] / M11, y[4] - P[0] * CA * y[5] / P[9]
     y[2], y[3] = dtheta, dL1
@@ -228,8 +229,8 @@ def hit(y, P):
 hit_numba = _compile_with_terms(hit)
 
 
-def handed_on(phase, y, D, P):
-    """Coordinates and rates with which the next phase begins."""
+def start_of_phase(phase, y, D, P):
+    """Return the coordinates and rates with which the next phase starts."""
     if phase == 0:
         _, _, L1, L2, dL1, dL2 = n_dls(math.sin(y[0]), math.cos(y[0]), y[1], D, P)
         return np.array([y[0], L1, L2, y[1], dL1, dL2])
@@ -240,7 +241,7 @@ def handed_on(phase, y, D, P):
 
 
 def scipy_steps(starts, parameters, tol, method="DOP853"):
-    """solve_ivp with compiled right-hand side and its own events; NaN where it failed."""
+    """Return gait steps by `solve_ivp` with compiled right-hand side; NaN if it failed."""
     out = np.zeros((len(starts), 7))
     for lane, (theta, w) in enumerate(starts):
         P = tuple(parameters[lane])
@@ -251,11 +252,11 @@ def scipy_steps(starts, parameters, tol, method="DOP853"):
             def right(t, y, phase=phase, D=D, P=P, lane=lane):
                 out[lane, 6] += 1.0
                 dy = np.empty_like(y)
-                slope(phase, y, D, P, dy)
+                state_rates(phase, y, D, P, dy)
                 return dy
 
             def guard(t, y, phase=phase, D=D, P=P):
-                return slope(phase, y, D, P, np.empty_like(y))[0]
+                return state_rates(phase, y, D, P, np.empty_like(y))[0]
 
             guard.terminal, guard.direction = True, -1.0
             solution = solve_ivp(
@@ -277,7 +278,8 @@ def scipy_steps(starts, parameters, tol, method="DOP853"):
 
 
 def torch_steps(starts, parameters, tol, method="dopri5"):
-    """torchdiffeq's odeint_event in eager PyTorch, both to be installed on their own."""
+    """Return gait steps by `odeint_event` of torchdiffeq in eager PyTorch; both need an
+    installation."""
     import torch
     from torchdiffeq import odeint_event
 
@@ -310,13 +312,13 @@ def torch_steps(starts, parameters, tol, method="dopri5"):
                     rates, torch.tensor(y), zero, event_fn=guard, rtol=tol, atol=tol, method=method
                 )
             y, out[lane, 3 + phase] = solution[-1].numpy().copy(), float(end)
-            y = handed_on(phase, y, D, P)
+            y = start_of_phase(phase, y, D, P)
         out[lane, :3] = y[0], y[2], y[3]
     return out
 
 
 class ByHand:
-    """`peer.cpp`, eight wheels side by side in C++, by a tableau of explicit Runge-Kutta."""
+    """Gait steps by `peer.cpp`: eight wheels side by side, with an explicit Runge-Kutta tableau."""
 
     def __init__(self, solver):
         tableau, created = load_explicit_tableau(solver), Path(tempfile.mkdtemp())
@@ -340,7 +342,7 @@ class ByHand:
         self.steps.argtypes = [pointer, pointer, pointer, ctypes.c_long, ctypes.c_double]
 
     def __call__(self, starts, parameters, tol):
-        """Lanes: a multiple of eight."""
+        """Return gait steps; the number of lanes is a multiple of eight."""
         given = [np.ascontiguousarray(x.T) for x in (parameters, starts)]
         result = np.empty((6, len(starts)))
         self.steps(*(x.ctypes.data for x in (*given, result)), len(starts), tol)
@@ -380,6 +382,6 @@ class Heyoka:
                 used_values = ta.propagate_until(20.0)[3]
                 out[lane, 6] += used_values * (ta.order + 1)  # a Taylor coefficient each
                 y, out[lane, 3 + phase] = ta.state.copy(), ta.time
-                y = handed_on(phase, y, D, P)
+                y = start_of_phase(phase, y, D, P)
             out[lane, :3] = y[0], y[2], y[3]
         return out

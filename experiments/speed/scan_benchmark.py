@@ -1,11 +1,11 @@
-"""A scan takes time linear in its samples and flat memory, on two cores, killed or not.
+"""Measure time and memory of scans over the number of samples, with two kills of the largest.
 
     python -m experiments.speed.scan_benchmark [largest]
 
-Grids of 1,000 samples and ten times as many each time, up to the largest (1,000,000), are scanned
-by a process each; the largest is killed with signal 9 after a third and after two thirds. Run it
-again after any interruption: it goes on. Writes `scan_benchmark.csv`, `.png` and `.svg`, and
-pictures of the largest scan, into `docs/figures`.
+One process each scans grids of 1,000 samples and of ten times as many, up to the largest
+(1,000,000). Signal 9 kills the largest after a third and after two thirds. If the command itself is
+interrupted, it continues when it is run again. It writes `scan_benchmark.csv`, `.png` and `.svg`,
+and pictures of the largest scan, into `docs/figures`.
 """
 
 import json
@@ -61,7 +61,7 @@ def log(size: int) -> Path:
 
 
 def scan(size: int, since: float) -> None:
-    """In a process of its own: every chunk's progress goes to the log, kill or no kill."""
+    """Scan in this process, and log the progress of every chunk."""
 
     def report(progress: ScanProgress) -> None:
         result_by_name = {
@@ -80,7 +80,7 @@ def scan(size: int, since: float) -> None:
 
 
 def sessions(size: int) -> list[list[dict]]:
-    """Reports of each process that worked on a scan, in order."""
+    """Return the reports of each process that worked on a scan, in order."""
     if not log(size).exists():
         return []
     result: dict[int, list[dict]] = {}
@@ -91,13 +91,13 @@ def sessions(size: int) -> list[list[dict]]:
 
 
 def done(size: int) -> int:
-    """Samples in the store, as far as told."""
+    """Return the number of samples in the store, according to the last report."""
     result = sessions(size)
     return result[-1][-1]["kept"] + result[-1][-1]["done"] if result else 0
 
 
 def supervise(size: int, killed_at: tuple[float, ...]) -> None:
-    """Run a scan to its end, killing it on the way where that has not happened yet."""
+    """Run a scan to its end, with those kills that have not happened yet."""
     due = [share * size for share in killed_at if done(size) < share * size]
     returned = None
     while returned != 0:
@@ -132,12 +132,16 @@ def figures_of(size: int) -> dict[str, object]:
 
 
 def draw(rows: list[Any]) -> None:
-    """The scanning processes, whose memory is told, do not know how to draw."""
+    """Draw the figures in a process of its own, because the memory of scanning processes is
+    measured."""
     from matplotlib.figure import Figure
 
     from vrw_jax import figures as plots
 
-    cold, warm = rows[:1], rows[1:]  # the first process compiles: what it takes is no trend
+    cold, warm = (
+        rows[:1],
+        rows[1:],
+    )  # The first process compiles, and its time is not part of the trend.
     with plots.figure_style():
         figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.6))
         left_part, right = figure.subplots(1, 2)
@@ -161,7 +165,7 @@ def draw(rows: list[Any]) -> None:
 
 
 def compare(size: int) -> None:
-    """Some chunks computed again, by nobody's leave: they must be the stored ones, bit by bit."""
+    """Compute some chunks again, and require the stored bits."""
     of_values = make_plan(size)
     stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of_values.build_engine()
     assert np.all(stored.outcome.values >= 0), "samples are missing"

@@ -32,7 +32,7 @@ GROUP, N_LEGS = 8, 8
 def count_tried_steps(
     rows: jax.Array, states: jax.Array, solver: str, options: vrw.StepOptions
 ) -> jax.Array:
-    """Steps that each lane tries in each phase, (3, lanes)."""
+    """Return the solver steps that each lane tries in each phase, shape (3, lanes)."""
     tableau = load_explicit_tableau(solver)
     assert tableau is not None
     walk_result = run_batch_phases(
@@ -41,8 +41,8 @@ def count_tried_steps(
     return jnp.stack([end.n_solver_steps for end in walk_result.phase_ends])
 
 
-def scenes(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Parameters, (lanes, 9), and section states."""
+def draw_cases(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return parameters, shape (lanes, 9), and section states, by the name of each case."""
     selection, states, _ = draw_wheels_near_gaits(n)
     params, random = make_wheels(selection), np.random.default_rng(5)
     rows = np.stack([np.broadcast_to(getattr(params, name), n) for name in PARAMETER_NAMES], 1)
@@ -53,8 +53,8 @@ def scenes(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     }
 
 
-def parameters(rows: np.ndarray) -> dict[str, np.ndarray]:
-    """By name, (lanes,)."""
+def columns_by_name(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the parameters by name, shape (lanes,) each."""
     return dict(zip(PARAMETER_NAMES, rows.T, strict=True))
 
 
@@ -64,8 +64,9 @@ def compute_group_steps(steps: np.ndarray, order: np.ndarray) -> float:
 
 
 def powers(rows: np.ndarray, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Of c/m, dtheta and k/m, and what multiplies theta and Ls, in the log of SLS-I's steps."""
-    own_values = parameters(rows)
+    """Return fits of the logarithm of SLS-I's steps: powers of c/m, dtheta, k/m, factors of theta
+    and Ls."""
+    own_values = columns_by_name(rows)
     mass = own_values["leg_mass"]
     logs = [
         np.log(own_values["damping"] / mass),
@@ -85,11 +86,11 @@ def main() -> None:
     solver = vrw.StepOptions().solver
     options = vrw.StepOptions(rtol=chosen.tolerance, atol=chosen.tolerance)
     result, fits = [], []
-    for scene, (rows, states) in scenes(chosen.lanes).items():
+    for scene, (rows, states) in draw_cases(chosen.lanes).items():
         steps = np.asarray(
             count_tried_steps(jnp.asarray(rows), jnp.asarray(states), solver, options)
         )
-        own_values = parameters(rows)
+        own_values = columns_by_name(rows)
         orders = (
             np.arange(len(rows)),
             np.argsort(own_values["damping"] / own_values["leg_mass"]),

@@ -1,10 +1,10 @@
-"""A step on uneven ground takes about as long as one on flat ground, in batches of both models.
+"""Compare the time of a step on uneven ground and on flat ground, in batches of both models.
 
     python -m experiments.speed.uneven_ground_benchmark [--repeats 11] [--sd 0.002]
 
 Wheels near their gaits walk ten steps on flat ground and on lines whose slopes vary from foothold
 to foothold, with the standard deviation `--sd`, rad. Both kinds of ground take turns in one
-process. Times are CPU time, and medians count. The experiment writes a table into
+process. Times are CPU times, and medians over the repeats. The command writes a table into
 `docs/benchmarks/steps.md`.
 """
 

@@ -1,12 +1,13 @@
-"""Times that can be compared between commits: running and compiling apart.
+"""Time running and compiling separately, in a form that `pytest-benchmark` compares between
+commits.
 
-    python -m experiments.speed.wall_time       # keeps them under .benchmarks
-    pytest-benchmark compare --group-by=name    # commit beside commit
+    python -m experiments.speed.wall_time       # stores the times in .benchmarks
+    pytest-benchmark compare --group-by=name    # compares commits
 
-Running: CPU time of a call that has been compiled. First: wall time of a process that starts,
-compiles with no cache and answers. All on one core. No test of the library looks at a clock; these
-are kept apart. Take them on an idle machine, both commits in one sitting. Further arguments are
-pytest's.
+The running time is the CPU time of a compiled call. The first time is the wall time of a process
+that starts, compiles without a cache and computes. All use one core. No test of the library
+measures time, and these files are separate. Run both commits one after the other on an idle
+machine. Further arguments go to pytest.
 """
 
 import os
@@ -28,12 +29,14 @@ from experiments.shared.wheels import PARAMETER_BOX, draw_parameter_rows, make_w
 START = (0.1, 1.6, -0.1)
 RUNNING = {
     "one step": lambda: vrw.return_map(vrw.WheelParams(), START),
-    "4,096 steps": lambda: vrw.step_batch(make_wheels(rows(4096)), np.tile(START, (4096, 1))),
+    "4,096 steps": lambda: vrw.step_batch(
+        make_wheels(draw_parameters(4096)), np.tile(START, (4096, 1))
+    ),
     "one limit cycle": lambda: vrw.limit_cycle(vrw.WheelParams()),
-    "1,024 limit cycles": lambda: many_cycles(rows(1024)),
+    "1,024 limit cycles": lambda: many_cycles(draw_parameters(1024)),
     "a gradient": lambda: gradient(vrw.WheelParams()),
     "256 steps on real ground": lambda: vrw.step_batch(
-        make_wheels(rows(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
+        make_wheels(draw_parameters(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
     ),
 }
 FIRST_CALLS = {
@@ -43,8 +46,8 @@ FIRST_CALLS = {
 }
 
 
-def rows(n: int) -> np.ndarray:
-    """Parameters of some wheels, the same each time."""
+def draw_parameters(n: int) -> np.ndarray:
+    """Return the parameters of random wheels, the same each time."""
     return draw_parameter_rows(PARAMETER_BOX, n, np.random.default_rng(0))
 
 

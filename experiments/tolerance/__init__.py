@@ -1,1 +1,1 @@
-"""Answers to within a tolerance: what they claim, what is true, what they cost."""
+"""Measures to a given tolerance: claimed errors, true errors and costs."""

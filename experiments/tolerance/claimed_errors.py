@@ -64,7 +64,7 @@ Columns = dict[str, np.ndarray]
 
 
 def wheels(part: int) -> tuple[Columns, np.ndarray, np.ndarray]:
-    """The box first, then the hostile ones; friction and tolerance of each."""
+    """Return the wheels of a part, those of the box first; friction and tolerance of each."""
     random = np.random.default_rng(part)
     draw = lambda n: {name: random.uniform(*ends, n) for name, ends in WIDE_BOX.items()}
     box, many = draw(N_BOX_WHEELS), draw(N_PARTS * N_HOSTILE_WHEELS)
@@ -83,7 +83,7 @@ def wheels(part: int) -> tuple[Columns, np.ndarray, np.ndarray]:
 
 
 def compute_part(part: int) -> Columns:
-    """What wheels of a part are told, and the truth; NaN where they have no gait."""
+    """Return claimed and reference results of the wheels of a part; NaN if a wheel has no gait."""
     columns, friction, tols = wheels(part)
     result: Columns = {}
     for tol in TOLERANCES:
@@ -112,12 +112,12 @@ def select_wheels(columns: Columns, selection: np.ndarray) -> vrw.WheelParams:
 def compute_reference(
     columns: Columns, friction: np.ndarray, near: np.ndarray, solution: np.ndarray
 ) -> np.ndarray:
-    """Measures of the gaits next to the answers' section states.
+    """Return measures of the gaits next to the section states of the results.
 
-    By Newton's method with the derivatives of steps at 1e-12 from there, where it leads farther
-    than CLOSE from where walks of WALKS steps end, and at last at looser tolerances: nothing
-    but the step is shared with what `vrw.answer` does. NaN where there is none: then the answer
-    is wrong.
+    Newton's method uses derivatives of steps at 1e-12. If its gait is farther than
+    `SAME_GAIT_DISTANCE` from the end of a walk of `WALKS` steps, looser tolerances follow. Only the
+    step is shared with `vrw.measure_to_tolerance`. NaN means that there is no gait, and then the
+    result is wrong.
     """
     exact, open_ = np.full((len(friction), len(MEASURES)), np.nan), np.flatnonzero(solution)
     legs = vrw.WheelParams().n_legs
@@ -153,7 +153,7 @@ def compute(parts: int, folder: Path) -> None:
 
 
 def gather_parts(folder: Path) -> None:
-    """All parts in one small file."""
+    """Write all parts into one small file."""
     parts = [dict(np.load(path)) for path in sorted(folder.glob("part_???.npz"))]
     result_by_name = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     lower = (
@@ -187,20 +187,23 @@ def compute_map() -> None:
 
 
 def find_best_model(cloud: Columns) -> np.ndarray:
-    """Steps' worth of what would have sufficed: the paper's gait alone, which costs what one step
-    does, where it is right to the tolerance; else real ground, as it was climbed to."""
+    """Return the cost, in steps, of the cheapest accurate model.
+
+    The cost is one step if the gait of the paper's model is accurate to the tolerance. Otherwise it
+    is the cost of the refinement with unilateral contact.
+    """
     lower = np.all(np.abs(cloud["model_error"]) <= cloud["tol"][:, None], axis=1)
     return np.where(lower & (cloud["hows"] <= 1), 1.0, cloud["n_steps"])
 
 
 def count_results() -> None:
-    """The page's numbers."""
+    """Return the numbers of the page."""
     cloud, table = dict(np.load(CLOUD)), []
     hostile = cloud["hostile"] > 0
     for name, selection in (("box", ~hostile), ("hostile", hostile)):
         own_values = {key: x[selection] for key, x in cloud.items()}
         answered = own_values["answered"] > 0
-        # Infinite where there is no gait to be right about.
+        # The error is infinite if there is no gait.
         ratio = np.nan_to_num(np.abs(own_values["wrong"]) / own_values["errors"], nan=np.inf).max(1)
         lower = answered & (own_values["hows"] <= 1) & np.isfinite(ratio)
         for which, rows in (("all", lower), ("of one step", lower & (own_values["hows"] == 0))):

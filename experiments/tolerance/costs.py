@@ -42,7 +42,7 @@ def draw_wheels(box: dict[str, tuple[float, float]], n: int) -> dict[str, np.nda
 
 
 def compare_with_unilateral_model(n: int, repeats: int) -> None:
-    """Of all wheels, and of those that begin at a gait of the paper's and end near it."""
+    """Return costs of all wheels, and of those whose gait is near that of the paper's model."""
     columns = draw_wheels(PARAMETER_BOX, n)
     columns["friction"] = np.exp(np.random.default_rng(2).uniform(*np.log(FRICTION), n))
     design = vrw.samples(columns)
@@ -65,7 +65,7 @@ def compare_with_unilateral_model(n: int, repeats: int) -> None:
 
 
 def measure_means() -> None:
-    """What a mean costs, beside a scan on real ground of as many wheels as its error takes."""
+    """Return the cost of a mean, and of a scan with unilateral contact for the same error."""
     rows = []
     for name, (box, tolerances) in DESIGNS.items():
         columns = draw_wheels(box, N_MEAN)
@@ -107,7 +107,7 @@ def measure_means() -> None:
 
 
 def _cpu(take: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """Least CPU time of all threads, s, after a first call that compiles; and the last result."""
+    """Return the least CPU time of all threads, s, without the first call, and the last result."""
     result, best = take(), np.inf
     for _ in range(repeats):
         began = time.process_time()

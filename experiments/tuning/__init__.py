@@ -1,1 +1,1 @@
-"""The best gait, by exact gradients and by others, on the paper's rung and on real ground."""
+"""Compare tuning by exact gradients with other optimizers, and the optima of two models."""

@@ -1,15 +1,16 @@
-"""Exact gradients find the best gait in 5 gaits; COBYLA takes 3 times, CMA-ES 60 times as many.
-
-From random starts in the box of the configs, for the most double support and for the largest
-stability margin, every premise kept: `vrw.tune`, CMA-ES, Nelder-Mead (both with an exact penalty)
-and COBYLA, at equal numbers of limit cycles. Then a grid around the best wheel, and a walk of it.
-Both optima are corners, held by as many constraints and bounds as there are parameters: where
-linear models are all it takes COBYLA is as good as it gets. Gaps below 1e-5 are the breach allowed.
+"""Compare `vrw.tune` with CMA-ES, Nelder-Mead and COBYLA at equal numbers of limit cycles.
 
     python -m experiments.tuning.against_others [folder] [--starts 20]
 
-Writes `tuning_against_others.csv`, `.svg` and `.png` to `docs/figures` or the folder given, and the
-table of `tuning.md` beside it.
+The objectives are the largest double support and the largest stability margin, with nonnegative
+margins, from random starts in the box of the configs. CMA-ES and Nelder-Mead use an exact penalty.
+Then the command evaluates a grid around the best wheel, and a walk of it. `vrw.tune` finds the best
+gait in 5 gaits; COBYLA takes 3 times as many. Both optima are corners, which as many constraints
+and bounds hold as there are parameters. Therefore COBYLA's linear models suffice. Gaps below 1e-5
+are smaller than the allowed violation.
+
+The command writes `tuning_against_others.csv`, `.svg` and `.png` to `docs/figures` or the given
+folder, and the table of `tuning.md`.
 """
 
 import contextlib
@@ -46,9 +47,9 @@ cma = require_extra("cma")
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABELS = {"tune": "this library"}
-DASHES = ("-", "--", "-.", ":")  # of the methods, in their order
+DASHES = ("-", "--", "-.", ":")  # line styles of the methods, in their order
 PROBLEMS = {"most double support": "tune_dls", "largest stability margin": "tune_stability"}
-MAX_EVALUATIONS = 400  # gaits per start and method
+MAX_EVALUATIONS = 400  # number of gaits per start and method
 SEED = 1
 CONSTRAINT_TOLERANCE = (
     1e-4  # breach of a constraint that still counts as none, in widths of the bounds
@@ -61,7 +62,7 @@ MISSING_GAIT_OBJECTIVE = (
 
 
 class MethodHistory(NamedTuple):
-    """What one method evaluated from one start, in order."""
+    """Evaluations of one method from one start, in order."""
 
     objective: np.ndarray  # NaN where there was no gait
     breach: np.ndarray
@@ -73,7 +74,7 @@ class SpentError(Exception):
 
 
 class Counter:
-    """Objective and breach of a problem at u, each gait counted; without derivatives."""
+    """Objective and constraints of a problem at u without derivatives; counts the gaits."""
 
     def __init__(self, problem: TuneProblem, values: Callable, scales: np.ndarray) -> None:
         self._problem, self._values, self._scales = problem, values, scales
@@ -82,7 +83,8 @@ class Counter:
         self.allowed = MAX_EVALUATIONS
 
     def __call__(self, u: np.ndarray) -> tuple[float, np.ndarray]:
-        """Objective and slack in widths of the bounds; NaN and -1 where there is no gait."""
+        """Return the objective and the slack in widths of the bounds; NaN and -1 if there is no
+        gait."""
         if len(self.objective) >= self.allowed:
             raise SpentError
         u = np.clip(u, 0.0, 1.0)
@@ -96,7 +98,8 @@ class Counter:
         return float(values[0]), slack
 
     def compute_penalized(self, u: np.ndarray) -> float:
-        """To be minimised: an exact penalty on every breach, and on leaving the box."""
+        """Return the value to minimize: the objective with an exact penalty on violations and on
+        leaving the box."""
         objective, slack = self(u)
         outside = float(np.sum(np.abs(u - np.clip(u, 0.0, 1.0))))
         if np.isnan(objective):
@@ -105,7 +108,7 @@ class Counter:
 
 
 def values_of(problem: TuneProblem) -> Callable:
-    """Whether there is a gait, and objective and constraints, compiled without derivatives."""
+    """Return a compiled function: whether there is a gait, the objective and the constraints."""
     target_values, finder = problem.objective_and_constraints, problem.finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -138,7 +141,8 @@ def nelder_mead(count: Counter, u: np.ndarray, seed: int) -> None:
 
 
 def cobyla(count: Counter, u: np.ndarray, seed: int) -> None:
-    """The constraints as they are; both functions of one place are one gait."""
+    """Minimize by COBYLA with separate constraints; objective and constraints of one point share
+    one gait."""
     last: dict[bytes, tuple[float, np.ndarray]] = {}
 
     def evaluate(u: np.ndarray) -> tuple[float, np.ndarray]:
@@ -190,7 +194,7 @@ def by_other(method: Callable, count: Counter, u: np.ndarray, seed: int) -> Meth
 
 
 def best_so_far(observed_values: MethodHistory) -> np.ndarray:
-    """The best objective of a gait that keeps every constraint, after each evaluation."""
+    """Return the best objective of an admissible gait, after each evaluation."""
     retained = np.isfinite(observed_values.objective) & (
         observed_values.breach <= CONSTRAINT_TOLERANCE
     )
@@ -198,7 +202,7 @@ def best_so_far(observed_values: MethodHistory) -> np.ndarray:
 
 
 def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray]:
-    """Random wheels of the box that have a gait, whether or not it keeps the premises."""
+    """Return random wheels of the box that have a gait, admissible or not."""
     generator = np.random.default_rng(SEED)
     starts: list[np.ndarray] = []
     while len(starts) < n:
@@ -209,7 +213,8 @@ def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray
 
 
 def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: float) -> dict:
-    """Whether any wheel of a grid of 7 values per parameter around u is better, at two scales."""
+    """Return whether any wheel of a grid of 7 values per parameter around u is better, at two
+    scales."""
     checked = retained = better = 0
     for reach in (0.05, 0.005):
         for offset in itertools.product(np.linspace(-reach, reach, 7), repeat=u.size):
@@ -227,7 +232,7 @@ def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: flo
 def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name: str) -> dict:
     values = values_of(problem)
     starts = starts_of(problem, values, n_starts)
-    # What a constraint changes over the box makes breaches comparable; once, at the config's wheel.
+    # Violations are scaled by the change of each constraint over the box, at the config's wheel.
     first = problem.evaluate_start()
     scales = scale_slacks(first.slack, first.slack_jacobian)
     observed_values: dict[str, list[MethodHistory]] = {
@@ -262,7 +267,7 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
 
 
 def draw_chart(results: dict[str, dict]) -> Figure:
-    """Gap to the best known over gaits evaluated: median of the starts, and quartiles."""
+    """Draw the gap to the best known objective over the number of gaits: median and quartiles."""
     with plots.figure_style():
         figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.9))
         panels = figure.subplots(1, len(results), sharey=True)
@@ -289,7 +294,7 @@ def draw_chart(results: dict[str, dict]) -> Figure:
 
 
 def summary(rows: list[dict]) -> str:
-    """How many starts came near the best, by how many gaits and in what time: medians."""
+    """Return how many starts came near the best, and the medians of gaits and times."""
     near = [f"within {gap:g}: starts, gaits" for gap in RELATIVE_GAPS]
     lines = []
     select = lambda row: (row["problem"], row["method"])

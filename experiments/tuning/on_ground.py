@@ -1,10 +1,11 @@
-"""The most double support on real ground (μ = 0.7) asks for another wheel than on the paper's.
+"""Compare the wheels with the most double support of two models: unilateral contact and the
+paper's.
 
     python -m experiments.tuning.on_ground
 
-Damping, stiffness, natural length and slope move in one box. On the paper's rung all premises that
-its gaits can keep are constraints; on real ground there are none. Each optimum is then evaluated on
-the other rung.
+The friction is μ = 0.7. Damping, stiffness, natural length and slope vary in one box. With the
+paper's model all margins that its gaits can satisfy are constraints. With unilateral contact there
+are none. Each optimum is then evaluated with the other model.
 """
 
 import vrw_jax as vrw
@@ -17,7 +18,7 @@ from experiments.shared.tables import (
 from experiments.shared.wheels import WIDE_BOX
 
 FRICTION = 0.7
-ON_PAPER = WIDE_BOX  # beyond c = 215 the rear foot lifts off in the landing
+PAPER_MODEL_BOX = WIDE_BOX  # Above c = 215 the rear foot lifts off at the landing.
 BOX = WIDE_BOX | {"damping": (20.0, 400.0)}
 DAMPING = 300.0  # of the second start on real ground, else Table 1; the first: the paper's optimum
 TOLERANCE, MAX_EVALUATIONS = 1e-4, 30  # gaits of one climb
@@ -25,8 +26,8 @@ OPTIONS = {"rtol": 1e-9, "atol": 1e-9}  # of steps
 FIELDS = ("scene", *BOX, "ending", "held_by", "dls_fraction", "period", "speed", "slip", "radius")
 
 
-def on_ground(wheel: vrw.WheelParams, start: object) -> tuple:
-    """Measures of a gait on real ground near `start`, or where a walk from it ends."""
+def measure_with_contact(wheel: vrw.WheelParams, start: object) -> tuple:
+    """Return the measures of a gait with unilateral contact near `start`, or the end of a walk."""
     model, options = vrw.UnilateralWheel(friction=FRICTION), vrw.StepOptions(**OPTIONS)
     walk = vrw.walk(wheel, start, 300, model=model, options=options)
     end = walk.steps.section_state[-1]
@@ -38,8 +39,8 @@ def on_ground(wheel: vrw.WheelParams, start: object) -> tuple:
     return ("", float(cycle.dls_fraction), float(cycle.period), float(cycle.speed), slip, radius)
 
 
-def on_paper(wheel: vrw.WheelParams) -> tuple:
-    """Measures of the paper's gait."""
+def measure_with_paper_model(wheel: vrw.WheelParams) -> tuple:
+    """Return the measures of the gait of the paper's model."""
     cycle = vrw.limit_cycle(wheel)
     if not bool(cycle.found):
         return (vrw.Outcome(int(cycle.outcome)).name, "", "", "", "", "")
@@ -66,19 +67,19 @@ def main() -> None:
         rows.append([scene, *numbers(wheel), ending or results[0], held_values_2, *results[1:]])
         print(rows[-1], flush=True)
 
-    paper = vrw.tune(vrw.WheelParams(), "dls_fraction", list(BOX), ON_PAPER)
+    paper = vrw.tune(vrw.WheelParams(), "dls_fraction", list(BOX), PAPER_MODEL_BOX)
     held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
     row(
         "paper's optimum, paper's rung",
         paper.params,
-        on_paper(paper.params),
+        measure_with_paper_model(paper.params),
         paper.status.name,
         held_values,
     )
     row(
         "paper's optimum, real ground",
         paper.params,
-        on_ground(paper.params, paper.cycle.section_state),
+        measure_with_contact(paper.params, paper.cycle.section_state),
     )
     climbed = []
     starts = {
@@ -91,12 +92,12 @@ def main() -> None:
             tolerance=TOLERANCE, max_evaluations=MAX_EVALUATIONS,
         )  # fmt: skip
         held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in tuned.active)
-        result = on_ground(tuned.params, tuned.cycle.section_state)
+        result = measure_with_contact(tuned.params, tuned.cycle.section_state)
         print(tuned, flush=True)
         row(scene, tuned.params, result, tuned.status.name, held_values)
         climbed.append(tuned)
     best = max(climbed, key=lambda tuned: tuned.value)
-    row("optimum on real ground, paper's rung", best.params, on_paper(best.params))
+    row("optimum on real ground, paper's rung", best.params, measure_with_paper_model(best.params))
     write_table(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
     show_table(
         "studies/double_support.md",
