@@ -15,6 +15,7 @@ from vrw_jax.cli.config import (
 )
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
+    FORCE_PEAK_MEASURES,
     GAIT_SENSITIVITY_MEASURES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
@@ -166,6 +167,8 @@ _GROUPS = (
         "contact report these measures in addition to those of a step."),
     ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES,
         "Limit cycles report these measures."),
+    ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model report "
+        "these measures. `vrw.force_peaks` returns them for walks, but for the impulse."),
     ("Of a trajectory", TRAJECTORY_MEASURES,
         "`vrw.simulate` returns these coordinates and variables."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES,

@@ -280,6 +280,8 @@ def test_a_gait_is_printed_with_its_margins(config: Path) -> None:
     assert result.exit_code == 0, result.output
     for words in ("DLS fraction", "0.53", "stable: multipliers 0.3286", "6 are broken"):
         assert words in result.stdout
+    assert "Force in the gait" in result.stdout
+    assert "peak force" in result.stdout
 
 
 def test_help_shows_brackets_and_every_command(config: Path) -> None:

@@ -137,7 +137,7 @@ def gait(
         int | None, typer.Option(min=1, max=MAX_OPTION_INTEGER, help="Steps to walk.")
     ] = None,
 ) -> None:
-    """Walk a wheel and print its gait: durations, speed, indicators and margins.
+    """Walk a wheel and print its gait: durations, speed, indicators, force peaks and margins.
 
     Walks step by step from a start near the gait of Table 1, or from the start in the config. Then
     finds the limit cycle near the last step. With unilateral contact and no start in the config,
@@ -157,7 +157,7 @@ def gait(
         import jax.numpy as jnp
 
         from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
-        from vrw_jax.simulation import step
+        from vrw_jax.simulation import SAMPLED_PEAK_MEASURES, force_peaks, simulate, step
         from vrw_jax.wheel import Outcome
 
         model: Any = settings.make_model()
@@ -177,7 +177,11 @@ def gait(
             model, reason = resolve_model_with_reason(params, model)
             needs_no_guess = start is None or make_finder(model, params.n_legs).supports_cold_start
             cycle: Any = limit_cycle(params, guess=None if needs_no_guess else state, model=model)
-        printing.print_gait(params, result, state, n_walked, cycle)
+            peaks = None
+            if model.is_compliant and bool(cycle.found):
+                gait_step = simulate(params, cycle.section_state, 1, model=model, options=options)
+                peaks = force_peaks(gait_step)[list(SAMPLED_PEAK_MEASURES)]
+        printing.print_gait(params, result, state, n_walked, cycle, peaks)
         if reason:
             stdout_console.print(reason)
 

@@ -5,7 +5,7 @@ import enum
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -264,9 +264,10 @@ def print_gait(
     start: "ArrayLike | tuple[float, ...]",
     n_walked: int,
     cycle: "LimitCycle | ReturnMapCycle",
+    peaks: "xr.Dataset | None",
 ) -> None:
-    """Print a wheel, the last step of its walk, which began at the state `start`, and its limit
-    cycle.
+    """Print a wheel, the last step of its walk, which began at the state `start`, its limit cycle,
+    and the force peaks of the gait's first step.
     """
     import numpy as np
 
@@ -291,6 +292,8 @@ def print_gait(
             f"[bold]Step {n_walked + 1} ended as {outcome.name}:[/] {outcome.meaning}"
         )
     _print_cycle(cycle)
+    if peaks is not None:
+        _print_measures("Force in the gait", {str(name): x.item() for name, x in peaks.items()})
     # This is a cycle of the paper's model.
     if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():
         _print_margins(result)
@@ -298,15 +301,23 @@ def print_gait(
 
 def _print_step(result: "AbstractStep") -> None:
     """Print the measures of a step."""
-    from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+    from vrw_jax.measures import MARGIN_MEASURES
 
-    values = result.measures()
+    excluded = ("outcome", "solver_steps", *MARGIN_MEASURES)
+    values = {name: value for name, value in result.measures().items() if name not in excluded}
+    _print_measures("Last step", values)
+
+
+def _print_measures(title: str, values: "Mapping[str, Any]") -> None:
+    """Print a table of measures by name."""
+    from vrw_jax.measures import MEASURES
+
     rows = (
         (measure.long_name, measure.symbol, f"{float(values[name]):.5g}", measure.display_unit)
         for name, measure in MEASURES.items()
-        if name in values and name not in ("outcome", "solver_steps", *MARGIN_MEASURES)
+        if name in values
     )
-    print_table("Last step", rows, ("quantity", "symbol", "value", "unit"), ("value",))
+    print_table(title, rows, ("quantity", "symbol", "value", "unit"), ("value",))
 
 
 def _print_cycle(cycle: "LimitCycle | ReturnMapCycle") -> None:

@@ -1,5 +1,10 @@
 """Gauss collocation of limit cycles, with the durations of the phases among the unknowns."""
 
+from vrw_jax.collocation.extrema import (
+    CollocatedPhase,
+    PhaseExtrema,
+    find_extrema,
+)
 from vrw_jax.collocation.gauss import (
     DOUBLE_END_WEIGHTS,
     DOUBLE_INTEGRATION_MATRIX,

@@ -36,6 +36,7 @@ from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
 from vrw_jax.measures import (
     DIFFERENTIABLE_STEP_NAMES,
+    FORCE_PEAK_MEASURES,
     GAIT_SENSITIVITY_MEASURES,
     MARGIN_MEASURES,
     MEASURES,
@@ -72,7 +73,9 @@ class CollocationFinder(AbstractGaitFinder):
     )
     supports_cold_start: ClassVar[bool] = True
     default_measures: ClassVar[tuple[str, ...]] = tuple(
-        n for n in cycle_measures if n not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES)
+        n
+        for n in cycle_measures
+        if n not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
     )
 
     @classmethod

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
+from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.printing import (
     AbstractPrintable,
     TextRow,
@@ -282,6 +283,10 @@ def _read_gait_sensitivity(name: str) -> Callable[[Any], Array]:
     return lambda cycle: cycle.gait_sensitivity(name)
 
 
+def _read_force_peak(name: str) -> Callable[[Any], Array]:
+    return lambda cycle: cycle.force_peaks[name]
+
+
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "dls_fraction": _read_property("dls_fraction"),
     "period": _read_property("period"),
@@ -305,6 +310,7 @@ CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "gait_sensitivity_dls_fraction": _read_gait_sensitivity("dls_fraction"),
     "gait_sensitivity_period": _read_gait_sensitivity("period"),
     "gait_sensitivity_speed": _read_gait_sensitivity("speed"),
+    **{name: _read_force_peak(name) for name in FORCE_PEAK_MEASURES},
 }
 """Functions of a cycle by the name of the measure. Derivatives of the stability measures are
 second derivatives of the motion. They need one more compiled program and take twice the time to

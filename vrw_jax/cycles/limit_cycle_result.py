@@ -6,7 +6,7 @@ forward and reverse mode, and to any order.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,6 +30,7 @@ from vrw_jax.cycles.collocation_search import (
 )
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.derivatives import attach_monodromy, solve_cycle_with_derivatives
+from vrw_jax.cycles.force_peaks import compute_force_peaks
 from vrw_jax.cycles.margin_defaults import gait_takeoff_acceleration
 from vrw_jax.cycles.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.cycles.slope_response import (
@@ -38,6 +39,7 @@ from vrw_jax.cycles.slope_response import (
     collocation_slope_response,
     compute_gait_sensitivity,
 )
+from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
 from vrw_jax.printing import TextRow, describe_elements, format_numbers
@@ -180,6 +182,21 @@ class LimitCycle(AbstractCycle):
             return compute_gait_sensitivity(response.select([index])).norm[0]
 
         return self._mask_missing(self._map_over_batch(norm_of)(self.slope_response))
+
+    @property
+    def force_peaks(self) -> dict[str, Array]:
+        """Return the `measures.FORCE_PEAK_MEASURES` by name, each the largest over the steps.
+
+        They have first derivatives, which are zero for numbers of peaks.
+        """
+        peaks_of_cycle = functools.partial(compute_force_peaks, self.system)
+        peaks = self._map_over_batch(peaks_of_cycle)(self.parameters, self.collocation_state)
+        return {name: self._mask_missing(value) for name, value in peaks.items()}
+
+    def measures(self, names: Iterable[str]) -> dict[str, Array]:
+        names = tuple(names)
+        peaks = {} if FORCE_PEAK_MEASURES.keys().isdisjoint(names) else self.force_peaks
+        return {name: peaks[name] if name in peaks else self.measure(name) for name in names}
 
     @property
     def margins(self) -> Margins:

@@ -27,6 +27,7 @@ from vrw_jax.cycles.finder import (
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import (
     DIFFERENTIABLE_STEP_NAMES,
+    FORCE_PEAK_MEASURES,
     GAIT_SENSITIVITY_MEASURES,
     SHARED_STEP_MEASURE_NAMES,
 )
@@ -224,7 +225,7 @@ class ReturnMapFinder(AbstractReturnMapFinder):
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
         n
         for n in CYCLE_MEASURE_FUNCTIONS
-        if n not in ("takeoff_acceleration", *GAIT_SENSITIVITY_MEASURES)
+        if n not in ("takeoff_acceleration", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         dict.fromkeys(

@@ -247,6 +247,27 @@ GAIT_SENSITIVITY_MEASURES = _make_table(
 )
 """Gait sensitivity norms of a limit cycle, for independent slopes of small standard deviation."""
 
+FORCE_PEAK_MEASURES = _make_table(
+    Measure("n_force_peaks", "1", "n_F", "number of force peaks",
+            "Smooth maxima of the fore foot's normal force inside the phases of a step."),
+    Measure("peak_force", "N", "F_max", "peak force",
+            "Largest of these maxima; 0 if there is none."),
+    Measure("force_trough_depth", "N", "ΔF", "depth of the force's trough",
+            "Lower of two force peaks less the smooth minimum between them, largest over the step; "
+            "0 if there is none."),
+    Measure("second_peak_rate", "N/s", "Ḟ_2", "rate of the force at a second rise",
+            "Largest maximum of the fore foot's force rate after its first peak. It is zero where "
+            "a second peak appears, and NaN if there is no maximum."),
+    Measure("n_total_force_peaks", "1", "n_F,tot", "number of peaks of the total force",
+            "As the number of force peaks, for the sum of both feet's normal forces."),
+    Measure("peak_total_force", "N", "F_tot,max", "peak of the total force",
+            "As the peak force, for the sum of both feet's normal forces."),
+    Measure("landing_impulse", "N s", "λ_I2", "impulse of the landing",
+            "Normal impulse of the ground on the fore foot in the landing.", "(18)"),
+)
+"""Peaks of the ground's normal force in a step of a gait: inside the phases, without impacts and
+changes of phase. For gaits of several steps, the largest over the steps."""
+
 TRAJECTORY_MEASURES = _make_table(
     Measure("time", "s", "t", "time", "Time since the landing that opens the first step."),
     Measure("step", "1", "step", "step", "Number of the step, from 0."),
@@ -316,6 +337,7 @@ MEASURES: dict[str, Measure] = (
     | STOPPER_MARGIN_MEASURES
     | LIMIT_CYCLE_MEASURES
     | GAIT_SENSITIVITY_MEASURES
+    | FORCE_PEAK_MEASURES
     | TRAJECTORY_MEASURES
     | CONTACT_MEASURES
     | PARAMETER_MEASURES

@@ -6,6 +6,7 @@ from vrw_jax.simulation.basins import (
     basin,
     invert_landing,
 )
+from vrw_jax.simulation.force_peaks import SAMPLED_PEAK_MEASURES, force_peaks
 from vrw_jax.simulation.stepping import (
     ModelLike,
     Walk,

@@ -1,0 +1,164 @@
+"""Force peaks of gaits are those of the five-coordinate reference, exact and differentiable."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.polynomial import Chebyshev
+from oracle import five_coordinates
+
+import vrw_jax as vrw
+from vrw_jax.measures import FORCE_PEAK_MEASURES
+
+TABLE_1 = vrw.WheelParams()
+TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
+WHEELS = {
+    "two peaks": TWO_PEAKS,
+    "softer": vrw.WheelParams(stiffness=2000.0, damping=50.0, natural_length=1.0, slope=0.05),
+    "softest": vrw.WheelParams(stiffness=1500.0, damping=75.0, natural_length=1.0, slope=0.06),
+    "Table 1": TABLE_1,
+}
+N_COEFFICIENTS = 80
+"""Chebyshev coefficients of the force in a phase: the last ones of these wheels are round-off."""
+
+
+def reference_step(params: vrw.WheelParams, x: np.ndarray) -> dict:
+    fields = {f.name: getattr(params, f.name) for f in dataclasses.fields(params)}
+    numbers = {name: float(value) for name, value in fields.items()} | {"n_legs": params.n_legs}
+    return five_coordinates.step(numbers, x)
+
+
+def force_polynomials(step: dict, multipliers: tuple[int, ...]) -> list[Chebyshev]:
+    """The sum of multipliers in each phase of a reference step, as a polynomial of time, N."""
+    wheel = five_coordinates.Wheel(five_coordinates.TABLE_1 | step["params"])
+    polynomials = []
+    for phase in step["phases"]:
+        force = lambda t, phase=phase: sum(
+            wheel.acceleration(*phase.sample(float(t)), phase.name)[1][i]
+            for i in multipliers
+            if i < 2 or phase.name == "DLS"
+        )
+        sample = np.vectorize(force)
+        domain = [0.0, phase.duration]
+        polynomials.append(Chebyshev.interpolate(sample, N_COEFFICIENTS, domain))
+    return polynomials
+
+
+def inner_zeros(polynomial: Chebyshev) -> np.ndarray:
+    roots = polynomial.roots()
+    real = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
+    begin, end = polynomial.domain
+    return real[(real > begin) & (real < end)]
+
+
+def reference_extrema(polynomials: list[Chebyshev]) -> tuple[np.ndarray, np.ndarray]:
+    """The force at its smooth extrema, N, and the sign of its second derivative."""
+    values, signs = [], []
+    for polynomial in polynomials:
+        times = inner_zeros(polynomial.deriv())
+        values += polynomial(times).tolist()
+        signs += np.sign(polynomial.deriv(2)(times)).tolist()
+    return np.array(values), np.array(signs)
+
+
+@pytest.fixture(scope="module", params=WHEELS, ids=str)
+def compared(request):
+    params = WHEELS[request.param]
+    cycle = vrw.limit_cycle(params)
+    step = reference_step(params, np.asarray(cycle.section_state))
+    step["params"] = {
+        name: float(getattr(params, name))
+        for name in ("stiffness", "damping", "natural_length", "slope")
+    }
+    np.testing.assert_allclose(step["section_state"], cycle.section_state, atol=1e-8)
+    peaks = {name: float(value) for name, value in cycle.measures(FORCE_PEAK_MEASURES).items()}
+    return request.param, peaks, step
+
+
+def test_peaks_and_trough_of_the_fore_foot_are_those_of_the_reference(compared):
+    _, peaks, step = compared
+    values, signs = reference_extrema(force_polynomials(step, (1,)))
+    maxima = values[signs < 0.0]
+    assert peaks["n_force_peaks"] == len(maxima)
+    assert abs(peaks["peak_force"] / maxima.max() - 1.0) < 1e-8
+    troughs = [
+        min(values[:i][signs[:i] < 0.0].max(), values[i:][signs[i:] < 0.0].max()) - values[i]
+        for i in np.flatnonzero(signs > 0.0)
+        if np.any(signs[:i] < 0.0) and np.any(signs[i:] < 0.0)
+    ]
+    assert abs(peaks["force_trough_depth"] - max(troughs, default=0.0)) < 1e-6
+
+
+def test_peaks_of_the_total_force_are_those_of_the_reference(compared):
+    _, peaks, step = compared
+    values, signs = reference_extrema(force_polynomials(step, (1, 3)))
+    assert peaks["n_total_force_peaks"] == np.sum(signs < 0.0)
+    assert abs(peaks["peak_total_force"] / values[signs < 0.0].max() - 1.0) < 1e-8
+
+
+def test_the_largest_later_rate_is_that_of_the_reference(compared):
+    _, peaks, step = compared
+    rates, first_peak, start = [], np.inf, 0.0
+    for polynomial in force_polynomials(step, (1,)):
+        times = inner_zeros(polynomial.deriv())
+        maxima = times[polynomial.deriv(2)(times) < 0.0] + start
+        first_peak = min([first_peak, *maxima])
+        times = inner_zeros(polynomial.deriv(2))
+        times = times[(polynomial.deriv(3)(times) < 0.0) & (times + start > first_peak)]
+        rates += polynomial.deriv()(times).tolist()
+        start += polynomial.domain[1]
+    if rates:
+        assert abs(peaks["second_peak_rate"] / max(rates) - 1.0) < 1e-7
+    else:
+        assert np.isnan(peaks["second_peak_rate"])
+
+
+def test_the_landing_impulse_is_that_of_the_reference(compared):
+    _, peaks, step = compared
+    assert abs(peaks["landing_impulse"] / step["lambda_impulse_applied"][1] - 1.0) < 1e-8
+
+
+def test_the_table_of_two_peaks_has_the_published_digits():
+    """Maximum, minimum, maximum of the fore foot's force: the independent code's table."""
+    expected = {"two peaks": (223.20, 25.34), "softer": (227.36, 55.32), "softest": (208.18, 21.02)}
+    for name, (peak, depth) in expected.items():
+        measures = vrw.limit_cycle(WHEELS[name]).measures(("peak_force", "force_trough_depth"))
+        assert abs(measures["peak_force"] - peak) < 0.01, name
+        assert abs(measures["force_trough_depth"] - depth) < 0.02, name
+
+
+def test_derivatives_are_central_differences():
+    names = tuple(name for name in FORCE_PEAK_MEASURES if not name.startswith("n_"))
+    cycle = vrw.limit_cycle(TWO_PEAKS)
+    table = vrw.sensitivities(
+        TWO_PEAKS, measures=(*names, "n_force_peaks"), guess=cycle, options=cycle.system.options
+    )
+    np.testing.assert_allclose(table.value[-1], 2.0)
+    np.testing.assert_array_equal(table.derivative[-1], 0.0)
+    for parameter, h in (("stiffness", 1.0), ("slope", 1e-4), ("leg_mass", 1e-3)):
+        value = float(getattr(TWO_PEAKS, parameter))
+
+        def measures(shift, parameter=parameter, value=value):
+            wheel = dataclasses.replace(TWO_PEAKS, **{parameter: jnp.asarray(value + shift)})
+            shifted = vrw.limit_cycle(wheel, guess=cycle, options=cycle.system.options)
+            return np.array(list(shifted.measures(names).values()), float)
+
+        outer, inner = ((measures(k * h) - measures(-k * h)) / (2.0 * k * h) for k in (2.0, 1.0))
+        expected = (4.0 * inner - outer) / 3.0
+        exact = table.derivative.sel(measure=list(names), parameter=parameter)
+        np.testing.assert_allclose(exact, expected, rtol=2e-6, err_msg=parameter)
+
+
+@pytest.mark.slow  # its program compiles for a minute on a busy machine
+def test_a_scan_of_peaks_has_those_of_each_gait(tmp_path):
+    names = ["n_force_peaks", "peak_force", "second_peak_rate"]
+    options = vrw.limit_cycle(TABLE_1).system.options
+    scan = vrw.scan(
+        vrw.grid(damping=[100.0, 200.0]), names, store=tmp_path / "scan", cycle_options=options
+    )
+    for damping, i in ((100.0, 0), (200.0, 1)):
+        cycle = vrw.limit_cycle(vrw.WheelParams(damping=damping), options=options)
+        for name, value in cycle.measures(names).items():
+            np.testing.assert_allclose(scan[name].values[i], value, rtol=1e-9, err_msg=name)
+    assert scan.peak_force.attrs["units"] == "N"
