@@ -1,4 +1,4 @@
-"""Share of a box of starts from which a wheel ends up on its gait."""
+"""Share of a box of starts from which a wheel reaches its gait."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, get_args
@@ -58,15 +58,21 @@ class BasinShare(AbstractPrintable):
     n_starts: int = eqx.field(static=True)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the shares with their errors."""
+        """Return label and text of each share, with its error."""
         n = len(self.walking_share)
-        walking, walking_error = self.walking_share[-1], self.walking_share_error[-1]
-        rows = [
+        walking_fraction, walking_fraction_error = (
+            self.walking_share[-1],
+            self.walking_share_error[-1],
+        )
+        text_rows = [
             ("ends up on the gait", f"{self.share:.4f} (standard error {self.share_error:.4f})"),
-            (f"walks after {n} steps", f"{walking:.4f} (standard error {walking_error:.4f})"),
+            (
+                f"walks after {n} steps",
+                f"{walking_fraction:.4f} (standard error {walking_fraction_error:.4f})",
+            ),
         ]
-        rows += [(name, f"{share:.4f}") for name, share in self.failure_shares.items()]
-        return [*rows, ("starts", f"{self.n_starts:,}")]
+        text_rows += [(name, f"{share:.4f}") for name, share in self.failure_shares.items()]
+        return [*text_rows, ("starts", f"{self.n_starts:,}")]
 
 
 @with_default_settings
@@ -142,7 +148,7 @@ def compute_basin_share(
     sampling: str = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return `basin_share` of a gait, for checked arguments."""
+    """Return the result of `basin_share` for a gait and checked arguments."""
     unit_points = _draw_unit_points(len(bounds.names), n_starts, sampling, seed)
     starts = bounds.lower + (bounds.upper - bounds.lower) * unit_points
     if bounds.names == POST_LANDING_NAMES:
@@ -156,7 +162,7 @@ def compute_basin_share(
         n_stepped[is_reachable] = walks.n_stepped
     n_stepped[is_on_gait] = max_steps
     walking_share = np.mean(n_stepped[:, None] >= np.arange(1, max_steps + 1), 0)
-    failures = {code.name: float(np.mean(outcome == code)) for code in Outcome if code}
+    share_by_failure = {code.name: float(np.mean(outcome == code)) for code in Outcome if code}
     share = float(is_on_gait.mean())
     return BasinShare(
         share=share,
@@ -164,35 +170,36 @@ def compute_basin_share(
         walking_share=walking_share,
         walking_share_error=compute_share_error(walking_share, n_starts),
         elsewhere_share=float(np.mean((outcome == Outcome.STEPPED) & ~is_on_gait)),
-        failure_shares={name: value for name, value in failures.items() if value > 0.0},
+        failure_shares={name: value for name, value in share_by_failure.items() if value > 0.0},
         n_starts=n_starts,
     )
 
 
 def compute_share_error(share: Any, n: int) -> Any:
-    """Return the standard error of a share, or of an array of shares, of n independent draws.
+    """Return the standard error of a share of n independent draws, or of an array of shares.
 
-    One draw on either side is added (Laplace's rule of succession), so that it is never zero.
+    One draw on either side is added (Laplace's rule of succession), so that the error is never
+    zero.
     """
-    smoothed = (share * n + 1.0) / (n + 2.0)
-    return (smoothed * (1.0 - smoothed) / n) ** 0.5
+    smoothed_share = (share * n + 1.0) / (n + 2.0)
+    return (smoothed_share * (1.0 - smoothed_share) / n) ** 0.5
 
 
-def _draw_unit_points(n_dims: int, n: int, sampling: str, seed: int) -> np.ndarray:
-    """Return points of the unit cube, (n, n_dims)."""
+def _draw_unit_points(n_dims: int, n_points: int, sampling: str, seed: int) -> np.ndarray:
+    """Return points of the unit cube, (n_points, n_dims)."""
     if sampling == "random":
-        return np.random.default_rng(seed).random((n, n_dims))
+        return np.random.default_rng(seed).random((n_points, n_dims))
     from scipy.stats import qmc  # This import is slow.
 
-    exponent = (n - 1).bit_length()
+    sobol_exponent = (n_points - 1).bit_length()
     generator = np.random.default_rng(seed)
-    return qmc.Sobol(n_dims, rng=generator).random_base2(exponent)[:n]
+    return qmc.Sobol(n_dims, rng=generator).random_base2(sobol_exponent)[:n_points]
 
 
 def parse_box(box: StartBox) -> BoxBounds:
     """Return names and bounds of the components of the starts.
 
-    Raises a TypeError or a ValueError unless the box bounds all components of one kind.
+    Raises `TypeError` or `ValueError` unless the box bounds all components of one kind.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
     for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):

@@ -19,7 +19,7 @@ from vrw_jax.simulation import ModelLike, check_model, check_options
 from vrw_jax.validation import check_int, check_type
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
-VARIABLE_ATTRS = {
+BASIN_VARIABLE_ATTRS = {
     "basin_share": ("1", "share of the box of starts that ends up on the gait"),
     "basin_share_error": ("1", "standard error of that share"),
     "smallest_disturbance": ("rad/s", "smallest change of dtheta that leaves the basin"),
@@ -78,55 +78,73 @@ def measure_basins(
             f"the branch is one of {attrs.get('model', 'a map')}, but model is {checked_model!r}: "
             "give the model of the branch."
         )
-    n_all = len(branch.values)
-    if n_all == 0:
+    n_branch_points = len(branch.values)
+    if n_branch_points == 0:
         raise ValueError(
             f"the branch has no gait: {branch.ending} Take a wheel for which vrw.limit_cycle finds "
             "a gait."
         )
-    points = np.unique(np.linspace(0, n_all - 1, min(n_points, n_all)).round().astype(int))
-    columns: dict[str, np.ndarray] = {}
+    point_indices = np.unique(
+        np.linspace(0, n_branch_points - 1, min(n_points, n_branch_points)).round().astype(int)
+    )
+    values_by_variable: dict[str, np.ndarray] = {}
 
-    def record(name: str, point: int, value: float) -> None:
-        columns.setdefault(name, np.full(len(points), np.nan))[point] = value
+    def record_value(variable_name: str, point_position: int, value: float) -> None:
+        values_by_variable.setdefault(variable_name, np.full(len(point_indices), np.nan))[
+            point_position
+        ] = value
 
-    for i, point in enumerate(points):
+    for i, point in enumerate(point_indices):
         if not branch.stable[point]:
             continue
         gait = _gait_at_point(branch, int(point), checked_model, checked_options)
         if bounds is not None:
-            share = compute_basin_share(gait, bounds, n_starts, max_steps)
-            record("basin_share", i, share.share)
-            record("basin_share_error", i, share.share_error)
+            basin_share_result = compute_basin_share(gait, bounds, n_starts, max_steps)
+            record_value("basin_share", i, basin_share_result.share)
+            record_value("basin_share_error", i, basin_share_result.share_error)
         if checked_model.can_begin_within_step:
-            smallest = compute_smallest_disturbance(gait, None, max_steps)
-            record("smallest_disturbance", i, smallest.size)
-            record("smallest_disturbance_error", i, smallest.size_error)
-    describe = lambda name: dict(zip(("units", "long_name"), VARIABLE_ATTRS[name], strict=True))
-    data = {name: xr.Variable("point", x, describe(name)) for name, x in columns.items()}
-    name = branch.parameter
-    labels = {name: xr.Variable("point", branch.values[points], measure_attrs(name))}
-    title = {"title": f"Basins of the gaits along {name}"}
-    return xr.Dataset(data, labels, attrs | title)
+            disturbance_result = compute_smallest_disturbance(gait, None, max_steps)
+            record_value("smallest_disturbance", i, disturbance_result.size)
+            record_value("smallest_disturbance_error", i, disturbance_result.size_error)
+    make_attrs = lambda parameter_name: dict(
+        zip(("units", "long_name"), BASIN_VARIABLE_ATTRS[parameter_name], strict=True)
+    )
+    variables = {
+        parameter_name: xr.Variable("point", x, make_attrs(parameter_name))
+        for parameter_name, x in values_by_variable.items()
+    }
+    parameter_name = branch.parameter
+    coordinates = {
+        parameter_name: xr.Variable(
+            "point", branch.values[point_indices], measure_attrs(parameter_name)
+        )
+    }
+    title = {"title": f"Basins of the gaits along {parameter_name}"}
+    return xr.Dataset(variables, coordinates, attrs | title)
 
 
 def _gait_at_point(
     branch: Branch, point: int, model: AbstractWheel, options: StepOptions
 ) -> StableGait:
-    """Return the gait at a point of a branch; raise a ValueError unless it is one of one step."""
+    """Return the gait at a point of a branch.
+
+    Raises `ValueError` unless the gait repeats after one step.
+    """
     attrs, dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
-    values = {
+    parameter_values = {
         name: jnp.asarray(attrs[f"parameter_{name}"], dtype)
         for name in PARAMETER_NAMES
         if f"parameter_{name}" in attrs
     }
-    params = WheelParams(**values, n_legs=attrs["parameter_n_legs"])
-    value = jnp.asarray(branch.values[point], dtype)
-    point_model, params = model.with_parameter(params, branch.parameter, value)
-    state = np.asarray(branch.dataset.section_state.values[point])[None]
-    gait = StableGait(params, point_model, options, state)
-    end = step_batch(params, state, model=point_model, options=options).section_state
-    if not gait.contains(end)[0]:
+    params = WheelParams(**parameter_values, n_legs=attrs["parameter_n_legs"])
+    branch_value = jnp.asarray(branch.values[point], dtype)
+    point_model, params = model.with_parameter(params, branch.parameter, branch_value)
+    section_state = np.asarray(branch.dataset.section_state.values[point])[None]
+    gait = StableGait(params, point_model, options, section_state)
+    next_section_state = step_batch(
+        params, section_state, model=point_model, options=options
+    ).section_state
+    if not gait.contains(next_section_state)[0]:
         raise ValueError(
             "a gait of the branch does not repeat after one step, but basins along branches are "
             "those of gaits of one step: continue a branch with period_n=1."

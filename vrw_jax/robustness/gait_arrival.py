@@ -1,4 +1,4 @@
-"""Walks from many starts of one wheel, until each is on a stable gait or has failed."""
+"""Walks from many starts of one wheel, until each walk is on a stable gait or has failed."""
 
 import functools
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 @dataclass(frozen=True)
 class ArrivalOptions:
-    """Test by which a walk has arrived at a gait."""
+    """Options of the test that a walk has arrived at a gait."""
 
     max_distance: float = 1e-6
     """Largest difference of a section state from one of the gait, in the wheel's own units.
@@ -35,7 +35,7 @@ ARRIVAL_OPTIONS = ArrivalOptions()
 
 
 class StableGait(NamedTuple):
-    """Stable gait of one wheel, with all that its steps depend on."""
+    """Stable gait of one wheel, with the wheel, model and options of its steps."""
 
     params: WheelParams
     model: AbstractWheel
@@ -88,7 +88,7 @@ class StableGait(NamedTuple):
         return gait
 
     def contains(self, states: np.ndarray, arrival: ArrivalOptions = ARRIVAL_OPTIONS) -> np.ndarray:
-        """Return whether each section state is one of the gait."""
+        """Return whether each section state is one of the gait's section states."""
         units = self.model.section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
@@ -111,7 +111,7 @@ def walk_to_gait(
     max_steps: int,
     arrival: ArrivalOptions = ARRIVAL_OPTIONS,
 ) -> WalkVerdicts:
-    """Return how a walk of at most `max_steps` steps from each section state ends."""
+    """Return the end of a walk of at most `max_steps` steps from each section state."""
     n_starts = len(starts)
     is_on_gait, outcome = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
     n_stepped = np.zeros(n_starts, int)

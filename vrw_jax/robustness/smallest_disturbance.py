@@ -20,39 +20,39 @@ from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_int, check_positive
 from vrw_jax.wheel import Outcome, WheelParams
 
-DIRECTIONS = np.array([-1.0, 1.0])
+DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
 """Signs of the change of the angular velocity: backward, forward."""
-PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
-RATE_INDEX = 3
+DISTURBED_PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
+ANGULAR_RATE_INDEX = 3
 """Index of the angular velocity in a state (theta, L1, L2 and their rates)."""
 
 
 @dataclass(frozen=True)
 class DisturbanceSearchOptions:
-    """Search for the smallest disturbance, over the instants of a step and the sizes."""
+    """Options of the search for the smallest disturbance, over instants of a step and sizes."""
 
     sample_strides: tuple[int, ...] = (512, 64, 8, 1)
     """Distances of the instants of each pass, in samples of a phase, coarse to fine.
 
-    They are chosen because each pass then covers two intervals of the pass before it, and the last
-    one resolves a ten-thousandth of a phase."""
+    The values are chosen because each pass then covers two intervals of the previous pass, and the
+    last pass resolves a ten-thousandth of a phase."""
     n_intervals: int = 16
     """Number of intervals between the instants of a pass."""
     n_first_sizes: int = 24
-    """Number of sizes tried first; a set of sizes that leaves the basin and is narrower than their
-    distance may be missed."""
+    """Number of sizes in the first grid. A set of sizes that leaves the basin may be missed if it
+    is narrower than the distance of these sizes."""
     n_bisection_sizes: int = 8
     """Number of sizes that divide a bracket, chosen because one batch then gains a digit."""
     size_tolerance: float = 1e-8
-    """Width of a bracket in the last pass, relative to the size; chosen because it is the error of
-    steps."""
+    """Width of a bracket in the last pass, relative to the size, chosen because this is the error
+    of steps."""
     profile_tolerance: float = 1e-5
     """Relative width of a bracket in earlier passes, chosen because sizes at neighboring instants
     differ by more."""
 
     @property
     def n_samples(self) -> int:
-        """Number of samples of a phase, both ends included."""
+        """Return the number of samples of a phase, both ends included."""
         return self.n_intervals * self.sample_strides[0] + 1
 
 
@@ -103,13 +103,16 @@ class SmallestDisturbance(AbstractPrintable):
         return Outcome(int(self.outcome)).meaning
 
     def summary_rows(self) -> list[TextRow]:
-        """Return size, direction and instant, and how the walk ends."""
+        """Return labels and texts of size, direction, instant and outcome."""
         if not np.isfinite(self.size):
             return [("largest tried size", f"{self.max_size:.6g} rad/s"), ("ending", self.ending)]
-        kind = "faster" if self.direction > 0 else "slower"
+        direction_text = "faster" if self.direction > 0 else "slower"
         return [
-            ("size", f"{self.size:.6g} rad/s {kind} (error {self.size_error:.1g})"),
-            ("instant", f"{self.time:.6g} s after the landing, {PHASE_NAMES[self.phase_index]}"),
+            ("size", f"{self.size:.6g} rad/s {direction_text} (error {self.size_error:.1g})"),
+            (
+                "instant",
+                f"{self.time:.6g} s after the landing, {DISTURBED_PHASE_NAMES[self.phase_index]}",
+            ),
             ("ending", self.ending),
         ]
 
@@ -180,17 +183,17 @@ def compute_smallest_disturbance(
     gait: StableGait,
     max_size: float | None,
     max_steps: int,
-    search: DisturbanceSearchOptions = SEARCH_OPTIONS,
+    search_options: DisturbanceSearchOptions = SEARCH_OPTIONS,
 ) -> SmallestDisturbance:
-    """Return `smallest_disturbance` of a gait of one step, for checked arguments."""
-    step = _sample_step(gait, search.n_samples)
+    """Return the result of `smallest_disturbance` for a gait of one step and checked arguments."""
+    gait_step = _sample_step(gait, search_options.n_samples)
     if max_size is None:
-        max_size = 2.0 * float(step.states[..., RATE_INDEX].max())
-    return _search_instants(gait, step, max_size, max_steps, search)
+        max_size = 2.0 * float(gait_step.states[..., ANGULAR_RATE_INDEX].max())
+    return _search_instants(gait, gait_step, max_size, max_steps, search_options)
 
 
 class _GaitStep(NamedTuple):
-    """Samples of the step of a gait."""
+    """Samples of the step of a gait, over phases and samples."""
 
     times: np.ndarray  # after the landing, (phase, sample), s
     states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
@@ -203,20 +206,22 @@ def _sample_step(gait: StableGait, n_samples: int) -> _GaitStep:
     x = jnp.asarray(gait.section_states[0])
     trajectory = gait.model.sample_step(gait.params, x, gait.options, n_samples)
     distance = jnp.asarray(gait.model.take_step(gait.params, x, gait.options).step_length)
-    happened = tuple(int(i) for i in np.flatnonzero(np.asarray(trajectory.durations) > 0.0))
-    return _GaitStep(np.asarray(trajectory.time), np.asarray(trajectory.state), happened, distance)
+    occurred_phases = tuple(int(i) for i in np.flatnonzero(np.asarray(trajectory.durations) > 0.0))
+    return _GaitStep(
+        np.asarray(trajectory.time), np.asarray(trajectory.state), occurred_phases, distance
+    )
 
 
-class _Rays(NamedTuple):
-    """Disturbances of one direction at one instant each, with a leading axis over rays."""
+class _DirectedInstants(NamedTuple):
+    """Instants of a step with a direction of the disturbance, on the leading axis."""
 
     phase_index: np.ndarray
     sample_index: np.ndarray
     direction: np.ndarray
 
 
-class _Exits(NamedTuple):
-    """Bracket of the first size that leaves the basin, for each ray."""
+class _ExitBrackets(NamedTuple):
+    """Bracket of the smallest size that leaves the basin, for each instant and direction."""
 
     lower: np.ndarray  # rad/s
     upper: np.ndarray  # rad/s, infinite if no tried size leaves the basin
@@ -224,125 +229,167 @@ class _Exits(NamedTuple):
 
     @property
     def size(self) -> np.ndarray:
-        """Middle of the bracket, rad/s."""
+        """Return the middle of the bracket, rad/s."""
         return 0.5 * (self.lower + self.upper)
 
 
 def _search_instants(
     gait: StableGait,
-    step: _GaitStep,
+    gait_step: _GaitStep,
     max_size: float,
     max_steps: int,
-    search: DisturbanceSearchOptions,
+    search_options: DisturbanceSearchOptions,
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance over all instants, by passes with finer instants."""
-    curves = [(phase, direction) for phase in step.phase_indices for direction in DIRECTIONS]
-    middle = dict.fromkeys(curves, search.n_samples // 2)
-    half_intervals = search.n_intervals // 2
-    profile = best = None
-    for stride in search.sample_strides:
-        offsets = stride * np.arange(-half_intervals, half_intervals + 1)
-        windows = [np.clip(middle[c] + offsets, 0, search.n_samples - 1) for c in curves]
-        n_instants = len(offsets)
-        rays = _Rays(
-            np.repeat([phase for phase, _ in curves], n_instants),
-            np.concatenate(windows),
-            np.repeat([direction for _, direction in curves], n_instants),
+    """Return the smallest disturbance over all instants, by passes with ever finer instants."""
+    phase_directions = [
+        (phase, direction) for phase in gait_step.phase_indices for direction in DISTURBANCE_SIGNS
+    ]
+    middle_samples = dict.fromkeys(phase_directions, search_options.n_samples // 2)
+    half_intervals = search_options.n_intervals // 2
+    first_pass = best_index = None
+    for stride in search_options.sample_strides:
+        sample_offsets = stride * np.arange(-half_intervals, half_intervals + 1)
+        sample_windows = [
+            np.clip(middle_samples[c] + sample_offsets, 0, search_options.n_samples - 1)
+            for c in phase_directions
+        ]
+        n_instants = len(sample_offsets)
+        directed_instants = _DirectedInstants(
+            np.repeat([phase for phase, _ in phase_directions], n_instants),
+            np.concatenate(sample_windows),
+            np.repeat([direction for _, direction in phase_directions], n_instants),
         )
-        is_last = stride == search.sample_strides[-1]
-        tolerance = search.size_tolerance if is_last else search.profile_tolerance
-        exits = _bracket_exits(gait, step, rays, max_size, max_steps, tolerance, search)
-        sizes = exits.size.reshape(len(curves), n_instants)
-        lowest = sizes.argmin(1)
-        middle = {c: windows[i][lowest[i]] for i, c in enumerate(curves)}
-        profile = profile or (rays, exits)
-        best = int(exits.size.argmin())
-    assert profile is not None
-    assert best is not None
-    size, phase = float(exits.size[best]), int(rays.phase_index[best])
+        is_last = stride == search_options.sample_strides[-1]
+        tolerance = search_options.size_tolerance if is_last else search_options.profile_tolerance
+        exit_brackets = _bracket_exits(
+            gait, gait_step, directed_instants, max_size, max_steps, tolerance, search_options
+        )
+        sizes = exit_brackets.size.reshape(len(phase_directions), n_instants)
+        lowest_indices = sizes.argmin(1)
+        middle_samples = {
+            c: sample_windows[i][lowest_indices[i]] for i, c in enumerate(phase_directions)
+        }
+        first_pass = first_pass or (directed_instants, exit_brackets)
+        best_index = int(exit_brackets.size.argmin())
+    assert first_pass is not None
+    assert best_index is not None
+    size, phase = (
+        float(exit_brackets.size[best_index]),
+        int(directed_instants.phase_index[best_index]),
+    )
     size_error = 0.0
     if np.isfinite(size):
-        size_error = float(exits.upper[best] - exits.lower[best])
-        if rays.sample_index[best] not in (0, search.n_samples - 1):
+        size_error = float(exit_brackets.upper[best_index] - exit_brackets.lower[best_index])
+        if directed_instants.sample_index[best_index] not in (0, search_options.n_samples - 1):
             # Neighbors of the last pass bound the change between two instants.
-            curve_index, k = divmod(best, n_instants)
+            curve_index, k = divmod(best_index, n_instants)
             neighbors = sizes[curve_index, max(k - 1, 0) : k + 2]
             size_error += float(np.max(neighbors[np.isfinite(neighbors)]) - size)
-    is_backward = profile[0].direction < 0.0
+    is_backward = first_pass[0].direction < 0.0
     profile_phase, profile_sample = (
-        index[is_backward] for index in (profile[0].phase_index, profile[0].sample_index)
+        index[is_backward] for index in (first_pass[0].phase_index, first_pass[0].sample_index)
     )
     return SmallestDisturbance(
         size=size,
         size_error=size_error,
-        direction=int(rays.direction[best]),
-        time=float(step.times[phase, rays.sample_index[best]]),
+        direction=int(directed_instants.direction[best_index]),
+        time=float(gait_step.times[phase, directed_instants.sample_index[best_index]]),
         phase_index=phase,
-        outcome=np.asarray(exits.outcome[best]),
-        times=step.times[profile_phase, profile_sample],
+        outcome=np.asarray(exit_brackets.outcome[best_index]),
+        times=gait_step.times[profile_phase, profile_sample],
         phase_indices=profile_phase,
-        backward_sizes=profile[1].size[is_backward],
-        forward_sizes=profile[1].size[~is_backward],
+        backward_sizes=first_pass[1].size[is_backward],
+        forward_sizes=first_pass[1].size[~is_backward],
         max_size=max_size,
     )
 
 
 def _bracket_exits(
     gait: StableGait,
-    step: _GaitStep,
-    rays: _Rays,
+    gait_step: _GaitStep,
+    directed_instants: _DirectedInstants,
     max_size: float,
     max_steps: int,
     size_tolerance: float,
-    search: DisturbanceSearchOptions,
-) -> _Exits:
-    """Return the bracket of the first size of each ray that leaves the basin."""
-    n_rays = len(rays.direction)
+    search_options: DisturbanceSearchOptions,
+) -> _ExitBrackets:
+    """Return the bracket of the smallest size that leaves the basin, for each instant and
+    direction.
+    """
+    n_rays = len(directed_instants.direction)
     lower, upper = np.zeros(n_rays), np.full(n_rays, np.inf)
     outcome = np.full(n_rays, int(Outcome.STEPPED))
-    fractions = np.arange(1, search.n_first_sizes + 1) / search.n_first_sizes
-    selected, sizes = np.arange(n_rays), np.tile(max_size * fractions, (n_rays, 1))
-    while len(selected):
-        selected_rays = _Rays(*(values[selected] for values in rays))
-        leaves, outcomes = _disturb(gait, step, selected_rays, sizes, max_steps)
-        has_exit, first = leaves.any(1), leaves.argmax(1)
-        row = np.arange(len(selected))
-        last_inside = np.where(has_exit, first, sizes.shape[1]) - 1
-        inside = np.where(last_inside >= 0, sizes[row, last_inside], lower[selected])
-        upper[selected] = np.where(has_exit, sizes[row, first], upper[selected])
-        outcome[selected] = np.where(has_exit, outcomes[row, first], outcome[selected])
-        lower[selected] = np.where(np.isfinite(upper[selected]), inside, max_size)
-        width = np.where(np.isfinite(upper), upper - lower, 0.0)
-        selected = np.flatnonzero(width > size_tolerance * upper)
-        parts = np.arange(1, search.n_bisection_sizes + 1) / (search.n_bisection_sizes + 1.0)
-        sizes = lower[selected, None] + width[selected, None] * parts
-    return _Exits(np.where(np.isfinite(upper), lower, np.inf), upper, outcome)
+    size_fractions = np.arange(1, search_options.n_first_sizes + 1) / search_options.n_first_sizes
+    selected_indices, tried_sizes = (
+        np.arange(n_rays),
+        np.tile(max_size * size_fractions, (n_rays, 1)),
+    )
+    while len(selected_indices):
+        selected_instants = _DirectedInstants(
+            *(values[selected_indices] for values in directed_instants)
+        )
+        leaves_basin, outcomes = _walk_after_disturbance(
+            gait, gait_step, selected_instants, tried_sizes, max_steps
+        )
+        has_exit, first_exit = leaves_basin.any(1), leaves_basin.argmax(1)
+        row_indices = np.arange(len(selected_indices))
+        last_inside = np.where(has_exit, first_exit, tried_sizes.shape[1]) - 1
+        largest_inside_size = np.where(
+            last_inside >= 0, tried_sizes[row_indices, last_inside], lower[selected_indices]
+        )
+        upper[selected_indices] = np.where(
+            has_exit, tried_sizes[row_indices, first_exit], upper[selected_indices]
+        )
+        outcome[selected_indices] = np.where(
+            has_exit, outcomes[row_indices, first_exit], outcome[selected_indices]
+        )
+        lower[selected_indices] = np.where(
+            np.isfinite(upper[selected_indices]), largest_inside_size, max_size
+        )
+        bracket_width = np.where(np.isfinite(upper), upper - lower, 0.0)
+        selected_indices = np.flatnonzero(bracket_width > size_tolerance * upper)
+        bracket_fractions = np.arange(1, search_options.n_bisection_sizes + 1) / (
+            search_options.n_bisection_sizes + 1.0
+        )
+        tried_sizes = (
+            lower[selected_indices, None]
+            + bracket_width[selected_indices, None] * bracket_fractions
+        )
+    return _ExitBrackets(np.where(np.isfinite(upper), lower, np.inf), upper, outcome)
 
 
-def _disturb(
-    gait: StableGait, step: _GaitStep, rays: _Rays, sizes: np.ndarray, max_steps: int
+def _walk_after_disturbance(
+    gait: StableGait,
+    gait_step: _GaitStep,
+    directed_instants: _DirectedInstants,
+    sizes: np.ndarray,
+    max_steps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each size of each ray leaves the basin, and the outcome, (rays, sizes)."""
+    """Return whether each disturbed walk leaves the basin, and its outcome, (instants, sizes)."""
     n_sizes = sizes.shape[1]
-    states = np.repeat(step.states[rays.phase_index, rays.sample_index], n_sizes, 0)
-    states[:, RATE_INDEX] += (rays.direction[:, None] * sizes).ravel()
-    phases = np.repeat(rays.phase_index, n_sizes)
+    states = np.repeat(
+        gait_step.states[directed_instants.phase_index, directed_instants.sample_index], n_sizes, 0
+    )
+    states[:, ANGULAR_RATE_INDEX] += (directed_instants.direction[:, None] * sizes).ravel()
+    phases = np.repeat(directed_instants.phase_index, n_sizes)
     outcome = np.empty(len(phases), int)
-    section = np.empty((len(phases), gait.section_states.shape[1]))
+    section_states = np.empty((len(phases), gait.section_states.shape[1]))
     for phase in np.unique(phases):
         is_in_phase = phases == phase
-        finish = functools.partial(
-            _finish_steps, gait.model, gait.options, gait.params, int(phase), step.distance
+        finish_block = functools.partial(
+            _finish_steps, gait.model, gait.options, gait.params, int(phase), gait_step.distance
         )
-        ends: Any = map_in_batches(finish, batch_sizes.DISTURBANCE_BATCH_SIZES, states[is_in_phase])
-        section[is_in_phase] = ends.section_state
-        outcome[is_in_phase] = ends.outcome
-    leaves = np.ones(len(phases), bool)
+        step_ends: Any = map_in_batches(
+            finish_block, batch_sizes.DISTURBANCE_BATCH_SIZES, states[is_in_phase]
+        )
+        section_states[is_in_phase] = step_ends.section_state
+        outcome[is_in_phase] = step_ends.outcome
+    leaves_basin = np.ones(len(phases), bool)
     has_stepped = np.flatnonzero(outcome == Outcome.STEPPED)
     if len(has_stepped):
-        walks = walk_to_gait(gait, section[has_stepped], max_steps)
-        outcome[has_stepped], leaves[has_stepped] = walks.outcome, ~walks.is_on_gait
-    return leaves.reshape(sizes.shape), outcome.reshape(sizes.shape)
+        walks = walk_to_gait(gait, section_states[has_stepped], max_steps)
+        outcome[has_stepped], leaves_basin[has_stepped] = walks.outcome, ~walks.is_on_gait
+    return leaves_basin.reshape(sizes.shape), outcome.reshape(sizes.shape)
 
 
 @eqx.filter_jit
@@ -354,6 +401,6 @@ def _finish_steps(
     distance: Array,
     states: Array,
 ) -> AdvanceResult:
-    """Return the rest of the step from each state within a phase."""
-    finish = lambda state: model.finish_step(params, phase_index, distance, state, options)
-    return jax.vmap(finish)(states)
+    """Return the results of the rest of the step from each state within a phase."""
+    finish_from = lambda state: model.finish_step(params, phase_index, distance, state, options)
+    return jax.vmap(finish_from)(states)
