@@ -21,6 +21,7 @@ from vrw_jax.measures.table import (
     MARGIN_MEASURES,
     PARAMETER_MEASURES,
     STEP_MEASURES,
+    STOPPER_MARGIN_MEASURES,
     TRAJECTORY_MEASURES,
     UNILATERAL_STEP_MEASURES,
     Measure,
@@ -165,6 +166,8 @@ _GROUPS = (
         "`step.margins` and scans report margins."),
     ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Steps with unilateral "
         "contact report these measures in addition to those of a step."),
+    ("Margins of stoppers with unilateral contact", STOPPER_MARGIN_MEASURES,
+        "Steps with stoppers that hold legs in the air report these margins."),
     ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES,
         "Limit cycles report these measures."),
     ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model report "
