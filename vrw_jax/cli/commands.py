@@ -139,9 +139,9 @@ def gait(
 ) -> None:
     """Walk a wheel and print its gait: durations, speed, indicators, force peaks and margins.
 
-    Walks step by step from a start near the gait of Table 1, or from the start in the config. Then
+    The walk begins near the gait of Table 1, or at the start in the config. The command then
     finds the limit cycle near the last step. With unilateral contact and no start in the config,
-    finds the slowest attracting gait instead. Writes no file.
+    it finds the slowest attracting gait instead. It writes no file.
 
     [bold]Examples[/bold]
 
@@ -211,7 +211,7 @@ def explore(
 def init(
     folder: Annotated[Path, typer.Argument(help="Where to write them.")] = Path("configs"),
 ) -> None:
-    """Write the example configs as a start for your own.
+    """Write the example configs, from which you can derive your own.
 
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
@@ -270,7 +270,7 @@ def reproduce(
 ) -> None:
     """Reproduce the paper: figures 6 to 10, and every published fact with the computed value.
 
-    Prints the table of facts and writes it with the figures, including tolerances and their
+    The command prints the table of facts, and writes it with the figures, tolerances and their
     reasons. The exit code is 1 if a fact does not hold.
     """
     from vrw_jax.runtime import start_jax
@@ -329,9 +329,10 @@ def scan(
 ) -> None:
     """Find the steady gait of every sample of a design, with its outcome and margins.
 
-    Writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption the same
-    command continues where it stopped, and ends with bitwise the same data. Of a finished scan only
-    chunks with damaged files are computed again. The exit code is 1 if --verify finds damage.
+    The command writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption
+    the same command continues where it stopped, and ends with bitwise the same data. Of a finished
+    scan only chunks with damaged files are computed again. The exit code is 1 if --verify finds
+    damage.
 
     [bold]Examples[/bold]
 
@@ -404,10 +405,10 @@ def tune(
 ) -> None:
     """Tune a wheel: find the best gait within bounds that satisfies its constraints.
 
-    Optimizes along the branch of gaits with exact gradients, then walks the tuned wheel. Writes
-    path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel) and figures (PNG and
-    SVG) into the folder. The exit code is 1 if the run does not end at an optimum. It is 2, and
-    nothing is written, if the start has no gait.
+    The optimization follows the branch of gaits with exact gradients; then the tuned wheel walks.
+    The command writes path.zarr (every gait evaluated), summary.md, wheel.toml (the tuned wheel)
+    and figures (PNG and SVG) into the folder. The exit code is 1 if the run does not end at an
+    optimum. It is 2, and nothing is written, if the start has no gait.
 
     [bold]Examples[/bold]
 
@@ -452,9 +453,9 @@ def continue_(
 ) -> None:
     """Continue a branch of stable and unstable gaits along a parameter, with its special points.
 
-    Writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and figures (PNG and
-    SVG) into the folder. The exit code is 1, and nothing is written, if there is no gait to start
-    from.
+    The command writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and
+    figures (PNG and SVG) into the folder. The exit code is 1, and nothing is written, if there is
+    no gait to start from.
 
     [bold]Examples[/bold]
 

@@ -45,8 +45,8 @@ EXPLORATION_OPTIONS = ExplorationOptions()
 """Options of the exploration by `vrw.tune`."""
 
 EvaluateBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
-"""Function that returns the gaits at the rows of u, one per start, searched for from neighboring
-gaits.
+"""Function that returns the gaits at rows of normalized parameters, one per start, searched for
+from neighboring gaits.
 """
 
 
@@ -164,7 +164,9 @@ def _is_finite(evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarra
 def _objective_gradient(
     evaluation: GaitEvaluation, free_indices: list[int], widths: np.ndarray
 ) -> np.ndarray:
-    """Return the gradient of the objective with respect to u, shape (starts, free)."""
+    """Return the gradient of the objective with respect to the normalized parameters, (starts,
+    free).
+    """
     return np.asarray(evaluation.jacobian)[:, free_indices, 0] * widths
 
 
@@ -174,7 +176,7 @@ def _slack_and_jacobian(
     widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slacks (starts, constraints), and their derivatives with respect to u (starts,
+    """Return slacks (starts, constraints), and their derivatives by normalized parameters (starts,
     constraints, free).
     """
     jacobian = np.swapaxes(np.asarray(evaluation.jacobian)[:, free_indices, 1:], 1, 2) * widths

@@ -50,7 +50,7 @@ class EvaluatedTrial(NamedTuple):
     outcome: Outcome
     is_on_branch: bool
     objective: float
-    gradient: np.ndarray  # gradient of the objective with respect to u
+    gradient: np.ndarray  # gradient of the objective by normalized parameters
     slack: np.ndarray  # constraint values minus their margins, in their own units
     slack_jacobian: np.ndarray  # (n_constraints, n_free)
     evaluation: GaitEvaluation | None
@@ -140,7 +140,7 @@ MAXIMIZATION_OPTIONS = MaximizationOptions()
 """Options of the maximization by `vrw.tune`."""
 
 EvaluateTrial = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
-"""Function that returns the trial at u, searched for from a neighbor's gait."""
+"""Function that returns the trial at normalized parameters, searched for from a neighbor's gait."""
 
 
 class _TrialRecord:
@@ -154,8 +154,8 @@ class _TrialRecord:
         self._indices = {start.normalized_parameters.tobytes(): 0}
 
     def evaluate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at u, from the record if it was evaluated; raise an exception if it
-        is unusable.
+        """Return the trial at these normalized parameters, from the record if it exists there;
+        raise an exception if the trial is unusable.
         """
         trial_index = self._indices.get(normalized_parameters.tobytes())
         if trial_index is None:
@@ -176,7 +176,7 @@ class _TrialRecord:
         return trial
 
     def evaluate_iterate(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at u, and record it as an iterate."""
+        """Return the trial at these normalized parameters, and record it as an iterate."""
         trial = self.evaluate_once(normalized_parameters)
         trial_index = self._indices[normalized_parameters.tobytes()]
         if trial_index:
@@ -184,7 +184,7 @@ class _TrialRecord:
         return trial
 
     def _nearest_gait(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
-        """Return the usable trial nearest to u."""
+        """Return the usable trial nearest to these normalized parameters."""
         gaits = [trial for trial in self.trials if trial.is_usable]
         return min(
             gaits,

@@ -234,25 +234,27 @@ class TuneProblem:
         return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
 
     def denormalize(self, normalized_parameters: np.ndarray) -> np.ndarray:
-        """Return all float parameters if the free ones are `u` widths above their lower bounds."""
+        """Return all float parameters from the free ones in widths above their lower bounds."""
         values = np.array(self.finder.model.parameter_values(self.params))
         values[self.free_indices] = self.lower + normalized_parameters * self.widths
         return values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
-        """Return the wheel at u."""
+        """Return the wheel with these normalized free parameters."""
         return self.finder.model.from_values(
             jnp.asarray(self.denormalize(normalized_parameters)), self.params.n_legs
         )[1]
 
     @property
     def normalized_start(self) -> np.ndarray:
-        """Return the value of u at the start."""
+        """Return the normalized free parameters of the start, shape (free,)."""
         values = np.array([float(getattr(self.params, name)) for name in self.free])
         return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
 
     def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at `u`; raise a ValueError unless it is usable as a start."""
+        """Return the trial at the normalized parameters `u`; raise a ValueError if it is
+        unusable.
+        """
         trial = self.evaluate_trial(u, None)
         if not trial.is_found:
             raise ValueError(
@@ -272,7 +274,9 @@ class TuneProblem:
     def evaluate_trial(
         self, normalized_parameters: np.ndarray, neighbor: EvaluatedTrial | None
     ) -> EvaluatedTrial:
-        """Return the trial at `u`, searched for from a neighbor's gait if one is given."""
+        """Return the trial at these normalized parameters, searched for from `neighbor` if it
+        is given.
+        """
         parameters = jnp.asarray(self.denormalize(normalized_parameters))
         neighbor_evaluation = None if neighbor is None else neighbor.evaluation
         guess = (
@@ -340,7 +344,9 @@ class TuneProblem:
     def _evaluate_batch(
         self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
     ) -> GaitEvaluation:
-        """Return the gaits at the rows of u, searched for from neighbors if they are given."""
+        """Return the gaits at rows of normalized parameters, searched for from `neighbors` if
+        given.
+        """
         parameters = jnp.asarray(
             [self.denormalize(parameter_row) for parameter_row in normalized_parameters]
         )
@@ -350,7 +356,7 @@ class TuneProblem:
         return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
 
     def _parameter_change(self, difference: np.ndarray) -> np.ndarray:
-        """Return the changes of all parameters, one row per change of u."""
+        """Return the changes of all parameters, one row per change of the normalized parameters."""
         parameter_change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
         parameter_change[:, self.free_indices] = difference * self.widths
         return parameter_change
