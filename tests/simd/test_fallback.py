@@ -103,7 +103,7 @@ def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
     code = list(ffi_primitive.LOADED_BY_NAME.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
-        code.address(ffi_handler.HANDLER_NAME)
+        code.find_address(ffi_handler.HANDLER_NAME)
     )
     metadata = (ctypes.c_int64 * 8)()
     extension = (ctypes.c_int64 * 4)(32, ffi_handler.METADATA_EXTENSION_TYPE, 0)

@@ -480,8 +480,8 @@ class CurveTracer(NamedTuple):
         self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
         """Return the labeled curve from its data."""
-        radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
-        table = branch.table | {"spectral_radius": radius}
+        spectral_radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
+        table = branch.table | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
         variables: dict[str, Any] = {
             column_name: ("point", table[column_name], measure_attrs(column_name))

@@ -247,16 +247,16 @@ def find_unexplained_changes(
         explaining_curves = [
             curve for curve in curves if curve.name in EXPLAINING_CURVES.get(name, (name,))
         ]
-        change_cells = np.array([change.cell_position for change in changes_of_name])
+        changes_in_cells = np.array([change.cell_position for change in changes_of_name])
         distances = np.full(len(changes_of_name), np.inf)
         for curve in explaining_curves:
             axes = zip(curve.values.T, curve.parameters, strict=True)
-            curve_cells = [
+            curve_in_cells = [
                 np.interp(values_of_axis, scan[n_samples].values, np.arange(scan.sizes[n_samples]))
                 for values_of_axis, n_samples in axes
             ]
             distances = np.minimum(
-                distances, distance_to_polyline(change_cells, np.stack(curve_cells, -1))
+                distances, distance_to_polyline(changes_in_cells, np.stack(curve_in_cells, -1))
             )
         remaining_changes += [
             change

@@ -387,11 +387,11 @@ def _linearize_phase(
 
     The last tangent is that with respect to the duration of the phase.
     """
-    append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    append_zero_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     pass_state = pass_state._replace(
-        held_tangents=append_zero(pass_state.held_tangents),
-        q_tangents=append_zero(pass_state.q_tangents),
-        v_tangents=append_zero(pass_state.v_tangents),
+        held_tangents=append_zero_tangent(pass_state.held_tangents),
+        q_tangents=append_zero_tangent(pass_state.q_tangents),
+        v_tangents=append_zero_tangent(pass_state.v_tangents),
     )
 
     def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:

@@ -90,10 +90,10 @@ class TestFunctionCurve(AbstractContinuationProblem):
         newton_step = self.test_function.linearize(
             args, z.z, jnp.stack([p, self.second_parameter(z)])
         )
-        derivative_first = newton_step.parameter_gradient[0]
-        derivative_fraction = parameter_range * newton_step.parameter_gradient[1]
-        fraction_change = -newton_step.value / derivative_fraction
-        fraction_tangent = -derivative_first / derivative_fraction
+        derivative_by_first_parameter = newton_step.parameter_gradient[0]
+        derivative_by_fraction = parameter_range * newton_step.parameter_gradient[1]
+        fraction_change = -newton_step.value / derivative_by_fraction
+        fraction_tangent = -derivative_by_first_parameter / derivative_by_fraction
         first_tangent, second_tangent = newton_step.tangents
         add_second_tangent = lambda change: (
             lambda first_entry, second_entry: first_entry + parameter_range * change * second_entry

@@ -482,7 +482,7 @@ def first_failed_check(
     return jnp.where((failed_check == 0.0) & ~is_resolved, float(MESH_CHECK_CODE), failed_check)
 
 
-def _is_attempt(attempt_index: Array, *names: str) -> Array:
+def _is_attempt_named(attempt_index: Array, *names: str) -> Array:
     """Return whether the attempt of this index has one of these names."""
     return functools.reduce(
         operator.or_, [attempt_index == SEARCH_ATTEMPTS.index(name) for name in names]
@@ -520,19 +520,19 @@ def _run_attempt(
         parameters,
         table_1_parameters + homotopy_fraction * (parameters - table_1_parameters),
     )
-    is_homotopy = _is_attempt(attempt_index, "homotopy")
+    is_homotopy = _is_attempt_named(attempt_index, "homotopy")
     start_parameters = jnp.where(is_homotopy, table_1_parameters, target_parameters)
     has_dls = jnp.broadcast_to(
-        ~_is_attempt(attempt_index, "without DLS") & ~is_second_try, parameters.shape[-1:]
+        ~_is_attempt_named(attempt_index, "without DLS") & ~is_second_try, parameters.shape[-1:]
     )
     homotopy_steps = jnp.where(is_homotopy, options.homotopy_steps, 0)
     start = surface_start(system, start_parameters, has_dls)
-    continues_previous = _is_attempt(attempt_index, "guess, on", "surface, on") | (
+    continues_previous = _is_attempt_named(attempt_index, "guess, on", "surface, on") | (
         (segment > 1) & ~is_second_try
     )
     start = jax.tree.map(lambda s, n: jnp.where(continues_previous, n, s), start, result.state)
     if guess is not None:
-        is_guess = _is_attempt(attempt_index, "guess")
+        is_guess = _is_attempt_named(attempt_index, "guess")
         start = jax.tree.map(lambda s, g: jnp.where(is_guess, g, s), start, guess)
     is_pending = result.state.found < 0.5
     is_pending &= ~is_segment | (

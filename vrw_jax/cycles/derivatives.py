@@ -253,14 +253,16 @@ def solve_cycle_with_derivatives(
     batched_search = compile_batched(
         search_problem, make_template, ("search", system), system.options.batch_size
     )
-    search_one = unbatch(functools.partial(_search_in_scaled_units, system, batched_search))
+    search_single_wheel = unbatch(
+        functools.partial(_search_in_scaled_units, system, batched_search)
+    )
     tangents_of = _make_tangent_function(system)
 
     @jax.custom_jvp
     def solve_with_rule(
         parameters: Array, *guess: CollocationState
     ) -> tuple[CollocationState, tuple]:
-        collocation_state, *diagnostics = search_one(parameters, *guess)
+        collocation_state, *diagnostics = search_single_wheel(parameters, *guess)
         return collocation_state, tuple(diagnostics)
 
     @solve_with_rule.defjvp

@@ -129,7 +129,7 @@ def _draw_slack(axes: Axes, result: TuneResult) -> None:
     with np.errstate(invalid="ignore"):
         slack_scale = np.maximum(np.nanmax(np.abs(values - margin), axis=0), 1e-12)
     positions = np.arange(len(names))[::-1]
-    active_names = {active.name for active in result.active}
+    active_names = {active_constraint.name for active_constraint in result.active}
     for slack_fraction, vertical_offset, color, text in (
         ((values[0] - margin) / slack_scale, 0.19, LIGHT_GRAY, "at the start"),
         ((values[tuned_index] - margin) / slack_scale, -0.19, BLUE, "tuned"),

@@ -44,7 +44,7 @@ class _NoKeyError(Exception):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Identity:
+class _IdentityKey:
     """Key of an object that is compared by identity. The key contains the object, so its address
     stays in use.
     """
@@ -52,7 +52,7 @@ class _Identity:
     content: Any
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self.content is other.content
+        return isinstance(other, _IdentityKey) and self.content is other.content
 
     def __hash__(self) -> int:
         return id(self.content)
@@ -126,7 +126,7 @@ def _make_key(value: Any, enclosing_ids: frozenset) -> Hashable:
     if isinstance(value, type):
         return _make_class_key(value, enclosing_ids | {id(value)})
     if isinstance(value, types.ModuleType) and _is_fixed(value.__name__):
-        return _Identity(value)
+        return _IdentityKey(value)
     if isinstance(value, functools.partial):
         partial_parts = (value.func, value.args, value.keywords)
         return value_type, tuple(map(make_inner_key, partial_parts))
@@ -135,10 +135,10 @@ def _make_key(value: Any, enclosing_ids: frozenset) -> Hashable:
     # A function with a derivative rule, as from jax.custom_jvp, refers to the values of the user's
     # function.
     if hasattr(value, "__wrapped__") and not _is_fixed(value.__module__):
-        return _Identity(value), make_inner_key(value.__wrapped__)
+        return _IdentityKey(value), make_inner_key(value.__wrapped__)
     fixed_types = (types.BuiltinFunctionType, jax.Array, np.ufunc, np.dtype)
     if isinstance(value, fixed_types) or value_type.__module__.startswith(("jax", "numpy")):
-        return _Identity(value)
+        return _IdentityKey(value)
     if dataclasses.is_dataclass(value):
         return make_inner_key(value_type), make_inner_key(vars(value))
     raise _NoKeyError
@@ -154,19 +154,19 @@ def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
     it.
     """
     if _is_fixed(value_type.__module__):
-        return _Identity(value_type)
+        return _IdentityKey(value_type)
     attributes = {
         name: value
         for name, value in vars(value_type).items()
         if not name.startswith("__") or name == "__call__"
     }
-    return _Identity(value_type), _make_key((attributes, value_type.__bases__), enclosing_ids)
+    return _IdentityKey(value_type), _make_key((attributes, value_type.__bases__), enclosing_ids)
 
 
 def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -> Hashable:
     """Return the function's code, and the keys of all values to which it refers."""
     if _is_fixed(function.__module__) and not function.__closure__:
-        return _Identity(function)
+        return _IdentityKey(function)
     names = {name for code in _iterate_codes(function.__code__) for name in code.co_names}
     global_keys = _make_scope_key(function.__globals__, names, enclosing_ids)
     try:
@@ -186,8 +186,8 @@ def _make_scope_key(scope: dict, names: set[str], enclosing_ids: frozenset) -> H
         if not isinstance(value, types.ModuleType) or _is_fixed(value.__name__):
             return _make_key(value, enclosing_ids)
         if id(value) in enclosing_ids:
-            return _Identity(value)
-        return _Identity(value), _make_scope_key(vars(value), names, enclosing_ids | {id(value)})
+            return _IdentityKey(value)
+        return _IdentityKey(value), _make_scope_key(vars(value), names, enclosing_ids | {id(value)})
 
     return tuple((name, make_entry_key(scope[name])) for name in sorted(names) if name in scope)
 

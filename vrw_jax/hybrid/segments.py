@@ -157,12 +157,12 @@ def product_multipliers(
         for i, jacobian in enumerate(jacobians):
             next_basis, triangles[i] = np.linalg.qr(jacobian @ next_basis)
         closing_matrix, basis = basis.T @ next_basis, next_basis
-        is_coupled = np.abs(np.tril(closing_matrix, -1)) > 1e-14
-        if not is_coupled.any():
+        has_coupling = np.abs(np.tril(closing_matrix, -1)) > 1e-14
+        if not has_coupling.any():
             break
     diagonal_blocks, block_start = [], 0
     for block_end in range(1, n + 1):
-        if not is_coupled[block_end:, :block_end].any():
+        if not has_coupling[block_end:, :block_end].any():
             diagonal_blocks.append(slice(block_start, block_end))
             block_start = block_end
     norms = np.linalg.norm(jacobians, axis=(1, 2))

@@ -174,20 +174,20 @@ def _refine_event(
 
     def take_short_step(carry: tuple) -> tuple:
         end, remaining_time, length, guard_index, is_distant, n_iterations = carry
-        is_moving = can_step(is_distant, remaining_time)
+        takes_short_step = can_step(is_distant, remaining_time)
         end = tree_where(
-            is_moving,
+            takes_short_step,
             rk_step(low_order_tableau, evaluate, end, remaining_time, with_error=False).end,
             end,
         )
         new_remaining_time, earliest_guard = _propose_earliest_event(
             *evaluate_with_rates(guards, evaluate, end), step.crossing_bits
         )
-        remaining_time = jnp.where(is_moving, new_remaining_time, remaining_time)
+        remaining_time = jnp.where(takes_short_step, new_remaining_time, remaining_time)
         length = jnp.where(
-            can_step(is_moving, new_remaining_time), length + new_remaining_time, length
+            can_step(takes_short_step, new_remaining_time), length + new_remaining_time, length
         )
-        guard_index = jnp.where(is_moving, earliest_guard, guard_index)
+        guard_index = jnp.where(takes_short_step, earliest_guard, guard_index)
         return (
             end,
             remaining_time,

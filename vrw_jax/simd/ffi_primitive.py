@@ -25,7 +25,7 @@ def register_code(code: MachineCode) -> None:
         if code.name not in LOADED_BY_NAME:
             loaded_code = LoadedCode(object_code)
             jax.ffi.register_ffi_target(
-                code.name, loaded_code.capsule(HANDLER_NAME), platform="cpu"
+                code.name, loaded_code.make_capsule(HANDLER_NAME), platform="cpu"
             )
             LOADED_BY_NAME[code.name] = loaded_code
 
@@ -72,7 +72,7 @@ def _lower_call(
     return jax.ffi.ffi_lowering(code.name)(context, *arguments)
 
 
-def _refuse_transform(*_: Any, **__: Any) -> Any:
+def _raise_transform_error(*_: Any, **__: Any) -> Any:
     """Raise a NotImplementedError for a transform that machine code does not support."""
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
@@ -82,5 +82,5 @@ def _refuse_transform(*_: Any, **__: Any) -> Any:
 
 mlir.register_lowering(MACHINE_CODE_PRIMITIVE, _lower_call, platform="cpu")
 batching.primitive_batchers[MACHINE_CODE_PRIMITIVE] = ad.primitive_jvps[MACHINE_CODE_PRIMITIVE] = (
-    _refuse_transform
+    _raise_transform_error
 )

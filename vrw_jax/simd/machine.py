@@ -140,16 +140,16 @@ class LoadedCode:
         self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
 
-    def address(self, name: str) -> int:
+    def find_address(self, name: str) -> int:
         """Return the address of a function in memory."""
         return self._engine.get_function_address(name)
 
-    def capsule(self, name: str) -> Any:
+    def make_capsule(self, name: str) -> Any:
         """Return a function as a PyCapsule, by which XLA can call it."""
         make_capsule = ctypes.pythonapi.PyCapsule_New
         make_capsule.restype = ctypes.py_object
         make_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-        return make_capsule(self.address(name), None, None)
+        return make_capsule(self.find_address(name), None, None)
 
 
 def _make_target_machine() -> "llvm.TargetMachine":

@@ -225,7 +225,7 @@ class _LaneProgram:
         function_type = ctypes.CFUNCTYPE(
             None, pointer_type, pointer_type, count_type, count_type, count_type
         )
-        self._run = function_type(self._loaded_code.address(KERNEL_NAME))
+        self._run = function_type(self._loaded_code.find_address(KERNEL_NAME))
 
     def __call__(self, scalars: Sequence[Any], lanes: Sequence[np.ndarray]) -> list[np.ndarray]:
         n_lanes = len(lanes[0])

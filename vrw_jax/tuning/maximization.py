@@ -339,8 +339,11 @@ def compute_optimality(
     if not constraint_normals.shape[1]:
         return OptimalityConditions(prices, lower_prices, upper_prices, 1.0)
     weights, residual = nnls(constraint_normals, -trial.gradient)
-    lower_start, upper_start = len(active_indices), len(active_indices) + len(lower_indices)
-    prices[active_indices] = weights[:lower_start] / scales[active_indices]
-    lower_prices[lower_indices] = weights[lower_start:upper_start]
-    upper_prices[upper_indices] = weights[upper_start:]
+    lower_weights_start, upper_weights_start = (
+        len(active_indices),
+        len(active_indices) + len(lower_indices),
+    )
+    prices[active_indices] = weights[:lower_weights_start] / scales[active_indices]
+    lower_prices[lower_indices] = weights[lower_weights_start:upper_weights_start]
+    upper_prices[upper_indices] = weights[upper_weights_start:]
     return OptimalityConditions(prices, lower_prices, upper_prices, float(residual) / gradient_norm)
