@@ -229,6 +229,7 @@ def test_no_smaller_disturbance_at_random_instants_leaves_the_basin(damping):
         assert (walks.outcome == vrw.Outcome.STEPPED).all(), phase
 
 
+@pytest.mark.slow  # two searches for each of two gaits
 def test_basins_along_a_branch_are_those_of_its_wheels():
     branch = vrw.continue_branch(TABLE_1, "damping", (195.0, 200.0))
     basins = vrw.measure_basins(branch, BOX, n_points=2, n_starts=256)
