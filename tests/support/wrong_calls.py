@@ -955,6 +955,31 @@ def register_wrong_calls() -> None:
     add_wrong_calls(
         "open_scan", lambda v: vrw.open_scan(v), many | {"number": (3, "TypeError")}, "path"
     )
+    unencodable = "wheels\ud800"  # half of a surrogate pair, which no file name contains
+    add_wrong_calls(
+        "open_scan verify",
+        lambda v: vrw.open_scan("nowhere", verify=v),
+        {"array": (np.array([1, 0]), "TypeError"), "key": (jax.random.key(0), "TypeError")},
+        "verify",
+    )
+    add_wrong_call(
+        "open_scan of a name without an encoding",
+        lambda: vrw.open_scan(unencodable),
+        "ValueError",
+        "cannot encode",
+    )
+    add_wrong_call(
+        "scan into a name without an encoding",
+        lambda: scan(store=unencodable),
+        "ValueError",
+        "cannot encode",
+    )
+    add_wrong_call(
+        "solve_fixed_point tolerance of a random key",
+        lambda: vrw.solve_fixed_point(lambda x: x, start, tolerance=jax.random.key(0)),
+        "TypeError",
+        "tolerance",
+    )
     add_wrong_call("explore a table", lambda: vrw.explore(dataset={}), "TypeError", "dataset is {}")
     add_wrong_calls(
         "solve_fixed_point tolerance",

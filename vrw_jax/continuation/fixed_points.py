@@ -161,7 +161,9 @@ def _solve_checked(
         raise ValueError(
             f"start has shape {start.shape}, but it is a vector: give an array of shape (n,)."
         )
-    if not isinstance(tolerance, jax.Array):
+    if isinstance(tolerance, jax.Array):
+        tolerance = check_reals("tolerance", tolerance)
+    else:
         check_positive("tolerance", tolerance)
 
     start = lax.stop_gradient(start)

@@ -37,7 +37,7 @@ from vrw_jax.figures.style import (
     require_variables_of_all,
 )
 from vrw_jax.measures import MEASURES, PHASE_NAMES
-from vrw_jax.validation import check_int, check_positive, check_type
+from vrw_jax.validation import check_int, check_path, check_positive, check_type
 
 Coordinate = float | np.ndarray
 """One coordinate of points, in m."""
@@ -516,7 +516,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
         'walk.gif'
     """
     check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
-    check_type("path", path, (str, Path), 'give a file, such as "walk.gif"')
+    check_path("path", path, 'give a file, such as "walk.gif"')
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     shared_palette = frames[0].quantize(32)

@@ -39,7 +39,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_callable, check_type, raise_for_renamed_arguments
+from vrw_jax.validation import check_callable, check_path, raise_for_renamed_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -115,7 +115,7 @@ def scan(
         ([1.018, nan], [0, 14])
     """
     if store is not None:
-        check_type("store", store, (str, Path), "give the folder to keep the result in")
+        check_path("store", store, "give the folder to keep the result in")
     if on_progress is not None:
         check_callable("on_progress", on_progress, "that takes the progress")
     scan_plan = plan_scan(

@@ -42,7 +42,7 @@ from vrw_jax.scans.integrity import (
     store_lock,
 )
 from vrw_jax.scans.measure_catalog import canonicalize_name
-from vrw_jax.validation import check_type
+from vrw_jax.validation import check_bool, check_path
 
 if TYPE_CHECKING:
     import zarr
@@ -304,7 +304,8 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     gaits = vrw.scan(design, ["speed"], store=path).load()
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
-    check_type("path", path, (str, Path), "give the folder that a scan wrote")
+    check_path("path", path, "give the folder that a scan wrote")
+    verify = check_bool("verify", verify)
     metadata = _read_scan_metadata(Path(path))
     damaged_metadata = metadata.find_damaged() if verify else []
     try:

@@ -9,6 +9,7 @@ from vrw_jax.validation.checks import (
     check_names,
     check_not_traced,
     check_numpy_reals,
+    check_path,
     check_positive,
     check_range,
     check_real,

@@ -8,6 +8,7 @@ import difflib
 import math
 import os
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -246,6 +247,17 @@ def check_type(name: str, value: Any, expected_type: type | tuple[type, ...], ad
         raise TypeError(
             f"{name} is {format_value(value)}, but it must be {article} {type_name}: {advice}."
         )
+
+
+def check_path(name: str, value: Any, advice: str) -> None:
+    """Raise an error unless a value is a path that the file system can encode."""
+    check_type(name, value, (str, Path), advice)
+    try:
+        os.fsencode(value)
+    except UnicodeEncodeError:
+        raise ValueError(
+            f"{name} is {value!r}, but the file system cannot encode this name: {advice}."
+        ) from None
 
 
 def check_callable(name: str, value: Any, description: str) -> None:
