@@ -100,7 +100,7 @@ def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
     """k = k0/e^2, c = c0/e, L* - L0 = d e^2: preload and damping ratio stay, the leg stiffens.
 
     The limit keeps the paper's landing, whose rear foot is held during the impulse. The classic
-    landing, whose rear foot takes none, is not its limit (docs/explanation/physics.md).
+    landing, whose rear foot takes none, is not its limit (docs/explanation/rigid_limit.md).
     """
     start = np.array([HALF_ANGLE, 2.0, 0.0])
     sizes = np.array([1 / 16, 1 / 32, 1 / 64])

@@ -100,7 +100,7 @@ def test_traced_results_print_their_shapes():
         (vrw.CycleOptions, "`homotopy_steps`: of a homotopy"),
         (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
         (vrw.Margins, "`contraction`:"),
-        (vrw.StepBatchResult, "`solver_steps`: number of solver steps tried"),
+        (vrw.StepBatchResult, "`solver_steps`: number of attempted solver steps"),
         (vrw.LimitCycle, "`n_newton_iterations`: number of linearized passes"),
         (vrw.TuneResult, "`n_evaluations`: number of limit cycles"),
         (vrw.UnilateralStep, "`slip`: path length of sliding feet, m"),
