@@ -1,4 +1,4 @@
-"""JAX as `start_jax` starts it, with a compilation cache; shapes checked against signatures."""
+"""Start JAX as `start_jax` does, with a compilation cache, and check shapes against signatures."""
 
 import gc
 import os
@@ -31,8 +31,7 @@ LONGEST_COMPILATIONS = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The library, imported here so that its annotations are checked; not where tests are only
-    handed out to other processes, which takes as long."""
+    """Import the library with checked annotations, unless this process only distributes tests."""
     distributes_tests = config.getoption("numprocesses", None) and not hasattr(
         config, "workerinput"
     )
@@ -45,6 +44,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first, so that two workers end together."""
+    """Run long files first, so that two workers end together."""
     position = {name: index for index, name in enumerate(LONGEST_COMPILATIONS)}
     items.sort(key=lambda item: position.get(item.path.stem, len(position)))

@@ -1,4 +1,4 @@
-"""The page of failures lists every case, and this library is never silently wrong."""
+"""The page of failures lists every case, and the library returns no wrong result without a code."""
 
 import csv
 import importlib
@@ -52,7 +52,8 @@ def test_all_methods_ran_together_and_this_library_is_within_1e_12_times_the_con
 
 
 def test_event_times_of_this_library_are_within_their_stated_errors():
-    """The implicit solver's too: what is above 1e-12 stands as "time to", an infinity included."""
+    """Include the implicit solver; an error above 1e-12 is stored as "time to", and may be
+    infinite."""
     timed = ("time", "dip", "switching", "event", "touch", "period", "first impact", "end of the")
     mine = [row for row in FAILURE_TABLE if row["method"].startswith("ours") and not row["digits"]]
     late_values = [

@@ -48,7 +48,7 @@ def test_damage_ends_as_it_should(rows, kind, fault, endings):
 
 
 class Canary:
-    """A pickle that makes a file when it is loaded."""
+    """A pickle that creates a file when it is loaded."""
 
     def __init__(self, place):
         self.place = place
@@ -125,7 +125,7 @@ def store_objects(store: Path, payload: bytes) -> None:
 
 
 def add_an_array_of_zarr_2(store: Path, payload: bytes) -> None:
-    """An array of the format before, whose filters may be pickles."""
+    """Add an array of Zarr format 2, whose filters may be pickles."""
     place = store / "mine"
     place.mkdir()
     array = {

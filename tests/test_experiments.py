@@ -1,4 +1,4 @@
-"""Every experiment starts: it imports, does nothing by that, and tells its own command."""
+"""Every experiment can be imported without effects, and its help states its command."""
 
 import ast
 import json
@@ -49,7 +49,7 @@ that has changed, and the missing names that the module uses of other modules.""
 
 @pytest.fixture(scope="module")
 def experiment_outputs():
-    """By module, one process for all."""
+    """Return the results by module, all from one process."""
     outside = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
     command = [sys.executable, "-W", "ignore", "-c", START_SCRIPT, *MODULES]
     out = subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True)

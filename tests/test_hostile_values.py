@@ -1,4 +1,4 @@
-"""Values that nobody means, for every argument: an answer, or one sentence of this library."""
+"""For invalid values of every argument, a call returns or raises one sentence of this library."""
 
 import os
 import subprocess

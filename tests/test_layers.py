@@ -1,4 +1,4 @@
-"""Imports keep their rules, each rule finds its violations, and an import has no side effects."""
+"""Imports obey their rules, each rule finds its violations, and imports have no side effects."""
 
 import subprocess
 import sys

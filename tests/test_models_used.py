@@ -1,4 +1,4 @@
-"""Whatever takes a model uses it: an option of the model shows in what every function tells."""
+"""Every function that takes a model uses the model's options in its results."""
 
 import inspect
 

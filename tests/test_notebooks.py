@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom, and what it shows in words is what it is stored with."""
+"""Every notebook runs from top to bottom and prints the stored text."""
 
 import os
 import re
@@ -52,6 +52,6 @@ def test_a_notebook_runs_and_prints_its_stored_output(path, monkeypatch):
 
 
 def collect_printed_text(cell: object) -> str:
-    """What a cell prints, numbers cut to three digits: pictures and reprs are not compared."""
+    """Return the printed text of a cell, numbers with three digits, without pictures and reprs."""
     text = "".join(o.text for o in cell.outputs if o.output_type == "stream" and o.name == "stdout")
     return re.sub(r"-?\d+\.?\d*(e-?\d+)?", lambda m: f"{float(m[0]):.3g}", text)

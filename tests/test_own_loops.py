@@ -1,4 +1,4 @@
-"""The page on own programs does what it says, as it is written."""
+"""The programs of the page on custom loops run as they are written."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "own_loops.md"
 
 @pytest.fixture
 def page_names(request, monkeypatch, tmp_path) -> dict:
-    """What a program of the page leaves behind."""
+    """Return the variables that a program of the page defines."""
     programs = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)
     monkeypatch.setattr(vrw, "start_jax", lambda: None)  # it has started
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""What is built brings what it needs, and its page on the package index leads somewhere."""
+"""The built package contains what it needs, and the links of its page on the package index work."""
 
 import importlib.util
 import re
@@ -15,7 +15,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 @pytest.fixture
 def build_hook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """The hook, with a stand-in for hatchling, which only building needs."""
+    """Return the build hook with a substitute for hatchling, which only a build needs."""
     interface = types.ModuleType("hatchling.metadata.plugin.interface")
     interface.MetadataHookInterface = object  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, interface.__name__, interface)

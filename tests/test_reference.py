@@ -1,4 +1,4 @@
-"""Every public name is documented: arguments, result and errors, with an example that runs."""
+"""Every public name documents its arguments, result and errors, with an example that runs."""
 
 import contextlib
 import doctest

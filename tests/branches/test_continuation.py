@@ -1,4 +1,4 @@
-"""Branches pass folds, and every bifurcation and border on them is located to 1e-9."""
+"""Branches pass folds, and every special point on them is located to 1e-9."""
 
 import pickle
 
@@ -371,7 +371,7 @@ def branch(branches):
 
 @pytest.fixture(scope="module")
 def find_gait_at_damping(branch):
-    """The gait of Table 1's wheel at a damping, found again next to the branch."""
+    """Return a function: the gait of Table 1's wheel at a damping, searched next to the branch."""
     guess = branch.special_points[-1].cycle
 
     def find(damping):
@@ -443,7 +443,8 @@ def test_special_points_do_not_depend_on_any_of_a_hundred_bounds(branch):
 
 def test_each_special_point_is_located_to_1e_9(branch, find_gait_at_damping):
     def quantity(border, damping):
-        """Indicator or monitor `border.name` at that damping; negative where the gait is lost."""
+        """Return the test function of a special point at a damping; negative if the gait does not
+        exist."""
         params, gait = find_gait_at_damping(damping)
         if not bool(gait.found):
             return -1.0

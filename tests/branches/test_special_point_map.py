@@ -19,7 +19,7 @@ LEG_NUMBERS = np.arange(3, 9)
 
 
 def make_scan(signs, outcome=None):
-    """A scan all of whose quantities are 1, but for those given."""
+    """Return a scan of which all quantities are 1, except the given ones."""
     ones = {name: np.ones((len(C), len(K))) for name in ("lambda_4_plus", *MARGIN_MEASURES)}
     data = {name: (MAP_PARAMETERS, signs.get(name, values)) for name, values in ones.items()}
     for name in (name for name in MARGIN_MEASURES if MARGIN_MEASURES[name].dimension):

@@ -1,6 +1,7 @@
-"""The command line: it teaches, it says what is wrong in one sentence, and it writes what it says.
+"""The command line: its help, its errors of one sentence, and its files.
 
-Scans here are computed by the stand-in of support.scanning; one gait is walked for real.
+The substitute engine of support.scanning computes the scans here; one gait is walked by the
+library.
 """
 
 import os
@@ -99,7 +100,7 @@ def test_explain_measures_some_samples_and_writes_nothing(
 
 
 def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first chunk's time is compiling too, and counts for nothing."""
+    """The time of the first chunk includes compilation and does not count."""
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     result: list[dict] = []

@@ -1,4 +1,4 @@
-"""Configs: what stands in the files of the library is right, and every mistake gets a sentence."""
+"""The configs of the library are valid, and every mistake in a config raises one sentence."""
 
 from pathlib import Path
 

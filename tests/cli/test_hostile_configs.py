@@ -1,4 +1,4 @@
-"""Hostile values for every key of a config: taken, or refused by one sentence."""
+"""Each key of a config accepts an invalid value, or raises one sentence."""
 
 import json
 

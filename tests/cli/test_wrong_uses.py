@@ -1,4 +1,4 @@
-"""What can be got wrong at the command line: one sentence, exit code 2, and nothing written."""
+"""Wrong uses of the command line print one sentence, exit with code 2, and write nothing."""
 
 import os
 import socket
@@ -423,7 +423,7 @@ def list_files(working_folder: Path) -> dict[Path, bytes]:
 
 
 def assert_refused(arguments: tuple[str, ...], expected: str, working_folder: Path) -> str:
-    """The sentence, of a command that must be refused with nothing written."""
+    """Require that a command prints the sentence and writes nothing; return the sentence."""
     before = list_files(working_folder)
     error_text = CliRunner().invoke(app, list(arguments))
     assert error_text.exit_code == 2, error_text.output

@@ -1,4 +1,4 @@
-"""One face for gaits: two independent finders tell the same gait, one table names what it tells."""
+"""Two independent finders return the same gait, and one table names its measures."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ WHEEL_AXES = eqx.tree_at(
 
 @pytest.fixture(scope="module")
 def finders_of_both_kinds() -> tuple[vrw.LimitCycle, vrw.ReturnMapCycle]:
-    """Table 1's gait by collocation, and by Newton's method on the event-driven step."""
+    """Return Table 1's gait by collocation, and by Newton's method on the event-driven step."""
     collocated = vrw.limit_cycle(TABLE_1, options=vrw.CycleOptions.tight())
     walking = ReturnMapFinder(vrw.ViscoelasticWheel(), 8, vrw.StepOptions.tight())
     return collocated, walking.find_cycle(TABLE_1, collocated)

@@ -1,4 +1,4 @@
-"""Gaits on real ground: sensitivities, branches, scans and tuning."""
+"""Gaits with unilateral contact: sensitivities, branches, scans and tuning."""
 
 import math
 from typing import NamedTuple
@@ -27,7 +27,7 @@ TIGHT_OPTIONS = vrw.StepOptions(rtol=1e-11, atol=1e-11)
 
 @pytest.fixture(scope="module")
 def gait_near_slow_start():
-    """A section state next to the slow gait at c = 300, μ = 0.7."""
+    """Return a section state next to the slow gait at c = 300, μ = 0.7."""
     return vrw.walk(
         SLOW_WHEEL, START, 40, model=GROUND_MODEL, options=TIGHT_OPTIONS
     ).steps.section_state[-1]
@@ -259,7 +259,7 @@ BATCH_OPTIONS = vrw.StepOptions(solver="Tsit5", rtol=1e-8, atol=1e-8)
 
 @pytest.fixture(scope="module")
 def unilateral_batch():
-    """Three steps of several wheels side by side: damping, friction, start and what they did."""
+    """Return three steps of several wheels: damping, friction, start and results."""
     damping = np.array([200.0, 300.0, 250.0, 160.0, 60.0, 150.0, 200.0])
     friction = np.array([0.7, 0.7, 1.2, math.inf, math.inf, math.nan, 0.3])
     states = np.tile(START, (len(damping), 1))
@@ -596,7 +596,7 @@ def test_a_singular_linear_system_does_not_affect_the_others():
 
 
 class _StepOutput(NamedTuple):
-    """As much of a step as Newton's method looks at."""
+    """The fields of a step that Newton's method reads."""
 
     section_state: np.ndarray
     outcome: np.ndarray | None

@@ -1,4 +1,4 @@
-"""Limit cycles: against a truth of 27 digits, against walking, their derivatives, and failures."""
+"""Limit cycles agree with a reference of 27 digits and with walks; derivatives and failures."""
 
 import functools
 import math
@@ -36,7 +36,7 @@ def collect_measures(cycle, names):
 
 @functools.cache
 def compile_cycle_measures(options, names, transform):
-    """Cycles of a batch with the derivatives of some measures, compiled once for many tests."""
+    """Return a compiled function: cycles of a batch with derivatives of some measures."""
 
     def one(vector):
         cycle = vrw.limit_cycle(truth.make_wheel(vector), options=options)
@@ -47,7 +47,7 @@ def compile_cycle_measures(options, names, transform):
 
 
 def differentiate_measures(rows, options=None, names=DIFFERENTIATED_MEASURES, transform=jax.jacfwd):
-    """(derivatives, cycles) of rows of parameters, in a batch of one size."""
+    """Return derivatives and cycles of rows of parameters, in a batch of fixed size."""
     rows = np.atleast_2d(np.asarray(rows, float))
     full = np.concatenate([rows, np.tile(rows[-1], (len(truth.REFERENCE_CASES) - len(rows), 1))])
     solution = compile_cycle_measures(options, names, transform)(jnp.asarray(full))
@@ -435,7 +435,7 @@ def test_options_of_the_wrong_type_are_refused_in_one_sentence():
 
 
 def make_simplest_walker(slope):
-    """Garcia et al. 1998: the map just after heel strike, stance angle and rate."""
+    """Return the map of Garcia et al. 1998 just after heel strike, of stance angle and rate."""
 
     def field(y):
         theta, phi, dtheta, dphi = y

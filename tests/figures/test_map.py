@@ -1,4 +1,4 @@
-"""A map shows every border as a curve over the measure, and where borders meet."""
+"""A map shows each curve of special points over the measure, and the points where curves meet."""
 
 import numpy as np
 import xarray as xr

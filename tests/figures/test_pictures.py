@@ -1,4 +1,5 @@
-"""Pictures are read by every eye, by one meaning a colour and one form of units."""
+"""Figures use colors that color-blind readers distinguish, one meaning per color, and one form of
+units."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Pictures of scans are drawn over whatever was swept."""
+"""Figures of scans support every kind of swept parameter."""
 
 import numpy as np
 import pytest

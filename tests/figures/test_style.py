@@ -1,4 +1,4 @@
-"""Labels come from the table of measures, and any of them can be drawn."""
+"""Labels come from the table of measures, and every measure can be drawn."""
 
 import matplotlib as mpl
 import numpy as np

@@ -1,4 +1,4 @@
-"""A gait that a walk reaches is found, whatever the wheel; what is found repeats when walked."""
+"""The library finds each gait that a walk reaches, and a found gait repeats when it walks."""
 
 import jax
 import jax.numpy as jnp
@@ -141,7 +141,7 @@ ORBIT_WHEEL = vrw.WheelParams(damping=219.85)
 
 @pytest.fixture(scope="module")
 def ten_step_orbit_points():
-    """Of an orbit in which one of ten steps has no double support."""
+    """Return the points of an orbit in which one of ten steps has no double support."""
     x = vrw.step_batch(ORBIT_WHEEL, np.asarray([[0.1, 1.6, -0.1]]), 600).section_state
     points = [np.asarray(x[0])]
     for _ in range(9):

@@ -1,4 +1,4 @@
-"""Which feet and stoppers carry an impact or a motion: every combination, by dense matrices."""
+"""The choice of feet and stoppers that carry an impact or a motion, against dense matrices."""
 
 import itertools
 
@@ -39,7 +39,8 @@ SOLUTION_COUNTS = {(0.7, False): {1}, (0.7, True): {1}, (3.0, False): {1, 3}, (3
 
 
 def draw_contact_cases():
-    """Postures with two feet on the slope: coordinates, rates, stoppers reached (slots, others)."""
+    """Return postures with two feet on the slope: coordinates, rates, reached stoppers (slots,
+    others)."""
     rng = np.random.default_rng(RNG_SEED)
     for _ in range(N_CASES):
         theta = rng.uniform(-0.7, -0.1)
@@ -111,7 +112,8 @@ def enumerate_admissible_contacts(wheel, q, v, at_stopper, locked, moving):
 
 @jax.jit
 def select_contacts(q, v, at_stopper, locked, friction, moving):
-    """The library's choice: modes, held stoppers, rates of hub and slots' lengths, solutions."""
+    """Return the library's choice: modes, held stoppers, rates of hub and slots' lengths,
+    solutions."""
     s = vrw.WheelParams().symbols()
     slots = find_slots(jnp.arange(8) < 2)
     motion = WheelMotion(*q[:3], *v[:3], q[3:], v[3:])

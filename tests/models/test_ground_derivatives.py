@@ -1,4 +1,4 @@
-"""Derivatives of a step on real ground through each kind of event, against central differences."""
+"""Derivatives of a step with unilateral contact through each event, against central differences."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ STEP_SCENES = {  # friction, damping, dtheta at the start, stoppers; events that
 
 
 def classify_events(trace, first_locked):
-    """What happened from phase to phase, in words."""
+    """Return the names of the events between the phases."""
     rows = np.flatnonzero(np.asarray(trace.duration) > 0.0)
     contact, locked = np.asarray(trace.contact)[rows], np.asarray(trace.locked)[rows]
     result = {"lands"}  # the opening landing

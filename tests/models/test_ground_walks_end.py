@@ -1,4 +1,4 @@
-"""How walks on real ground end: by physics alone, and alike at every tolerance."""
+"""Walks with unilateral contact end for physical reasons only, and alike at every tolerance."""
 
 import math
 
@@ -25,7 +25,7 @@ PARADOX_OUTCOMES = dict.fromkeys((78, 85, 90, 105, 121, 123, 126), vrw.Outcome.P
 
 
 def draw_wheels():
-    """Of `experiments.ground.survey`."""
+    """Return the wheels of `experiments.ground.survey`."""
     draw = np.random.default_rng(0).uniform
     params = vrw.WheelParams(damping=draw(20.0, 400.0, N_WHEELS), slope=draw(0.1, 0.34, N_WHEELS))
     limits = (0.05, 0.15), (0.8, 2.2), (-0.3, 0.0)
@@ -33,7 +33,7 @@ def draw_wheels():
 
 
 def find_walk_ends(friction, stoppers, tolerance):
-    """Outcomes of the wheels that don't walk all steps."""
+    """Return the outcomes of the wheels that do not walk all steps."""
     params, starts = draw_wheels()
     model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
     options = vrw.StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)

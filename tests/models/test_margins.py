@@ -1,4 +1,4 @@
-"""Margins and forces against Newton's law on the point masses, from the independent reference."""
+"""Margins and forces agree with Newton's law on the point masses, by the independent reference."""
 
 import functools
 
@@ -83,7 +83,7 @@ def test_the_step_of_the_reference_code_agrees():
 
 
 def assert_agrees_with_reference(vector, start):
-    """Same outcome, durations and next state, whichever branch of Section 5.1 was taken."""
+    """Require the same outcome, durations and next state, for every branch of Section 5.1."""
     params = dict(zip(NAMES, map(float, vector), strict=True)) | {"n_legs": 8}
     oracle = five_coordinates.step(params, start)
     solution = jax.tree.map(

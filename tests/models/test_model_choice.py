@@ -1,4 +1,4 @@
-"""The lowest rung whose premises hold, lane by lane, with its reason."""
+"""The chosen model is the simplest one with nonnegative margins for each lane, with its reason."""
 
 import math
 
@@ -44,7 +44,7 @@ HIGH_FRICTION = 50.0
 
 @pytest.fixture(scope="module")
 def ladder_steps():
-    """Lanes that differ in damping and friction, all steps at once."""
+    """Return steps of lanes that differ in damping and friction, all in one batch."""
     damping = jnp.asarray([200.0, 50.0, 200.0, 150.0])
     friction = jnp.asarray([HIGH_FRICTION, HIGH_FRICTION, 0.7, math.inf])
 

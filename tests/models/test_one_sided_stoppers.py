@@ -1,4 +1,4 @@
-"""Stoppers that only push: complementarity in an impact, forces, energy, another code, lanes."""
+"""One-sided stoppers: complementarity in an impact, forces, energy, a second formulation, lanes."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_an_unknown_kind_of_stopper_is_refused_in_one_sentence():
 
 @pytest.fixture(scope="module")
 def stopper_impact():
-    """A spinning wheel in the air of which one leg meets its stopper, by the speed of rest."""
+    """Return a wheel in the air, one leg of which meets its stopper, by the rest speed."""
     s, zero, none = vrw.WheelParams().symbols(), jnp.zeros(()), jnp.zeros(8, bool)
     motion = WheelMotion(
         zero, zero + 2.0, zero - 0.2, zero + 1.0, zero - 0.5, zero + 1.5, jnp.ones(8), jnp.zeros(8)

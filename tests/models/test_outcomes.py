@@ -1,4 +1,4 @@
-"""Every way a step can end has a code, a wheel that provokes it, and disturbs nobody."""
+"""Every end of a step has a code and a wheel that causes it, and does not change other lanes."""
 
 import jax
 import jax.numpy as jnp

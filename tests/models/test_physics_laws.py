@@ -1,4 +1,4 @@
-"""Laws that any simulation of this wheel must keep, checked on steps across the box."""
+"""Steps across the box obey the physical laws that every simulation of this wheel must obey."""
 
 import jax
 import jax.numpy as jnp
@@ -114,7 +114,7 @@ def test_the_stopper_never_pulls_leg_2_and_the_landing_never_pulls_the_foot(samp
 
 
 def test_forces_equal_the_rate_of_momentum_of_the_point_masses():
-    """lambda_1, lambda_2 from total momentum against Newton's law on every mass."""
+    """Compare lambda_1 and lambda_2 with the rate of momentum by Newton's law on every mass."""
     p = vrw.WheelParams()
     s = p.symbols()
     theta, L1, L2, dtheta, dL1, dL2 = -0.3, 0.93, 0.96, 1.2, -0.1, 0.2

@@ -1,4 +1,4 @@
-"""A new model edits one place: its class declares what the library offers for it."""
+"""A new model needs edits in one place: its class declares what the library offers for it."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from vrw_jax.wheel import PARAMETER_NAMES
 
 
 class PointFeetWheel(vrw.AbstractWheel):
-    """A model of a user, whose motion is that of the rigid wheel."""
+    """A user's model, whose motion is that of the rigid wheel."""
 
     model_name: ClassVar[str] = "point_feet"
     capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(

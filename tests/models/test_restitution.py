@@ -1,4 +1,4 @@
-"""Feet that come back: Newton's law in the impact problem, and energy that never grows."""
+"""Feet with restitution: Newton's law in the impact problem, and energy that never grows."""
 
 import jax
 import jax.numpy as jnp

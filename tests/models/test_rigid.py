@@ -1,4 +1,4 @@
-"""The rigid rung: published closed forms, quadrature, and the limit that leads to it."""
+"""The rigid wheel agrees with published closed forms, quadrature and the limit of stiff legs."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ POINT_MASS_WHEEL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=9.8, sl
 
 
 def rigid_walks(**changes):
-    """A wheel that never lifts off on its own account, so that only the map is looked at."""
+    """Return a wheel without lift-off, so that only the map matters."""
     return vrw.RigidWheel(stop_at_lift_off=False, **changes)
 
 

@@ -1,4 +1,4 @@
-"""Whatever the parameters and the start: an outcome, finite numbers, no exception."""
+"""Any parameters and any start give an outcome and finite numbers, and raise no exception."""
 
 import jax
 import numpy as np
@@ -37,7 +37,7 @@ def assert_valid_outcomes(lanes):
 
 
 def make_batch(vector, x):
-    """Sixteen lanes at a time: neighbours of every kind."""
+    """Return a batch of sixteen lanes with neighbors of every kind."""
     return st.lists(st.tuples(vector, x), min_size=BATCH_SIZE, max_size=BATCH_SIZE)
 
 

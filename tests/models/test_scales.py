@@ -1,4 +1,4 @@
-"""Units: in others a step and a gait are the same, and units tell two columns of a Jacobian."""
+"""A step and a gait are the same in other units, and units give two columns of a Jacobian."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ ALL_INPUT_NAMES = ("section_state", *PARAMETER_NAMES)
 
 
 def random_batch():
-    """Wheels like that of Table 1, starts, and units for each."""
+    """Return wheels similar to that of Table 1, starts, and units for each."""
     draw = np.random.default_rng(3)
     length, time = draw.uniform(0.2, 3.0, N), draw.uniform(0.5, 3.0, N)
     table = {
@@ -26,7 +26,7 @@ def random_batch():
 
 
 def rescale_units(table, start, length, time):
-    """The same wheels, with numbers in units so many times smaller."""
+    """Return the same wheels in other units of length and time."""
     powers = {"leg_com": 1, "locked_length": 1, "natural_length": 1, "gravity": 1}
     per_time = {"stiffness": 2, "damping": 1, "gravity": 2}
     result_by_name = {
@@ -55,7 +55,7 @@ def test_a_step_is_the_same_in_other_units():
 
 @pytest.mark.parametrize("name", [PARAMETER_NAMES[last] for last in SCALING_BY_PARAMETER])
 def test_tangents_derived_from_units_equal_those_of_the_step(name):
-    """Asked for by itself a column is carried through the step; with all others it is not."""
+    """A single column is propagated through the step; with all columns, units give two of them."""
     table, start, length, time = random_batch()
     other, shifted = rescale_units(table, start, length, time)
     params = vrw.WheelParams(**other)

@@ -1,4 +1,5 @@
-"""Real ground against a second event-driven formulation: every mode, both kinds of stoppers."""
+"""Unilateral contact agrees with a second event-driven formulation, in every mode and for both
+stoppers."""
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ EVENT_CHAIN_TOLERANCE_SECONDS = 1e-9
 
 
 def compare_codes(friction, damping, slope, x, stoppers, n_steps=1, max_events=400):
-    """Durations over all steps and the last section state, by the library and by the oracle."""
+    """Return durations over all steps and the last section state, by the library and by the
+    reference."""
     # Friction is finite: what infinite friction would be chooses the program of test_unilateral.
     model = vrw.UnilateralWheel(friction, max_events, stoppers, infinite_friction_rule="paper")
     params = vrw.WheelParams(damping=damping, slope=slope)

@@ -1,4 +1,4 @@
-"""One step against a truth of 27 digits, made from two other formulations in another library."""
+"""One step agrees with a reference of 27 digits, from two formulations in another library."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ STARTS = truth.stack_quantity("step", "start")
 
 
 def compute_reference_steps(options):
-    """States and durations of all cases."""
+    """Return states and durations of all cases."""
     return compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)[0]
 
 

@@ -1,4 +1,4 @@
-"""The wheel on real ground: contact laws, impacts, energy, the paper's gait, another code."""
+"""Unilateral contact: contact laws, impacts, energy, the paper's gait, and a second formulation."""
 
 import math
 from functools import partial
@@ -52,7 +52,7 @@ STEP_SCENES = {  # friction, damping, dtheta at the start: what happens in the f
 
 
 def compute_step(friction, damping=200.0, x=START, options=TIGHT_OPTIONS):
-    """One full step; infinite friction is the paper's."""
+    """Return one full step; infinite friction follows the paper's rule."""
     params = vrw.WheelParams(damping=damping)
     model = vrw.UnilateralWheel(friction=friction, infinite_friction_rule="paper")
     return vrw.step(params, x, model=model, options=options)
@@ -60,7 +60,7 @@ def compute_step(friction, damping=200.0, x=START, options=TIGHT_OPTIONS):
 
 @pytest.fixture(scope="module")
 def scene_traces():
-    """The motion of each scene, phase by phase, with what it loses."""
+    """Return the motion of each scene by phase, with its energy losses."""
     result_by_name = {}
     for name, (friction, damping, dtheta) in STEP_SCENES.items():
         wheel, params = vrw.UnilateralWheel(friction=friction), vrw.WheelParams(damping=damping)
@@ -70,7 +70,7 @@ def scene_traces():
 
 
 def iterate_phases(params, trace):
-    """Motions and tallies (samples first) of the phases that happened."""
+    """Yield motions and accumulators, samples first, of the phases that occur."""
     for k in np.flatnonzero(np.asarray(trace.duration) > 0.0):
         motion, tally = jax.vmap(unpack_state)(trace.state[k])
         yield k, motion, tally
@@ -173,7 +173,7 @@ def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
 
 
 def make_reference_start(x):
-    """A full section state as the time-stepping code wants it."""
+    """Return a full section state in the form of the time-stepping reference."""
     theta = float(x[0]) - moreau_jean.ALPHA
     L, dL, code = (np.roll(x[4 + 8 * i : 12 + 8 * i], 1) for i in range(3))
     hub = [L[0] * np.sin(theta), L[0] * np.cos(theta), theta]
@@ -243,7 +243,7 @@ def make_contact_law(s, friction):
 
 
 def make_resting_motion(theta, **changes):
-    """A wheel at rest on legs of length L0, the lower foot on the slope."""
+    """Return a wheel at rest on legs of length L0, with the lower foot on the slope."""
     zero = jnp.zeros(())
     height = jnp.maximum(jnp.cos(theta), jnp.cos(theta + math.pi / 4))
     motion = WheelMotion(

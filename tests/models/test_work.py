@@ -1,4 +1,4 @@
-"""Work and accuracy of the defaults can't get worse unseen: counts and errors, never a clock."""
+"""Work and accuracy of the default options are limited by counts and errors, without a clock."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""The documented face: any field, guards and resets; closed forms, and what it refuses."""
+"""The documented interface for any field, guards and resets: closed forms and errors."""
 
 import re
 from pathlib import Path
@@ -158,7 +158,8 @@ def make_switching_system(rate):
 
 
 def make_crossing_system(field, start, behind, angle, events):
-    """Guards on y[0] = 1/2 both ways, of y[0] that falls there at `behind` + `angle` + 2 pi k."""
+    """Return guards on y[0] = 1/2 in both directions; y[0] falls there at `behind` + `angle` + 2 pi
+    k."""
     halves = [
         Guard(lambda y: y[0] - 0.5, target_mode=1),
         Guard(lambda y: 0.5 - y[0], target_mode=0),
@@ -169,7 +170,7 @@ def make_crossing_system(field, start, behind, angle, events):
 
 
 def make_rotating_field(rate):
-    """y' = rate (cos t - y) of a rotation: its cosine, a little smaller and later."""
+    """Return y' = rate (cos t - y) with a rotation as clock; y is a cosine, smaller and later."""
     field = lambda y: jnp.stack([rate * (y[1] - y[0]), -y[2], y[1]])
     size = rate**2 / (1.0 + rate**2)  # cos of the lag times the amplitude
     angle = np.arccos(0.5 / np.sqrt(size))
@@ -177,7 +178,7 @@ def make_rotating_field(rate):
 
 
 def make_attracted_field(rate):
-    """Prothero and Robinson's: y = cos t, to which the field pulls."""
+    """Return the field of Prothero and Robinson, which attracts to y = cos t."""
     field = lambda y: jnp.stack([-rate * (y[0] - jnp.cos(y[1])) - jnp.sin(y[1]), 1.0 + 0.0 * y[1]])
     return make_crossing_system(field, [1.0, 0.0], 0.0, np.pi / 3.0, 10)
 

@@ -1,4 +1,4 @@
-"""Events of a phase, on flows whose event times are known in closed form."""
+"""Events of a phase, on flows with event times in closed form."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ TIGHT_OPTIONS = vrw.StepOptions.tight()
 
 
 def clock_field(y):
-    """y = (t, s) with t the time and s a second coordinate: t' = 1, s' = cos t."""
+    """Return the rates of y = (t, s), with t the time and s a second coordinate: t' = 1, s' = cos
+    t."""
     return jnp.stack([jnp.ones_like(y[0]), jnp.cos(y[0])])
 
 

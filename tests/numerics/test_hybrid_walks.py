@@ -1,4 +1,4 @@
-"""How walks through modes end, what their clock is worth, and how they are compiled."""
+"""Walks through modes: their ends, the error of their event times, and their compilation."""
 
 from fractions import Fraction
 
@@ -24,7 +24,7 @@ TIGHT = vrw.StepOptions.tight()
 
 
 def turn(y):
-    """Rate of a rotation by one radian per second."""
+    """Return the rate of a rotation by one radian per second."""
     return jnp.stack([y[1], -y[0]])
 
 
@@ -142,7 +142,7 @@ def test_the_derivative_of_a_long_walk_s_clock_loses_no_digit():
 
 
 def bouncing(restitution=0.8, lift=0.0):
-    """A ball whose floor adds `lift` to the rate that it gives back."""
+    """Return a ball whose floor adds `lift` to the rate after a bounce."""
     fall = lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]])
     bounce = lambda y: jnp.stack([0.0 * y[0], lift - restitution * y[1]])
     return fall, Guard(lambda y: y[0], bounce)

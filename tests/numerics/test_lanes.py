@@ -1,4 +1,4 @@
-"""Batches of any size are run in few shapes; derivatives of lanes take all directions together."""
+"""Batches of any size run in few shapes; derivatives of lanes use all directions together."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ TRACED_CALLS = []
 
 
 def product_in_a_loop(x, y):
-    """x y^3."""
+    """Return x y^3."""
     TRACED_CALLS.append(x)
     return lax.fori_loop(0, 3, lambda _, value: value * y, x)
 

@@ -1,4 +1,4 @@
-"""Floquet multipliers of small maps: closed forms, derivatives, and where they meet."""
+"""Floquet multipliers of small maps: closed forms, derivatives, and equal multipliers."""
 
 import jax
 import jax.numpy as jnp

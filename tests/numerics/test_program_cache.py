@@ -1,4 +1,4 @@
-"""Programs that are compiled once and programs that are not shared; JAX logs its compilations."""
+"""Programs are compiled once where they may be shared; JAX logs its compilations."""
 
 import functools
 import logging

@@ -14,7 +14,7 @@ RESTITUTION = 0.8
 
 
 def balls(n):
-    """Balls beside each other in one mode, heights first, with a guard each."""
+    """Return a mode of balls side by side, heights first, with a guard for each."""
 
     def bounce(i):
         return lambda y: y.at[i].set(0.0).at[n + i].set(-RESTITUTION * y[n + i])

@@ -1,4 +1,4 @@
-"""Explicit methods are diffrax's to the last digit, and a step does not load diffrax."""
+"""Explicit methods have diffrax's coefficients, and a step does not import diffrax."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from vrw_jax.numerics.options import SOLVER_NAMES
 
 
 def read_tableau(name):
-    """A row of `tableaus.json`: what it is made of, and None for methods that are not explicit."""
+    """Return an entry of `tableaus.json`; None for methods that are not explicit."""
     solver_class = getattr(diffrax, name)
     given = getattr(solver_class, "tableau", None)
     if given is None or not hasattr(given, "a_lower"):

@@ -1,1 +1,1 @@
-"""Independent oracle of the wheel: shares no code and no derivation with the library."""
+"""Independent references of the wheel, which share no code and no derivation with the library."""

@@ -1,10 +1,11 @@
-"""Oracle of the unilateral rung: event-driven in all eleven coordinates, dense, NumPy and SciPy.
+"""Reference of unilateral contact: event-driven in eleven coordinates, dense, in NumPy and SciPy.
 
-Hub (x, z), theta and all lengths stay coordinates; contacts and stoppers are multipliers on the
-dense mass matrix. Whatever touches at an event is one complementarity problem, every mode of which
-is solved: with impulses where something strikes, then with forces. Where rounding leaves several,
-each is followed for a microsecond: the one whose signs hold there is right. Shares no code with the
-library. Legs are in the labels of the step that begins.
+The coordinates are those of the hub (x, z), theta and all lengths. Contacts and stoppers are
+multipliers on the dense mass matrix. At an event all touching feet and legs form one
+complementarity problem, of which every mode is solved: with impulses if a foot or leg strikes, then
+with forces. If rounding admits several modes, each is followed for a microsecond, and the mode
+whose signs hold is right. The module shares no code with the library. Labels of legs are those of
+the starting step.
 """
 
 import itertools

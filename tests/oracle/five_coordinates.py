@@ -1,8 +1,8 @@
-"""The paper's wheel in its own five coordinates: an oracle that shares no code with the library.
+"""The paper's wheel in the paper's five coordinates: a reference without code of the library.
 
 Coordinates q = (x, z, theta, L1, L2) with Lagrange multipliers, eqs (1)-(29) and the procedure
-(A1)-(A4), (B1)-(B3) of Section 5, misprints mended. The equations of motion are generated from the
-Lagrangian (``derive_five_coordinates.py``) and integrated by SciPy's DOP853. An event is located
+(A1)-(A4), (B1)-(B3) of Section 5, with misprints corrected. The equations of motion follow from the
+Lagrangian (``derive_five_coordinates.py``), and SciPy's DOP853 integrates them. An event is located
 by Newton's method on integrations that end at the event time, so its state carries the error of
 the integrator, not that of the interpolant.
 

@@ -1,9 +1,10 @@
-"""Oracle of the unilateral rung: Moreau-Jean time stepping in eleven coordinates, dense, in NumPy.
+"""Reference of unilateral contact: Moreau-Jean time stepping in eleven coordinates, in NumPy.
 
-No events, no modes: every step solves Signorini's and Coulomb's laws for the velocities at its end
-by projected Gauss-Seidel. First order in the step. Shares no code with the library. Legs are in the
-labels of the step that begins; a leg in the air that reaches its stopper stays on it until its foot
-is loaded, a leg on the ground has a one-sided stopper. `one_sided`: so have all legs.
+There are no events and no modes. Each time step solves the laws of Signorini and Coulomb for the
+velocities at its end by projected Gauss-Seidel. The method has first order. It shares no code with
+the library. Labels of legs are those of the starting step. A leg in the air that reaches its
+stopper stays on it until its foot carries load. A leg on the ground has a one-sided stopper; with
+`one_sided`, all legs have.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The oracle itself: its equations hold, its two forms agree, it meets the stored truth."""
+"""The references satisfy their equations, agree with each other and reproduce the stored values."""
 
 from __future__ import annotations
 

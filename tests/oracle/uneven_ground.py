@@ -1,11 +1,11 @@
-"""The paper's wheel on uneven ground, in an absolute frame: an oracle without turning frames.
+"""Reference of the paper's wheel on uneven ground, in one absolute frame.
 
-The five coordinates of ``five_coordinates`` with x horizontal, z upwards and theta from the
-vertical, so that gravity is vertical and no slope enters the equations of motion. Straight lines
-join the footholds: line k, of slope phi[k], leads from foothold k - 1 to foothold k. Feet stay
-where they landed. Step k begins with the landing on foothold k; its rear foot leaves where the
-ground no longer presses it along the normal of line k, and it ends where the next foot meets line
-k + 1, which begins at foothold k.
+The coordinates are those of ``five_coordinates``, with x horizontal, z upwards and theta from the
+vertical. Gravity is vertical, and no slope enters the equations of motion. Straight lines join the
+footholds: line k, of slope phi[k], leads from foothold k - 1 to foothold k. Feet stay at their
+footholds. Step k starts with the landing on foothold k. Its rear foot leaves when the ground stops
+pressing along the normal of line k. The step ends when the next foot meets line k + 1, which starts
+at foothold k.
 """
 
 from __future__ import annotations

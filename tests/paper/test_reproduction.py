@@ -1,4 +1,4 @@
-"""The paper comes out: each published fact holds, each can fail, and the figures are written."""
+"""The published facts of the paper hold, each check can fail, and the figures are written."""
 
 import csv
 import dataclasses
@@ -104,7 +104,7 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
 
 
 def _scale_results(results: xr.Dataset, factor: float) -> xr.Dataset:
-    """All numbers but the coordinates times a factor."""
+    """Return the results with all numbers but the coordinates multiplied by a factor."""
     return results.map(
         lambda v: v * factor if v.dtype.kind == "f" else v, keep_attrs=True
     ).assign_attrs(results.attrs)

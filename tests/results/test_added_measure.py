@@ -1,4 +1,4 @@
-"""A measure added as the how-to says works everywhere that measures have names."""
+"""A measure added as the how-to describes works everywhere that measures have names."""
 
 import json
 import os
@@ -42,7 +42,7 @@ print(json.dumps({
 
 
 def changed(source: str, change: str) -> str:
-    """The source with the lines of a change that begin with + inserted below the others."""
+    """Return the source with the lines of a change that begin with + inserted below the others."""
     lines = change.splitlines(keepends=True)
     below = "".join(line[1:] for line in lines if line.startswith(" "))
     added = "".join(line[1:] for line in lines if line.startswith("+"))

@@ -1,4 +1,4 @@
-"""Quantities say what they are called, what breaks below zero, and print themselves."""
+"""Measures state their names and the meaning of a negative value, and print themselves."""
 
 import pytest
 

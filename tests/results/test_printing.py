@@ -1,4 +1,4 @@
-"""Results print numbers with symbols and units, as text and tables; help says what fields mean."""
+"""Results print numbers with symbols and units, as text and tables; help describes the fields."""
 
 import dataclasses
 import pydoc

@@ -11,7 +11,7 @@ DIRECTION = DIRECTION / np.linalg.norm(DIRECTION)
 
 
 def estimate_probability(fails, n_samples=40_000):
-    """Probability of a region by samples of the fitted density, and its standard error."""
+    """Return a region's probability by samples of the fitted density, and its standard error."""
     random, n = np.random.default_rng(0), len(DIRECTION)
     density = fit_failure_density(lambda e: (fails(e), fails(e)), n, random)
     deviations = density.draw_samples(n_samples, random)

@@ -1,4 +1,4 @@
-"""First passage: published values, extended precision, counts, gradients, bad input."""
+"""First passage: published values, extended precision, counts, gradients and bad input."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ MEAN_STEPS = {
 
 
 def solve_in_extended_precision(slope_sd, n_nodes=200):
-    """Mean steps by the same kernel in 80-bit numbers, without the difference 1 - kappa_1."""
+    """Return mean steps by the same kernel in 80-bit numbers, without the form 1 - kappa_1."""
     wide, half, mean = np.longdouble, np.longdouble(np.pi) / 8, np.longdouble(8.0 * DEGREE)
     kept, gravity = wide(0.5), wide(2.0)
     cosine, sine = (1 - kept) * np.cos(half), (1 + kept) * np.sin(half)
@@ -108,7 +108,7 @@ def test_the_papers_wheel_lasts_as_long_as_an_independent_code_counts(slope_sd, 
 
 
 def count_failure_share(params, slope_sd, n_walkers, n_steps):
-    """Failures per step of the paper's wheel, and their standard error, without any bias."""
+    """Return failures per step of the paper's wheel, and their standard error, without bias."""
     random, mean = np.random.default_rng(5), float(params.slope)
     start = np.tile(np.asarray(vrw.limit_cycle(params).section_state), (n_walkers, 1))
     states, slopes, ages = start, np.full(n_walkers, mean), np.zeros(n_walkers, int)

@@ -1,4 +1,4 @@
-"""What is executed from the cache is what was put there, by the user, under that very name."""
+"""Only code that the user stored under the same name is executed from the cache."""
 
 import os
 import stat
@@ -29,7 +29,7 @@ FACTORS = (2.0, 3.0)
 
 @pytest.fixture
 def folder(tmp_path):
-    """A cache of the test's own."""
+    """Return a cache folder of the test."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compilation_cache.reset_cache()
@@ -45,7 +45,7 @@ def process(monkeypatch):
 
 
 def multiples():
-    """The numbers of X times each factor, by machine code and by a trace that calls some."""
+    """Return the numbers of X times each factor, by machine code and by a trace that calls it."""
     results = []
     for factor in FACTORS:
         lanes = lambda _, x, factor=factor: (factor * x[0],)
@@ -63,7 +63,8 @@ def expected():
 
 
 def check_recompiles(process, warns=True):
-    """The right numbers in a later process, with one warning at most, and then without any."""
+    """Require right numbers in a later process, with one warning at most, and then without a
+    warning."""
     for again in range(2):
         process.reset_registry()
         store._warned_kinds.clear()
@@ -190,7 +191,7 @@ def test_a_record_that_can_t_be_written_whole_leaves_nothing(folder, monkeypatch
 
 
 def started(code="", **environment):
-    """A process under an umask of 0, which starts JAX."""
+    """Run a process under an umask of 0 that starts JAX."""
     lines = f"import os; os.umask(0); import vrw_jax as vrw; {code or 'vrw.start_jax()'}"
     outside = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     return subprocess.run(

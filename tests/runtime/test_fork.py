@@ -1,4 +1,4 @@
-"""A child by fork would wait for ever for JAX's threads: it is told so instead, in one sentence."""
+"""A forked child that needs JAX's threads gets an error of one sentence and does not block."""
 
 import json
 import os
@@ -74,7 +74,7 @@ if __name__ == "__main__":
 
 
 def fork(parent, calls, seconds, tmp_path):
-    """What came of each call in a child of its own, forked by a parent with or without arrays."""
+    """Return the result of each call in a forked child, from a parent with or without arrays."""
     place = tmp_path / "parent.py"
     place.write_text(PROGRAM)
     results = subprocess.run(

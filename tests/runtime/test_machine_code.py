@@ -1,4 +1,4 @@
-"""Machine code is kept beside JAX's own; an edit that changes no trace compiles nothing."""
+"""Machine code is stored beside JAX's; an edit that changes no trace compiles nothing."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 
 @pytest.fixture
 def cache_folder(tmp_path):
-    """A cache of the test's own, in which JAX too keeps whatever it compiles."""
+    """Return a cache folder of the test, in which JAX also stores all its programs."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compilation_cache.reset_cache()  # it may have opened another folder
@@ -38,7 +38,7 @@ def fresh_process(monkeypatch):
 
 
 def make_function(traced):
-    """A program of JAX that calls machine code, and adds to a list when it is traced."""
+    """Return a JAX program that calls machine code, and appends to a list when it is traced."""
     double = cached_lane_function(lambda x: 2.0 * x, lambda x: x, "double")
 
     def run(x):

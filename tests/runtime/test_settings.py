@@ -1,4 +1,4 @@
-"""Settings of JAX that are meant for the caller's code change no number and raise no error."""
+"""JAX settings of the user's code change no number and raise no error."""
 
 import threading
 

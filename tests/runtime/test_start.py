@@ -1,4 +1,4 @@
-"""How a process starts: number format, kept traces, XLA's quick way."""
+"""Start of a process: number format, cached traces and XLA's quick compilation."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ def cache_folder(tmp_path):
 
 
 def make_counted_function():
-    """A function of two arrays, and the list to which each of its traces adds."""
+    """Return a function of two arrays, and the list to which each of its traces appends."""
     traces = []
 
     def function(x, y):

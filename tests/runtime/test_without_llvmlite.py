@@ -1,4 +1,4 @@
-"""Without llvmlite XLA computes the same, and a request for machine code names the library."""
+"""Without llvmlite XLA computes the same; a request for machine code names the missing library."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def test_the_library_is_imported_without_llvmlite():
 
 @pytest.mark.slow
 def test_the_library_computes_without_llvmlite():
-    """Reference: the same by machine code, to the tolerance of a step."""
+    """Reference: machine code, to the tolerance of a step."""
     cache = os.environ.get("VRW_TEST_CACHE", ".jax_cache")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.run(

@@ -1,4 +1,4 @@
-"""Scans to within a tolerance give what `vrw.measure_to_tolerance` gives, sample by sample."""
+"""Scans to a tolerance return what `vrw.measure_to_tolerance` returns for each sample."""
 
 from pathlib import Path
 

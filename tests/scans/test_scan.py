@@ -1,4 +1,4 @@
-"""Scans: they survive being killed, refuse to mix, and a sample's result is its own."""
+"""Scans survive kills, do not mix designs, and compute each sample independently of the others."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""What lies in a store is what was written there, and anyone may read it."""
+"""A store returns what a scan wrote, and other programs can read it."""
 
 import json
 import shutil
@@ -405,7 +405,8 @@ def test_a_damaged_coordinate_that_is_not_swept_is_written_again(complete_store:
 
 
 def as_before_marks_covered_settings(complete_store: Path) -> None:
-    """Makes a store what 0.1's successor wrote: no attributes of marks, marks of files alone."""
+    """Convert a store to the format after version 0.1: no attributes of marks, and marks of files
+    only."""
     edited_root(complete_store, lambda root: inline(root, "bookkeeping").update(attributes={}))
     book = complete_store / "bookkeeping" / "zarr.json"
     book.write_text(json.dumps(json.loads(book.read_text()) | {"attributes": {}}, indent=2))

@@ -1,4 +1,4 @@
-"""Sobol' indices: those of functions whose indices are known in closed form."""
+"""Sobol' indices agree with those of functions with a closed form."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ ISHIGAMI_RANGES = {"damping": (100.0, 200.0), "slope": (0.2, 0.3), "stiffness": 
 
 
 def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
-    """A scan that computes Ishigami's function, and its unit coordinates."""
+    """Return a scan that computes Ishigami's function, and its unit coordinates."""
     design = vrw.saltelli(ISHIGAMI_RANGES, n)
     low, high = np.array(list(ISHIGAMI_RANGES.values())).T
     unit = (np.stack(list(design.values.values()), 1) - low) / (high - low)

@@ -1,4 +1,4 @@
-"""arm64: LLVM makes code of the same text, and an emulator gets the same digits by it."""
+"""LLVM makes arm64 code from the same text, and an emulator computes the same digits."""
 
 import jax.numpy as jnp
 import llvmlite.binding as llvm
@@ -15,7 +15,7 @@ LANES_PER_REGISTER = 2
 
 @pytest.fixture
 def arm_machine(monkeypatch):
-    """Machine code is for arm64 from here on."""
+    """Make machine code for arm64 in the test."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     monkeypatch.setattr(machine, "describe_processor", lambda: ARM_TARGET)
@@ -26,7 +26,7 @@ def compute_roots(a, b):
 
 
 def compute_waves(a, b):
-    """With constants that lie apart from the code, and loops over rows."""
+    """Return waves; the code has constants at other addresses, and loops over rows."""
     return a * 0.1234567 + b, jnp.cumsum(jnp.stack([a, b, a * b, a - b]), axis=0) * 1.7
 
 

@@ -1,4 +1,4 @@
-"""Machine code is kept by its content: what a later start, or another text, finds of it."""
+"""Machine code is stored by its content; a later start or another program finds it."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ def fresh_process(monkeypatch):
 
 
 def make_counted_function(factor=2.0):
-    """A function of lanes, and the list to which each of its traces adds."""
+    """Return a function of lanes, and the list to which each of its traces appends."""
     traces = []
 
     def times(_, lanes):

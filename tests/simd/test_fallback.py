@@ -1,4 +1,4 @@
-"""On a release of JAX that was not tried, the library warns once and XLA computes the same."""
+"""With an untested release of JAX the library warns once, and XLA computes the same."""
 
 import ctypes
 import json

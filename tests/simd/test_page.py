@@ -1,4 +1,4 @@
-"""The page of machine code says what there is: a table of primitives, an example that runs."""
+"""The page of machine code lists all primitives, and its example runs."""
 
 import re
 from pathlib import Path

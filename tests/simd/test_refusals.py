@@ -1,4 +1,4 @@
-"""What machine code can't do is refused in a sentence that names it, and never misread."""
+"""Unsupported operations raise one sentence that names them, and are never compiled wrongly."""
 
 import itertools
 
@@ -16,7 +16,7 @@ X = np.random.default_rng(0).normal(size=(2, 9))
 
 
 def call_program(function, *arrays):
-    """Its results as machine code."""
+    """Return the results of a function as machine code."""
     run = simd.compile_lane_function(function, function, ("refusals", next(KEYS)), None)
     return jax.jit(run)(*map(jnp.asarray, arrays))
 

@@ -1,4 +1,4 @@
-"""Machine code for lanes does what JAX does with the same function."""
+"""Machine code for lanes computes what JAX computes with the same function."""
 
 import itertools
 
@@ -17,7 +17,7 @@ RANDOM_GENERATOR = np.random.default_rng(0)
 
 
 def make_program(function, lanes, uniform=()):
-    """`function(uniform, lanes)` compiled for inputs like these."""
+    """Return `function(uniform, lanes)`, compiled for inputs of these shapes."""
     kinds = [np.asarray(x).dtype for x in uniform]
     return simd.compile_lane_program(
         function, kinds, len(lanes), lanes[0].dtype, ("simd", next(KEYS)), None
@@ -25,7 +25,7 @@ def make_program(function, lanes, uniform=()):
 
 
 def run_both_backends(function, lanes, uniform=()):
-    """Its results as machine code and by JAX, array by array."""
+    """Return the results as machine code and by JAX, for each array."""
     uniform = [np.asarray(x, lanes[0].dtype) for x in uniform]
     compiled = make_program(function, lanes, uniform)(uniform, lanes)
     expected = function(uniform, [jnp.asarray(x) for x in lanes])
@@ -84,7 +84,7 @@ def test_powers_of_step_size_control_have_the_stated_accuracy():
 
 
 def count_collatz_steps(_, lanes):
-    """Steps to 1: every lane ends when it likes."""
+    """Return the number of steps to 1, which differs between lanes."""
     start = lanes[0].astype(jnp.int32)
 
     def turn(state):
@@ -128,7 +128,7 @@ def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monk
 
 
 def use_arrays_in_loops(x):
-    """Small and large arrays; axes moved, cut, joined; sums; loops that carry and stack."""
+    """Use small and large arrays, change axes, slice, join, sum, and carry and stack in loops."""
     table = np.sin(np.arange(240.0)).reshape(12, 20)
     large = jnp.tensordot(jnp.asarray(table, x.dtype), x, 1)  # (12, 3, lanes)
     shifted = jnp.concatenate([large[1::2], large[:6] * 2.0, x[:7]]).swapaxes(
@@ -173,7 +173,7 @@ def use_arrays_in_loops(x):
 
 
 def overwrite_in_loops(x):
-    """Large arrays that loops within loops go on with, while others read what was there."""
+    """Continue large arrays in nested loops, while other code reads their previous values."""
     zero = jnp.zeros((), jnp.int32)
 
     def each(rows, function):
@@ -218,7 +218,7 @@ def test_in_place_updates_of_loops_do_not_change_other_readers():
 
 
 def exchange_in_scan(x):
-    """Loops that read, axes exchanged, what another wrote and what an outer one carries."""
+    """Read in a loop, with exchanged axes, arrays of another loop and the carry of an outer one."""
     write = lambda c, row: (c + row[0], jnp.stack([row * c, row + 1.0, row - c, row * row]))
     written_text = lax.scan(write, x[0, 0], x)[1]  # (20, 4, 3, lanes)
     sums = lax.scan(lambda c, part: (c - part[1, 2], part), x[1, 1], written_text.swapaxes(0, 1))
@@ -233,7 +233,7 @@ def exchange_in_scan(x):
 
 
 def pick_rows(x, large):
-    """A table looked up turn by turn; rows of a large array overwritten by what stands there."""
+    """Look up a table in each turn, and overwrite rows of a large array with its own values."""
     table = jnp.asarray(np.cos(np.arange(144.0)).reshape(12, 12))
 
     def turn(i, rows):

@@ -1,4 +1,4 @@
-"""Functions of lanes as code for WebAssembly, linked and run here as a browser would."""
+"""WebAssembly code of lane functions, linked and run here as in a browser."""
 
 import shutil
 import struct
@@ -14,7 +14,7 @@ from vrw_jax import simd
 
 
 def halve_until(minimum, x):
-    """Turn by turn, each lane its own number of times, until below `least`."""
+    """Halve each lane until it is below the minimum; the lanes need different numbers of turns."""
     goes_on = lambda now: jnp.any(now > minimum)
     return (lax.while_loop(goes_on, lambda now: jnp.where(now > minimum, 0.5 * now, now), x),)
 

@@ -1,1 +1,1 @@
-"""What many tests share: the truth as arrays, compiled steps, small designs."""
+"""Helpers of many tests: reference values as arrays, compiled steps, small designs."""

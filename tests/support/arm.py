@@ -1,4 +1,4 @@
-"""Machine code for arm64 run by an emulator: an object file at its place, and a call of it."""
+"""Run machine code for arm64 in an emulator: load an object file, and call its function."""
 
 import struct
 from typing import NamedTuple
@@ -22,7 +22,8 @@ class Section(NamedTuple):
 
 
 def load_object(code: bytes) -> tuple[bytes, dict[str, int]]:
-    """What lies from CODE on, addresses filled in, and where each symbol is."""
+    """Return the memory from `CODE_ADDRESS` on, with filled-in addresses, and the address of each
+    symbol."""
     start, entry, count = *struct.unpack_from("<Q", code, 40), *struct.unpack_from("<HH", code, 58)
     sections = [
         Section(f[1], f[2], f[4], f[5], f[6], f[7])
@@ -30,7 +31,9 @@ def load_object(code: bytes) -> tuple[bytes, dict[str, int]]:
     ]
     memory, places = bytearray(), {}
     for index, section in enumerate(sections):
-        if section.kind == 1 and section.flags & 2:  # code and data that are there at run time
+        if (
+            section.kind == 1 and section.flags & 2
+        ):  # sections of code and data that exist at run time
             memory += bytes(-len(memory) % 64)
             places[index] = len(memory)
             memory += code[section.offset : section.offset + section.size]
@@ -57,7 +60,7 @@ OFFSET_SHIFTS = {277: 0, 278: 0, 284: 1, 285: 2, 286: 3, 299: 4}
 
 
 def relocate(memory: bytearray, address: int, kind: int, target: int) -> None:
-    """One instruction, or number, that names an address."""
+    """Write an address into an instruction or number of the code."""
     instruction = struct.unpack_from("<I", memory, address)[0]
     instruction_address = CODE_ADDRESS + address
     if kind == 275:  # adrp
@@ -99,7 +102,7 @@ def run_compiled_lanes(
     n = output_shapes[0].shape[-1]
     for register, value in zip(range(5), (*lists, n, 0, n // width), strict=True):
         emulator.reg_write(arm.UC_ARM64_REG_X0 + register, value)
-    emulator.reg_write(arm.UC_ARM64_REG_CPACR_EL1, 3 << 20)  # vectors are on
+    emulator.reg_write(arm.UC_ARM64_REG_CPACR_EL1, 3 << 20)  # enable vector instructions
     emulator.reg_write(arm.UC_ARM64_REG_SP, STACK_ADDRESS)
     emulator.reg_write(arm.UC_ARM64_REG_LR, END_ADDRESS)
     emulator.emu_start(named["lanes"], END_ADDRESS)

@@ -1,4 +1,4 @@
-"""Compiled once, used by many tests: steps of up to sixteen wheels at a time."""
+"""Steps of batches of up to sixteen wheels, compiled once for many tests."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ TIME_LIMIT_CASES = (
 
 
 def make_parameter_rows(**changes):
-    """Rows of parameters: Table 1 with some columns changed."""
+    """Return rows of parameters: those of Table 1 with some columns changed."""
     count = max(np.size(value) for value in changes.values()) if changes else 1
     rows = np.tile(TABLE_1_VALUES, (count, 1))
     for name, value in changes.items():
@@ -55,7 +55,7 @@ OUTCOME_CASES = {
 
 
 def pad_to_batch(rows, width):
-    """Rows repeated to a batch of SIZE, and how many are real."""
+    """Return rows repeated to a batch of `BATCH_SIZE`, and the number of original rows."""
     rows = np.atleast_2d(np.asarray(rows, dtype=float))
     assert rows.shape[1] == width
     assert rows.shape[0] <= BATCH_SIZE
@@ -70,7 +70,7 @@ def _compute_full_steps(vectors, starts, options, model, uses_lane_engine):
 
 
 def compute_full_steps(vectors, starts, options=None, model=None, uses_lane_engine=False):
-    """Full step results of a batch of wheels (rows of parameters) from section states."""
+    """Return the step results of wheels (rows of parameters) from section states."""
     count = max(np.atleast_2d(vectors).shape[0], np.atleast_2d(starts).shape[0])
     result = _compute_full_steps(
         jnp.asarray(pad_to_batch(vectors, 9)),
@@ -83,7 +83,7 @@ def compute_full_steps(vectors, starts, options=None, model=None, uses_lane_engi
 
 
 def compute_state_and_work(vector, start, options):
-    """State and durations, and the solver's steps, of one lean step."""
+    """Return state and durations of a step without margins, and the number of solver steps."""
     result = vrw.ViscoelasticWheel().advance(truth.make_wheel(vector), start, options)
     return jnp.concatenate([result.section_state, result.durations]), result.solver_steps
 

@@ -1,4 +1,4 @@
-"""What a file of another format keeps of a labelled result."""
+"""Check that labeled results keep their content in files of another format."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import xarray as xr
 
 
 def assert_netcdf_round_trip(dataset: xr.Dataset, folder: Path) -> None:
-    """Fails unless every variable and attribute comes back from a netCDF file."""
+    """Fail unless a netCDF file returns every variable and attribute."""
     dataset.to_netcdf(folder / "told.nc")
     reloaded = xr.open_dataset(folder / "told.nc", decode_times=False)
     for name, variable in dataset.variables.items():

@@ -1,7 +1,7 @@
-"""Hostile values for every argument of the public functions, drawn by hypothesis.
+"""Draw invalid values for every argument of the public functions by hypothesis.
 
-Run as a program it draws so many for each call, in a process of its own, where nothing checks
-annotations as the tests do, and prints what is neither answered nor refused by one sentence.
+As a program the module draws a number of values for each call, in a process without the annotation
+checks of the tests. It prints the calls that neither return nor raise an error of one sentence.
 """
 
 import sys
@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 
 def values(hostile):
-    """Whatever may be given for an argument; whole numbers stay small, for they count work."""
+    """Return a strategy for arguments of any type; whole numbers stay small, because they set the
+    work."""
     plain = (
         st.none() | st.booleans() | st.integers(-3, 3) | st.floats() | st.text(max_size=9)
         | st.complex_numbers() | st.binary(max_size=9) | st.dates()
@@ -35,6 +36,7 @@ def values(hostile):
 
 
 def main(examples):
+    """Make the calls, print those that end with a fault, and return their number."""
     from experiments.hardening.random_calls import (
         FAULTS,
         hostile_values,
@@ -42,23 +44,23 @@ def main(examples):
         valid_calls,
     )
 
-    drawn, found = values(hostile_values()), {}
+    argument_values, fault_by_call = values(hostile_values()), {}
     for name, call in valid_calls().items():
 
         @settings(
             max_examples=examples, derandomize=True, database=None, deadline=None,
             phases=[Phase.generate], suppress_health_check=list(HealthCheck),
         )  # fmt: skip
-        @given(st.just(name), st.sampled_from([*call.arguments]), drawn)
+        @given(st.just(name), st.sampled_from([*call.arguments]), argument_values)
         def one(name, argument, value):
             ending = make_call(name, {argument: value})
             if ending.kind in FAULTS:
-                found[name, argument, ending.error[:120]] = ending.kind
+                fault_by_call[name, argument, ending.error[:120]] = ending.kind
 
         one()
-    for place, kind in found.items():
-        print(kind, *place)
-    return len(found)
+    for call, kind in fault_by_call.items():
+        print(kind, *call)
+    return len(fault_by_call)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A registry of machine code that can be emptied, as in another process."""
+"""Replace the registry of machine code by one that can be emptied, as in a new process."""
 
 import jax
 
@@ -10,7 +10,8 @@ _REGISTERED = ffi.LOADED_BY_NAME  # XLA never releases code and accepts one code
 
 
 class CodeRegistrySpy:
-    """Records `names` of registered code; `reset_registry()` gives the state of a new process."""
+    """Record of the `names` of registered code; `reset_registry()` gives the state of a new
+    process."""
 
     def __init__(self, monkeypatch):
         self.names, self._monkeypatch = [], monkeypatch
@@ -31,7 +32,7 @@ class CodeRegistrySpy:
 
 
 class PersistentRegistry(dict):
-    """Loaded code by name; registrations outlive the test."""
+    """Loaded code by name, whose registrations outlive the test."""
 
     def __setitem__(self, name, library):
         _REGISTERED.setdefault(name, library)

@@ -1,8 +1,9 @@
-"""The import graph of a Python package: modules, packages and edges, read from source, never run.
+"""Read the import graph of a Python package from its sources: modules, packages and edges.
 
-Every import counts: inside functions, for type checkers only, by name (`import_module("a.b")`, a
-string that is a module's dotted name), by attribute (`package.module.name`). A name imported
-through an `__init__` file, or by `lazy_import`, also gives an edge to the module that defines it.
+Every import counts: inside functions, for type checkers, by name (`import_module("a.b")`, or a
+string with a module's dotted name) and by attribute (`package.module.name`). A name imported
+through an `__init__` file or by `lazy_import` also gives an edge to the module that defines it. The
+package itself does not run.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""A small design, and a stand-in for the engine that computes its samples."""
+"""A small design, and an arithmetic substitute for the engine that computes samples."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -17,7 +17,7 @@ SMALL_GRID = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspac
 
 
 def evaluate_arithmetically(columns: SampleColumns) -> Mapping[str, np.ndarray]:
-    """A stand-in for the engine, quick and exact: every variable is some function of the sample."""
+    """Return every variable as a function of the sample, in place of the engine."""
     total = np.sum([np.sin(column) for column in columns.values()], axis=0)
     results = {name: total * (i + 1) for i, name in enumerate(MARGIN_MEASURES)}
     for name, margin in MARGIN_MEASURES.items():
@@ -29,7 +29,7 @@ def evaluate_arithmetically(columns: SampleColumns) -> Mapping[str, np.ndarray]:
 
 
 class CountingEngine:
-    """The stand-in, counting its calls and failing at one of them."""
+    """Substitute for the engine that counts its calls, and fails at one of them."""
 
     def __init__(
         self, failing_call: int | None = None, error: type[BaseException] = KeyboardInterrupt
@@ -49,7 +49,7 @@ def run_plan(
     evaluate: Callable | None = None,
     **keywords: object,
 ) -> xr.Dataset:
-    """A scan whose samples `evaluate` computes in the engine's stead, in turn."""
+    """Return a scan whose samples `evaluate` computes in order, in place of the engine."""
 
     def compute_in_order(running_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
         for index in missing:

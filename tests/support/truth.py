@@ -1,4 +1,4 @@
-"""The high-precision truth of tests/oracle/truth.json as arrays; its generator stands beside it."""
+"""Reference values of tests/oracle/truth.json as arrays; `oracle.make_truth` generates the file."""
 
 import json
 from pathlib import Path
@@ -15,12 +15,12 @@ REFERENCE_CASES: list[dict[str, Any]] = json.loads(
 
 
 def to_floats(value: Any) -> np.ndarray:
-    """Nested lists of decimal strings as float64."""
+    """Return nested lists of decimal strings as a float64 array."""
     return np.asarray(value, dtype=float)
 
 
 def stack_quantity(part: str, key: str) -> np.ndarray:
-    """One quantity of every case, cases first."""
+    """Return one quantity of all cases, with the cases along the first axis."""
     return np.stack([to_floats(case[part][key]) for case in REFERENCE_CASES])
 
 
@@ -31,17 +31,17 @@ REFERENCE_PARAMETERS = np.stack(
 
 
 def make_wheel(vector: Any) -> WheelParams:
-    """Parameters from a vector in the order of `PARAMETER_NAMES`."""
+    """Return the parameters from a vector in the order of `PARAMETER_NAMES`."""
     return WheelParams(**dict(zip(PARAMETER_NAMES, vector, strict=True)))
 
 
 def make_wheels(matrix: Any) -> WheelParams:
-    """A batch of parameters from rows."""
+    """Return a batch of parameters from rows."""
     return make_wheel(jnp.asarray(matrix).T)
 
 
 def compute_scaled_error(values: Any, reference: np.ndarray) -> float:
-    """Largest error, relative where the truth exceeds 1."""
+    """Return the largest error, relative if the reference exceeds 1."""
     return float(
         np.max(np.abs(np.asarray(values) - reference) / np.maximum(np.abs(reference), 1.0))
     )

@@ -1,4 +1,4 @@
-"""The code inside docs/wheel.html, run here by wasmtime as a browser runs it."""
+"""Run the code inside docs/wheel.html with wasmtime, as a browser runs it."""
 
 import ctypes
 import gzip
@@ -17,27 +17,30 @@ PAGE_PATH = Path(__file__).parents[2] / "docs" / "wheel.html"
 
 
 class PageCode:
-    """The page's functions for wheels with so many legs; lanes are the last axis."""
+    """Functions of the page for wheels with one number of legs; lanes are the last axis."""
 
     def __init__(self, n_legs: int) -> None:
         self.modules = WasmModule(str(n_legs)), WasmModule(SHARED_MODULE_NAME)
         self.facts = self.modules[0].facts
 
     def __call__(self, name: str, *given: Any) -> list[np.ndarray]:
-        """Call the function; see `WasmModule`."""
+        """Call a function; see `WasmModule`."""
         [owner] = [module for module in self.modules if name in module]
         return owner(name, *given)
 
 
 class WasmModule:
-    """One of the page's codes."""
+    """One WebAssembly module of the page."""
 
     def __init__(self, name: str) -> None:
         wasmtime = pytest.importorskip("wasmtime", reason="wasmtime runs the page's code here")
         page = PAGE_PATH.read_text(encoding="utf-8")
         self.facts = read_page_content(page, FACTS)
         code = gzip.decompress(unpack_bytes(read_page_content(page, CODE)[name]))
-        self._store, self._kept = wasmtime.Store(), []  # what it calls must outlive it
+        self._store, self._kept = (
+            wasmtime.Store(),
+            [],
+        )  # The functions that the module calls must outlive it.
         module = wasmtime.Module(self._store.engine, code)
         float_type = wasmtime.FuncType([wasmtime.ValType.f64()], [wasmtime.ValType.f64()])
         self.imports = [needed.name for needed in module.imports]
@@ -53,8 +56,10 @@ class WasmModule:
         return name in self._exports
 
     def _make_callback(self, kind: Any, function: Callable[[float], float]) -> Any:
-        """A function of a number, called without the checks of `wasmtime.Func`: these take thirty
-        times as long, and a sine is needed a million times."""
+        """Return a callback of one number without the checks of `wasmtime.Func`.
+
+        The checks take thirty times as long, and a run needs a million sines.
+        """
         from wasmtime import Func, _bindings
 
         def call(_env: Any, _caller: Any, values: Any, _n: int) -> int:

@@ -1,7 +1,7 @@
-"""Wrong uses of the library, each with the type of its error and words of its message.
+"""Wrong calls of the library, each with the type of its error and words of its message.
 
-As a program it runs them all in a process without the annotation checks of the tests, and prints
-{name: [error type, message, file that raised it]}.
+As a program the module makes all calls in a process without the annotation checks of the tests. It
+prints {name: [error type, message, file that raised it]}.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Tuning ends at optima that nothing nearby beats, keeps what it must, and says what it met."""
+"""Tuning ends at optima that no neighbor improves, keeps its constraints and reports its end."""
 
 import itertools
 
@@ -76,7 +76,7 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
 
 
 def find_max_dls_gait(tuned: TuneResult):
-    """The gait at a result, evaluated afresh and from no neighbour."""
+    """Return the gait at a result, computed without a guess."""
     problem = make_problem("dls_fraction")
     u = (
         np.array([float(getattr(tuned.params, n)) for n in FREE_PARAMETERS]) - problem.lower

@@ -1,4 +1,4 @@
-"""Starts are sorted by where they end: which orbit attracts them, or how they fall."""
+"""Starts are classified by their end: the orbit that attracts them, or their fall."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Derivatives of the return map: forwards, in reverse, by differences and by saltation agree."""
+"""Derivatives of the return map agree: forward, reverse, by differences and by saltation."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""One step, two engines: machine code and diffrax tell the same, values and derivatives."""
+"""The machine-code and the diffrax engine agree on one step, in values and derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ TIGHT_OPTIONS = vrw.StepOptions(rtol=1e-13, atol=1e-13, max_phase_time=MAX_PHASE
 
 
 def draw_box(n, seed):
-    """Wheels and starts of a wide box: many step, some fall in every way."""
+    """Return wheels and starts of a wide box: many step, and some fall in every way."""
     random = np.random.default_rng(seed)
     table = {
         name: np.full(n, float(getattr(vrw.WheelParams(), name))) for name in PARAMETER_DOMAINS
@@ -34,7 +34,7 @@ def draw_box(n, seed):
 
 
 def flatten_derivatives(by_input):
-    """Derivatives of state and durations by everything, (lanes, 6, 12)."""
+    """Return the derivatives of state and durations by all inputs, (lanes, 6, 12)."""
     columns = [
         np.concatenate([by_input[name].section_state, by_input[name].durations], 1).reshape(
             len(by_input[name].durations), 6, -1

@@ -1,4 +1,4 @@
-"""Trajectories on real ground: forces are momentum's, labels pass on, what is lost is told."""
+"""Trajectories with unilateral contact: forces change momentum, labels shift, losses count."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ def sampled_walk() -> xr.Dataset:
 
 
 def split_into_intervals(sampled_walk: xr.Dataset) -> list[xr.Dataset]:
-    """Between one event and the next."""
+    """Return the samples between two events, for each interval."""
     return [
         sampled_walk.isel(time=slice(begin, begin + N_SAMPLES))
         for begin in range(0, sampled_walk.sizes["time"], N_SAMPLES)
@@ -36,7 +36,7 @@ def split_into_intervals(sampled_walk: xr.Dataset) -> list[xr.Dataset]:
 
 
 def compute_center_of_mass(part: xr.Dataset) -> np.ndarray:
-    """Moments of mass along x and z, kg m, from where the paper puts each mass."""
+    """Return the moments of mass along x and z, kg m, with each mass at the paper's position."""
     angles = part.theta.values[:, None] + 2.0 * math.pi / 8 * np.arange(8)
     reach = part.length.values - float(PARAMS.leg_com)
     leg = float(PARAMS.leg_mass)

@@ -1,4 +1,4 @@
-"""Bad input gets one clear sentence: what was given, what is allowed, what to do."""
+"""Bad input raises one clear sentence: the given value, the allowed values, the remedy."""
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,8 @@ def test_float32_is_refused_at_tolerances_it_cannot_resolve():
 
 @pytest.fixture
 def switched_off():
-    """A wheel, lanes of wheels, a start and a gait of 64 bits, after which JAX goes back to 32."""
+    """Return a wheel, lanes of wheels, a start and a gait of 64 bits, and then switch JAX to 32
+    bits."""
     made = (
         vrw.WheelParams(),
         vrw.WheelParams(damping=np.array([100.0, 150.0])),

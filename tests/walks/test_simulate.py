@@ -1,4 +1,4 @@
-"""Trajectories: what is planted stands, what is lost was dissipated, forces are momentum's."""
+"""Trajectories: planted feet do not move, lost energy is dissipated, forces change momentum."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -31,7 +31,7 @@ def _phases(sampled_walk: xr.Dataset) -> list[xr.Dataset]:
 
 
 def _integral(values: np.ndarray, time: np.ndarray) -> float:
-    """Simpson's rule over equal intervals: error of fourth order, some 1e-8 here."""
+    """Return Simpson's rule over equal intervals: an error of fourth order, some 1e-8 here."""
     h = (time[-1] - time[0]) / (time.size - 1)
     weights = np.ones(time.size)
     weights[1:-1:2], weights[2:-1:2] = 4.0, 2.0

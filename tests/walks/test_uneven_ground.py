@@ -1,4 +1,4 @@
-"""Uneven ground: independent codes in an absolute frame, energy, derivatives, plain calls."""
+"""Uneven ground: independent references in an absolute frame, energy, derivatives, simple calls."""
 
 import itertools
 

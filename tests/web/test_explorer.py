@@ -1,4 +1,4 @@
-"""`vrw.explore`: the wheel that is shown is read and set from Python."""
+"""`vrw.explore`: Python reads and sets the parameters of the displayed wheel."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""The code in docs/wheel.html gives what the library gives: it is the library's own step."""
+"""The code in docs/wheel.html is compiled from the library's step, and returns the same numbers."""
 
 import functools
 
@@ -35,7 +35,7 @@ def make_page_code(n_legs):
 
 
 def draw_wheels(n):
-    """Wheels and starts far and wide: half of them near Table 1's gait."""
+    """Return wheels and starts of wide ranges; half of the starts are near Table 1's gait."""
     random = np.random.default_rng(7)
     draw = lambda ranges: np.stack([random.uniform(*limits, n) for limits in ranges])
     wheels, starts = draw(RANGES.values()), draw(STARTS)
@@ -215,7 +215,7 @@ def test_unilateral_steps_of_ten_thousand_wheels_equal_the_librarys(n, n_legs):
 
 
 def compute_page_steps(n_legs, friction, wheels, state, stretches=None):
-    """The page's way through a step: from event to event, until none is under way."""
+    """Return steps computed as the page does, from event to event until all wheels finish."""
     page, given = make_page_code(n_legs), [float(vrw.StepOptions().rtol), friction]
     form = page.facts["ground"][str(n_legs)]
     rows = [form["lane"], 7 + 4 * n_legs, form["section"] + len(page.facts["groundTold"])]
@@ -251,7 +251,7 @@ def assert_same_unilateral_steps(n, n_legs):
     [state] = make_page_code(n_legs)("ground_begun", [], [wheels, starts], [((size,), np.float64)])
 
     def both(wheels, state):
-        """Numbers and outcomes of the page, then of the library."""
+        """Return numbers and outcomes of the page, then those of the library."""
         numbers, codes = compute_page_steps(n_legs, friction, wheels, state)
         steps = vrw.step_batch(make_wheels(wheels, n_legs), state.T, model=model)
         known_values_2 = np.concatenate([steps.section_state, steps.durations], 1).T

@@ -1,4 +1,4 @@
-"""docs/wheel.html in a real browser: sliders move, numbers follow, nothing is cut off."""
+"""docs/wheel.html in a real browser: sliders move, numbers follow, and nothing is cut off."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ TIMEOUT_MILLISECONDS = 120_000
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    """A Chromium of this machine, with nothing of anyone's in it."""
+    """Return a Chromium of this machine with an empty profile."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="playwright drives the browser: pip install playwright"
     )
@@ -45,14 +45,14 @@ def browser(tmp_path_factory):
 
 
 def record_requests(address, complaints):
-    """The page has all that it needs inside."""
+    """Record requests; the page contains everything that it needs."""
     if not address.startswith(("file:", "blob:", "data:")):
         complaints.append(address)
 
 
 @pytest.fixture
 def page(browser):
-    """The page, opened from its file; what it complains of fails the test."""
+    """Return the page, opened from its file; any console message fails the test."""
     shown_values, complaints = browser.new_page(), []
     shown_values.on("pageerror", lambda error: complaints.append(str(error)))
     shown_values.on(

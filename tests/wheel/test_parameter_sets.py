@@ -1,4 +1,4 @@
-"""Named parameter sets walk as their source states, and are usable by name."""
+"""Named parameter sets walk as their source states, and can be selected by name."""
 
 import pytest
 

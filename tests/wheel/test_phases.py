@@ -42,7 +42,7 @@ each = pytest.mark.parametrize("index", range(3), ids=NAMES)
 
 
 def make_state_at(index, distance=STATE_DISTANCE, stop_at_lift_off=True):
-    """A phase, and coordinates and rates in it."""
+    """Return a phase, and coordinates and rates in it."""
     q, v = (tuple(map(jnp.asarray, x)) for x in PHASE_STATES[index])
     return make_phases(SYMBOLS, distance, stop_at_lift_off)[index], q, v
 
@@ -208,7 +208,7 @@ def end_by_lane_engine():
 
 
 def end_by_step_collocation():
-    """Again and again, as the duration is not known beforehand."""
+    """Collocate repeatedly, because the duration is not known before."""
     phase, q, v = make_state_at(2)
     run = jax.jit(lambda q, v, T: fixed_work.collocate_phase(phase, q, v, T, PhaseMesh(2, 1.0)))
     duration = jnp.asarray(0.2, float)  # of no weak type, as what comes back
@@ -219,7 +219,7 @@ def end_by_step_collocation():
 
 
 def end_by_cycle_collocation():
-    """Newton's method on the angle of the event."""
+    """Apply Newton's method to the angle of the event."""
     phase = sequence.held_landing_sequence(PARAMS.n_legs).phases[2]
     constants = sequence.compute_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     _, q, v = make_state_at(2)
