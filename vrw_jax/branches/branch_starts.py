@@ -38,6 +38,7 @@ class BranchRequest(NamedTuple):
     period_n: int
     cycle_options: CycleOptions | None
     step_options: StepOptions
+    reads_force_peaks: bool = False  # whether its points have the measures of the gait's force
 
 
 class BranchStart(NamedTuple):
@@ -108,7 +109,12 @@ def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
         return FindLimitCycle(finder, request.model, name, wheel, guess, point.z, point.p)
 
     return BranchStart(
-        CollocationProblem(system=system, parameter_name=name, additional_quantities=None),
+        CollocationProblem(
+            system=system,
+            parameter_name=name,
+            additional_quantities=None,
+            reads_force_peaks=request.reads_force_peaks,
+        ),
         BranchWheel(params, start_cycle.collocation_state.phase_active),
         jax.vmap(lambda solution: transfer_to_mesh(start_cycle.system, system, solution))(
             start_cycle.collocation_state.solution

@@ -44,6 +44,7 @@ from vrw_jax.cycles import (
     resolve_model,
 )
 from vrw_jax.measures import (
+    FORCE_PEAK_MEASURES,
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     STEP_MEASURES,
@@ -53,13 +54,14 @@ from vrw_jax.measures import (
     measure_attrs,
     provenance,
 )
-from vrw_jax.models import AbstractWheel
+from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, batch_sizes, take_rows
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import refuse_ladder
 from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
 from vrw_jax.validation import (
+    check_bool,
     check_callable,
     check_int,
     check_not_traced,
@@ -73,6 +75,9 @@ from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_n
 INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the order of events changes and the branch ends."""
+
+SECOND_PEAK_NAME = "second_peak_rate"
+"""Measure of the gait's force whose zero is the special point at which a second peak appears."""
 
 DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
 """Advice in the error for a caller who differentiates a branch."""
@@ -114,7 +119,11 @@ class GaitContinuation(AbstractContinuation):
         *BRANCH_ENDING_QUANTITIES,
         FRICTION_SURPLUS_COLUMN,
     )
-    margin_names: ClassVar[tuple[str, ...]] = (*INDICATOR_NAMES, *MARGIN_MEASURES)
+    margin_names: ClassVar[tuple[str, ...]] = (
+        *INDICATOR_NAMES,
+        *MARGIN_MEASURES,
+        SECOND_PEAK_NAME,
+    )
     linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
     """Names of margins that vanish as a cube, with the quantity that vanishes linearly at the
     same point. A foot that takes off less steeply descends less deeply, until it rises immediately.
@@ -183,6 +192,7 @@ def continue_branch(
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
+    force_peaks: bool = False,
 ) -> Branch:
     """Return the branch of limit cycles through `params` along a parameter within `bounds`.
 
@@ -214,6 +224,9 @@ def continue_branch(
         options: `ArclengthOptions` of the branch.
         cycle_options: options of the gaits.
         step_options: options of the checking steps, and of the gaits of other models.
+        force_peaks: for the paper's model, add the measures of the gait's force. The wheel at which
+            a second peak appears, with first and second time derivative of the force zero at one
+            instant, is then the special point "second_peak_rate".
 
     Returns:
         A `Branch`. If there is no gait to start from, its `outcome` is the reason.
@@ -235,7 +248,7 @@ def continue_branch(
     (branch,) = continue_branches(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=check_model(resolve_model(params, model)),
-        cycle_options=cycle_options, step_options=step_options,
+        cycle_options=cycle_options, step_options=step_options, force_peaks=force_peaks,
     )  # fmt: skip
     return branch
 
@@ -252,6 +265,7 @@ def continue_branches(
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
+    force_peaks: bool = False,
 ) -> tuple[Branch, ...]:
     """Return `continue_branch` of a batch of wheels; every parameter has one leading axis.
 
@@ -268,6 +282,7 @@ def continue_branches(
         options: `ArclengthOptions` of the branches.
         cycle_options: options of the gaits.
         step_options: as in `continue_branch`.
+        force_peaks: as in `continue_branch`.
 
     Returns:
         One `Branch` per wheel.
@@ -293,6 +308,12 @@ def continue_branches(
             "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
         )
     (lower, upper), options = check_range("bounds", bounds), _check_arclength_options(options)
+    has_collocation = model.capabilities.gait_method == GaitMethod.COLLOCATION
+    if check_bool("force_peaks", force_peaks) and not has_collocation:
+        raise ValueError(
+            f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
+            "the force: take vrw.force_peaks(vrw.simulate(...)) of its gaits."
+        )
     finder = make_finder(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
     )
@@ -308,7 +329,7 @@ def continue_branches(
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
     request = BranchRequest(
-        params, model, name, parameter_values, period_n, cycle_options, step_options
+        params, model, name, parameter_values, period_n, cycle_options, step_options, force_peaks
     )
     outcomes, branch_data = _continue_from_starts(request, cycle, options, np.array([lower, upper]))
     take_wheel = lambda wheel_index: jax.tree.map(lambda leaf: leaf[wheel_index], params)
@@ -405,7 +426,7 @@ def _label_branch(
         return Branch(name, empty_dataset, (), ("", ""), branch_outcome)
     measure_names = (
         name
-        for name in STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
+        for name in STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
         if name not in OMITTED_MEASURES
     )
     variables = make_variables(

@@ -35,6 +35,7 @@ from vrw_jax.cycles import (
     PeriodMap,
     collocation_correction_norm,
     compile_batched,
+    compute_force_peaks,
     gait_takeoff_acceleration,
     init_search_flags,
     solve_linear_systems,
@@ -111,11 +112,13 @@ class CollocationProblem(AbstractGaitProblem):
 
     Beyond the zero of an indicator the solution continues, but the event-driven step rejects it as
     a gait. `additional_quantities` is a function of the phase points of the first step and of z.
+    With `reads_force_peaks` the points also have the measures of the gait's force.
     """
 
     system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
     additional_quantities: Callable | None = eqx.field(static=True)
+    reads_force_peaks: bool = eqx.field(static=True, default=False)
 
     @property
     def n_steps(self) -> int:
@@ -174,6 +177,8 @@ class CollocationProblem(AbstractGaitProblem):
         }
         if self.additional_quantities is not None:
             continued_quantities |= self.additional_quantities(s, steps[0], z)
+        if self.reads_force_peaks:
+            continued_quantities |= compute_force_peaks(self.system, parameters, z)
         return jnp.stack([step_end.q[0], *step_end.v]), continued_quantities
 
 

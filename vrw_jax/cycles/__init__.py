@@ -38,6 +38,7 @@ from vrw_jax.cycles.finder_selection import (
     resolve_model,
     resolve_model_with_reason,
 )
+from vrw_jax.cycles.force_peaks import compute_force_peaks
 from vrw_jax.cycles.gait_search import (
     GaitChoice,
     limit_cycle,

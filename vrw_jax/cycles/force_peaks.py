@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.collocation import CollocatedPhase, PhaseExtrema, find_extrema
-from vrw_jax.cycles.collocation_search import CollocationState, CollocationSystem
+from vrw_jax.collocation import CollocatedPhase, CollocationSolution, PhaseExtrema, find_extrema
+from vrw_jax.cycles.collocation_search import CollocationSystem
 from vrw_jax.numerics import Scalar
 from vrw_jax.wheel import (
     AbstractPhase,
@@ -24,12 +24,11 @@ from vrw_jax.wheel import (
 
 @functools.partial(jax.jit, static_argnums=0)
 def compute_force_peaks(
-    system: CollocationSystem, parameters: Array, collocation_state: CollocationState
+    system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> dict[str, Scalar]:
     """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps."""
     s = wheel_from_parameters(parameters, system.n_legs).symbols()
-    solution, step_peaks = collocation_state.solution, []
-    _, steps = system.evaluate_phase_points(parameters, solution)
+    step_peaks, (_, steps) = [], system.evaluate_phase_points(parameters, solution)
     for step_index, phase_points in enumerate(steps):
         phases = make_phases(s, phase_points[0].start.held_constants[0], stop_at_lift_off=False)
         durations = solution.durations[step_index]

@@ -190,7 +190,8 @@ class LimitCycle(AbstractCycle):
         They have first derivatives, which are zero for numbers of peaks.
         """
         peaks_of_cycle = functools.partial(compute_force_peaks, self.system)
-        peaks = self._map_over_batch(peaks_of_cycle)(self.parameters, self.collocation_state)
+        solution = self.collocation_state.solution
+        peaks = self._map_over_batch(peaks_of_cycle)(self.parameters, solution)
         return {name: self._mask_missing(value) for name, value in peaks.items()}
 
     def measures(self, names: Iterable[str]) -> dict[str, Array]:
