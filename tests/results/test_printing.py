@@ -97,7 +97,7 @@ def test_traced_results_print_their_shapes():
     [
         (vrw.WheelParams, "`damping`: c, viscous damping of each leg"),
         (vrw.StepOptions, "`dt0`: first solver step of each phase, s"),
-        (vrw.CycleOptions, "`homotopy_steps`: of a homotopy"),
+        (vrw.CycleOptions, "`homotopy_steps`: number of steps of a homotopy"),
         (vrw.StepResult, "`step_length`: distance between the feet at the opening landing, m"),
         (vrw.Margins, "`contraction`:"),
         (vrw.StepBatchResult, "`solver_steps`: number of attempted solver steps"),
