@@ -1,1 +1,2 @@
-"""Where methods fail: stiffness, events, borders of derivatives, long walks, formulations."""
+"""Study conditions under which methods fail: stiffness, events, derivatives, long walks,
+formulations."""

@@ -1,4 +1,4 @@
-"""Charts and tables of the atlas, drawn from its tables of numbers alone."""
+"""Draw charts and tables of the atlas from its stored tables."""
 
 import re
 from collections.abc import Callable, Sequence

@@ -1,11 +1,10 @@
-"""Where methods fail, on problems that nobody here made: one table, one picture for each case.
+"""Compare methods on published problems: one table, and one figure for each case.
 
     python -m experiments.atlas.failures [--only CASE ...] [--redraw]
 
-Each case is a module of experiments/atlas/cases with its truth. The rows of the table are what each
-method gave in one run of the whole: its answer, its error, its own words, what it cost.
-docs/verification/failures.md and hybrid_problems.md contain them. With --only these cases are run
-again; `run` gives the time.
+Each case is a module of experiments/atlas/cases with its reference. A row of the table contains a
+method's result, its error, its message and its cost. The pages docs/verification/failures.md and
+hybrid_problems.md contain the rows. With `--only` the given cases run again.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Results of a case: one row per method, and its verdict: right, says so, or silently wrong."""
+"""Results of a case: one row per method, with the verdict right, reported or silently wrong."""
 
 import math
 import re

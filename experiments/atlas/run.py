@@ -1,10 +1,10 @@
-"""Where methods fail: stiffness, events, borders of derivatives, long walks, formulations.
+"""Compute the tables of the atlas: stiffness, events, derivatives, long walks, formulations.
 
     python -m experiments.atlas.run [--only NAME] [--cases 1000000] [--redraw]
 
-Each map is a function that fills one small table (csv) and one that draws it. A table that exists
-is kept; those of events and of dips go on where they were stopped. docs/verification/accuracy.md
-and docs/benchmarks/stiff_legs.md show them.
+For each table one function computes a csv file and one draws it. An existing table is kept. The
+tables of events and of minima continue from where they stopped. docs/verification/accuracy.md and
+docs/benchmarks/stiff_legs.md show the tables.
 """
 
 import csv

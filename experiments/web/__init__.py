@@ -1,1 +1,1 @@
-"""The wheel in a browser: the library's own step as WebAssembly, in one page."""
+"""Build the page with the wheel in a browser, whose step is the library's code as WebAssembly."""

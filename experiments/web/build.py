@@ -1,9 +1,10 @@
-"""docs/wheel.html: the wheel in a browser, one file with the library's own step inside.
+"""Build docs/wheel.html, one file with the library's step inside.
 
     python -m experiments.web.build [--page]
 
-`--page` takes the step's code from the page that stands there, which is quick; without it the step
-is traced and compiled anew, some minutes. `wasm-ld` is Debian's `lld`, or `pip install ziglang`.
+With `--page` the command takes the code of the step from the present page, which is quick. Without
+it the command traces and compiles the step, which takes some minutes. `wasm-ld` is Debian's `lld`,
+or comes with `pip install ziglang`.
 """
 
 import base64

@@ -1,8 +1,9 @@
-"""How long the page takes after a slider moved, for its map and its basin, in Node and in Chromium.
+"""Measure the time of the page's updates after a slider moves, in Node and in Chromium.
 
     python -m experiments.web.speed
 
-Writes its table into docs/explore.md. Needs `node`, `chromium`, and playwright: `.[web]`.
+The command writes its table into docs/explore.md. It needs `node`, `chromium` and playwright
+(`.[web]`).
 """
 
 import json

@@ -1,1 +1,1 @@
-"""Work against precision of every engine and its peers, quantity by quantity."""
+"""Measure work against precision of every engine and of other programs."""

@@ -1,4 +1,4 @@
-"""Charts and tables of work against precision, drawn from its measurements alone."""
+"""Draw charts and tables of work against precision from the stored measurements."""
 
 import json
 import math

@@ -1,12 +1,12 @@
-"""Truth of 256 steps and 256 limit cycles to 20 digits.
+"""Compute references of 256 steps and 256 limit cycles to 20 digits.
 
     python -m experiments.work_precision.truth [--at-most 256]
 
-Wheels and starts are those of `engine_benchmark`. One step from each start, the limit cycle of
-each wheel, its monodromy matrix and its derivatives by four parameters come from the oracle of
-`tests/oracle` (formulation `HubForm`, 30 digits); derivatives are central differences of relative
-step 1e-10. Every 16th lane is computed again by `MultiplierForm`, which shares no equation with it.
-The file keeps what is done: a run that was stopped goes on.
+Wheels and starts are those of `engine_benchmark`. For each start there is one step, and for each
+wheel the limit cycle, its monodromy matrix and its derivatives with respect to four parameters.
+They come from `HubForm` of `tests/oracle` with 30 digits. Derivatives are central differences with
+relative steps of 1e-10. `MultiplierForm`, which shares no equation with it, computes every 16th
+lane again. The file stores finished lanes, and a stopped run continues.
 """
 
 from pathlib import Path
