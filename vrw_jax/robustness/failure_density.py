@@ -20,25 +20,33 @@ class DensityOptions:
     """Options of the fitted density."""
 
     n_samples: int = 6144
-    """Number of walks of each stage. The value is chosen because fits to fewer walks vary by tens
-    of per cent."""
+    """Largest number of walks of each stage. The value is chosen because fits to fewer walks vary
+    by tens of per cent."""
     n_components: int = 4
     """Number of Gaussians. The value is chosen because the paper's wheel fails in two ways, and
     each failing region is curved."""
     nominal_fraction: float = 0.1
     """Fraction of walks that are drawn without bias. Its inverse bounds all weights. These walks
     also find failures that the fit missed, if such failures are frequent enough to matter."""
+    wide_fraction: float = 0.2
+    """Fraction of walks that are drawn from the fitted Gaussians with larger standard deviations.
+    These walks bound the weights where the failures extend beyond the fit."""
+    wide_factor: float = 1.7
+    """Factor of these standard deviations."""
+    n_refits: int = 2
+    """Number of fits without inflation. The value is chosen because the second fit uses failures
+    that the first one produces."""
     min_failure_fraction: float = 0.15
     """Fraction of failing walks at which the inflation is large enough. The value is chosen because
     about a third of failing walks fail in their last step."""
     inflation_factor: float = 1.3
     """Factor between successive inflations."""
-    max_inflation: float = 100.0
-    """Largest inflation. The value is chosen because rarer failures have probabilities below the
-    smallest floating-point number."""
-    min_effective_samples: float = 300.0
-    """Smallest effective number of failures at the next, smaller inflation. The value is chosen
-    because each Gaussian in five dimensions has 20 parameters."""
+    max_inflation: float = 20.0
+    """Largest inflation. The value is chosen because rarer failures have probabilities below
+    1e-80."""
+    effective_samples_per_dimension: float = 60.0
+    """Smallest effective number of failures at the next, smaller inflation, per dimension. The
+    value is chosen because each Gaussian in five dimensions has 20 parameters."""
     covariance_floor: float = 0.02
     """Variance that is added in every direction. It bounds the weights if failures are few."""
     n_em_iterations: int = 25
@@ -79,6 +87,10 @@ class GaussianMixture:
             np.concatenate([self.means, other_mixture.means]),
             np.concatenate([self.cholesky_factors, other_mixture.cholesky_factors]),
         )
+
+    def widen(self, factor: float) -> "GaussianMixture":
+        """Return the mixture with standard deviations multiplied by `factor`."""
+        return GaussianMixture(self.component_weights, self.means, factor * self.cholesky_factors)
 
     def compute_component_log_densities(self, deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of each component's weighted density, (components, samples)."""
@@ -181,6 +193,7 @@ def fit_failure_density(
         inflation *= options.inflation_factor
         if inflation > options.max_inflation:
             return None
+    n_refits = 0
     while True:
         if not np.any(has_failed_last):
             return None
@@ -191,7 +204,10 @@ def fit_failure_density(
         )
         chosen_indices = generator.choice(len(failing_deviations), options.n_em_samples, p=weights)
         fitted_mixture = fit_mixture(failing_deviations[chosen_indices], generator, options)
-        if inflation == 1.0:
+        wide_mixture = fitted_mixture.widen(options.wide_factor)
+        fitted_mixture = fitted_mixture.with_component(wide_mixture, options.wide_fraction)
+        n_refits += inflation == 1.0
+        if n_refits == options.n_refits:
             return fitted_mixture.with_component(nominal_density, options.nominal_fraction)
         inflation = next_inflation
         density = fitted_mixture.with_component(
@@ -220,9 +236,11 @@ def _lower_inflation(
         normalized_weights: np.ndarray = weights / np.sum(weights)
         return normalized_weights
 
-    has_enough_samples = lambda w: (
-        1.0 / np.sum(w**2) >= min(options.min_effective_samples, 0.3 * len(w))
+    n_required = min(
+        options.effective_samples_per_dimension * failing_deviations.shape[1],
+        0.3 * len(failing_deviations),
     )
+    has_enough_samples = lambda w: 1.0 / np.sum(w**2) >= n_required
     next_inflation = inflation
     while next_inflation > 1.0:
         candidate_inflation = max(next_inflation / 1.05, 1.0)

@@ -7,6 +7,7 @@ many walks fail in their last step. Likelihood ratios give the probability of th
 bias. Groups are independent, so that their spread gives the error.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -16,7 +17,11 @@ import numpy as np
 
 from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness.failure_density import GaussianMixture, fit_failure_density
+from vrw_jax.robustness.failure_density import (
+    DENSITY_OPTIONS,
+    GaussianMixture,
+    fit_failure_density,
+)
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -303,7 +308,12 @@ def _make_biased_round(
         has_failed = walk_results.outcome != Outcome.STEPPED
         return has_failed & (walk_results.n_stepped == n_lines - 1), has_failed
 
-    failure_density = fit_failure_density(find_failures, n_lines, walker_groups.random)
+    density_options = dataclasses.replace(
+        DENSITY_OPTIONS, n_samples=min(DENSITY_OPTIONS.n_samples, len(walker_groups.states))
+    )
+    failure_density = fit_failure_density(
+        find_failures, n_lines, walker_groups.random, density_options
+    )
     if failure_density is None:
         return None
     nominal_density = GaussianMixture.isotropic(n_lines, 1.0)
