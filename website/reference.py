@@ -20,6 +20,7 @@ from vrw_jax.measures.table import (
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     PARAMETER_MEASURES,
+    PASSAGE_MEASURES,
     STEP_MEASURES,
     STOPPER_MARGIN_MEASURES,
     TRAJECTORY_MEASURES,
@@ -172,6 +173,8 @@ _GROUPS = (
         "Limit cycles report these measures."),
     ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model report "
         "these measures. `vrw.force_peaks` returns them for walks, but for the impulse."),
+    ("Of walks over random slopes", PASSAGE_MEASURES,
+        "Scans with `slope_sd` report these measures."),
     ("Of a trajectory", TRAJECTORY_MEASURES,
         "`vrw.simulate` returns these coordinates and variables."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES,

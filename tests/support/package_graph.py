@@ -19,7 +19,7 @@ PACKAGE_LAYERS = (
     ("simd",), ("validation",), ("printing",), ("runtime",), ("numerics",), ("integrator",),
     ("hybrid",), ("collocation",), ("wheel",), ("measures",), ("models",), ("contact",),
     ("selection",), ("simulation",), ("batches",), ("continuation",), ("cycles",), ("tolerance",),
-    ("branches", "tuning"), ("scans", "robustness"), ("figures", "web"), ("paper",), ("cli",),
+    ("branches", "tuning"), ("robustness",), ("scans",), ("figures", "web"), ("paper",), ("cli",),
 )  # fmt: skip
 """Packages in import order: a package may import those of earlier rows only."""
 

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 MAX_OPTION_INTEGER = 10**9
 """Largest integer of an option, chosen because a scan takes no more samples."""
 
+SENSITIVITY_MEASURES = ("period", "speed")
+"""Measures whose gait sensitivity norms `vrw robustness` prints."""
+
 FolderOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
@@ -108,6 +111,8 @@ def root(
       [cyan]vrw reproduce --out paper[/cyan]             all figures and the table of facts
 
       [cyan]vrw scan configs/quickstart.toml[/cyan]      4,096 steady gaits, a dataset and a picture
+
+      [cyan]vrw robustness configs/robustness.toml[/cyan]   mean lives on random slopes
 
       [cyan]vrw tune configs/tune_dls.toml[/cyan]        the most double support without scuffing
 
@@ -365,6 +370,43 @@ def scan(
             from vrw_jax.cli.reports import write_scan
 
             printing.print_written_paths(write_scan(dataset, folder))
+
+
+@app.command()
+def robustness(
+    config: Annotated[Path, typer.Argument(help="TOML file with slope_sd in its table [scan].")],
+    folder: FolderOption = None,
+    picture: PictureOption = True,
+) -> None:
+    """Compute the mean number of steps until failure on random slopes, and gait sensitivities.
+
+    Without a design in the config, prints both for one wheel and writes no file. With a grid or
+    samples, computes each sample in turn and writes scan.zarr and figures (PNG and SVG) into the
+    folder. After an interruption the same command continues where it stopped.
+
+    [bold]Examples[/bold]
+
+      vrw robustness configs/robustness.toml
+    """
+    with report_errors():
+        settings = _load_config(config)
+        slope_sd = settings.scan.slope_sd
+        if slope_sd is None:
+            raise ValueError(
+                f"{config.name}: [scan] has no slope_sd, the standard deviation of the slopes: "
+                "write slope_sd = 0.01, in rad, say."
+            )
+        if settings.design is None:
+            from vrw_jax.robustness import first_passage, gait_sensitivity
+
+            params, model = settings.make_wheel(), settings.make_model()
+            with show_stages("walking over random slopes (the first time compiles for a while)"):
+                passage = first_passage(params, slope_sd, model=model)
+                sensitivity = gait_sensitivity(params, SENSITIVITY_MEASURES, model=model)
+            print(passage)
+            print(sensitivity)
+            return
+    scan(config, folder, picture=picture)
 
 
 @app.command("map")

@@ -16,7 +16,13 @@ import numpy as np
 from vrw_jax.hybrid import make_solver
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions
-from vrw_jax.scans import CATALOGS, MAX_LISTED_SAMPLES, TOLERANCE_CATALOG, check_measures
+from vrw_jax.scans import (
+    CATALOGS,
+    MAX_LISTED_SAMPLES,
+    TOLERANCE_CATALOG,
+    add_passage_measures,
+    check_measures,
+)
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import find_model_class, list_config_names
 from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
@@ -67,12 +73,14 @@ class ScanConfig:
     - `measures`: names of measures and derivatives; by default DLS fraction, speed and the like;
     - `chunk`: number of samples that are written at a time; 4,096 by default;
     - `tol`: permitted error of each measure with unilateral contact (`name = "unilateral"`), in its
-      unit. Each sample uses the simplest model that permits it.
+      unit. Each sample uses the simplest model that permits it;
+    - `slope_sd`: standard deviation of random slopes, rad, for the measures of `vrw.first_passage`.
     """
 
     measures: tuple[str, ...] | None = None
     chunk: int | None = None
     tol: float | None = None
+    slope_sd: float | None = None
 
     @classmethod
     def from_table(
@@ -83,6 +91,7 @@ class ScanConfig:
         """
         _require_known_keys(table, cls.__dataclass_fields__, "[scan]", "settings")
         measures = table.get("measures")
+        slope_sd = table.get("slope_sd")
         if measures is not None:
             if not (
                 isinstance(measures, list)
@@ -95,6 +104,8 @@ class ScanConfig:
                 if "tol" not in table
                 else TOLERANCE_CATALOG
             )
+            if slope_sd is not None and "tol" not in table:
+                catalog = add_passage_measures(catalog)
             check_measures(measures, catalog)
             measures = tuple(measures)
         chunk = table.get("chunk")
@@ -103,6 +114,9 @@ class ScanConfig:
             measures,
             None if chunk is None else _parse_int(chunk, "chunk", 1),
             None if tol is None else _parse_number(tol, "tol", must_be_positive=True),
+            None
+            if slope_sd is None
+            else _parse_number(slope_sd, "slope_sd", must_be_positive=True),
         )
 
 

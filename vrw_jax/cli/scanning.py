@@ -34,6 +34,7 @@ def plan_config_scan(
         chunk=chunk or settings.scan.chunk,
         config_text=settings.source_text,
         tol=settings.scan.tol,
+        slope_sd=settings.scan.slope_sd,
     )
 
 

@@ -10,6 +10,7 @@ from vrw_jax.measures.table import (
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
     MEASURES,
+    PASSAGE_MEASURES,
     PHASE_NAMES,
     SHARED_STEP_MEASURE_NAMES,
     STEP_MEASURES,

@@ -272,6 +272,17 @@ FORCE_PEAK_MEASURES = _make_table(
 """Peaks of the ground's normal force in a step of a gait: inside the phases, without impacts and
 changes of phase. For gaits of several steps, the largest over the steps."""
 
+PASSAGE_MEASURES = _make_table(
+    Measure("mean_steps", "1", "M", "mean number of steps until failure",
+            "On random slopes, from their quasi-stationary distribution; infinite if no failure "
+            "was found."),
+    Measure("mean_steps_error", "1", "ΔM", "error of the mean number of steps until failure",
+            "Half the width of its 99 % confidence interval."),
+    Measure("failure_probability", "1", "1 - κ_1", "failure probability of a step",
+            "On random slopes, from their quasi-stationary distribution."),
+)
+"""Measures of walks over random slopes of a given standard deviation."""
+
 TRAJECTORY_MEASURES = _make_table(
     Measure("time", "s", "t", "time", "Time since the landing at the start of the first step."),
     Measure("step", "1", "step", "step", "Number of the step, starting from 0."),
@@ -350,6 +361,7 @@ MEASURES: dict[str, Measure] = (
     | LIMIT_CYCLE_MEASURES
     | GAIT_SENSITIVITY_MEASURES
     | FORCE_PEAK_MEASURES
+    | PASSAGE_MEASURES
     | TRAJECTORY_MEASURES
     | CONTACT_MEASURES
     | PARAMETER_MEASURES

@@ -25,6 +25,7 @@ from vrw_jax.scans.measure_catalog import (
     CATALOGS,
     DIFFERENTIABLE_MEASURES,
     TOLERANCE_CATALOG,
+    add_passage_measures,
     check_measures,
 )
 from vrw_jax.scans.planning import ScanPlan, plan_scan

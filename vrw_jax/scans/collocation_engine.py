@@ -39,6 +39,8 @@ class EvaluationRequest(NamedTuple):
     cycle_options: CycleOptions
     # largest permitted error of each measure, in its unit; None for a scan without tolerance
     tol: float | None
+    # standard deviation of random slopes, rad; None for a scan without measures of such walks
+    slope_sd: float | None = None
 
 
 class CollocationEngine:
@@ -54,7 +56,7 @@ class CollocationEngine:
         """Initialize the engine; `threads` is the number of CPU threads, by default one per
         core.
         """
-        measures, base, model, options, cycle_options, _ = request
+        measures, base, model, options, cycle_options, *_ = request
         self._threads = count_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
         requested_derivatives = tuple(

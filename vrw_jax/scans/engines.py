@@ -24,8 +24,10 @@ from vrw_jax.cycles import (
     find_slow_gaits,
     make_finder,
 )
+from vrw_jax.measures import PASSAGE_MEASURES
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
 from vrw_jax.numerics import batch_sizes, map_in_batches
+from vrw_jax.robustness import first_passage
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.scans.collocation_engine import (
     CollocationEngine,
@@ -243,14 +245,59 @@ class ToleranceEngine:
         return mask_failures(measure_result.outcomes, results | {"rung": rung})
 
 
+class PassageEngine:
+    """Engine that adds walks over random slopes to the gaits of another engine.
+
+    Samples are computed one after another, each with the same random numbers.
+    """
+
+    def __init__(self, request: EvaluationRequest, slope_sd: float, gait_engine: Any) -> None:
+        self._base, self._model, self._slope_sd = request.base, request.model, slope_sd
+        self._names = tuple(name for name in request.measures if name in PASSAGE_MEASURES)
+        self._gait_engine = gait_engine
+
+    def __call__(self, columns: SampleMapping) -> ResultColumns:
+        """Return the results by variable; `columns` contains the values of each swept parameter,
+        one per sample.
+        """
+        results: ResultColumns = dict(self._gait_engine(columns))
+        outcome = results["outcome"]
+        passages = np.full((len(self._names), len(outcome)), np.nan, self._base.damping.dtype)
+        for sample in np.flatnonzero(outcome == Outcome.STEPPED) if self._names else ():
+            values = {name: float(column[sample]) for name, column in columns.items()}
+            passages[:, sample] = self._measure_passage(values)
+        return results | dict(zip(self._names, passages, strict=True))
+
+    def _measure_passage(self, values: Mapping[str, float]) -> list[float]:
+        """Return the measures of one sample; NaN if hardly any step of its walks succeeds."""
+        model, params = self._model, self._base
+        for name, value in values.items():
+            model, params = model.with_parameter(params, name, jnp.asarray(value))
+        try:
+            # mypy takes the name for the module `robustness.first_passage`.
+            passage = first_passage(params, self._slope_sd, model=model)  # type: ignore[operator]
+        except ValueError:
+            return [np.nan] * len(self._names)
+        by_name = {
+            "mean_steps": passage.mean_steps,
+            "mean_steps_error": passage.error,
+            "failure_probability": passage.failure_probability,
+        }
+        return [float(by_name[name]) for name in self._names]
+
+
 def make_engine(
     request: EvaluationRequest, threads: int | None = None
-) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine:
+) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine | PassageEngine:
     """Return the engine for a scan of this model, or for a scan to a tolerance."""
     if request.tol is not None:
         return ToleranceEngine(request)
     engine_class: Any = ENGINE_CLASSES[request.model.capabilities.gait_method]
-    return engine_class(request, threads)
+    if request.slope_sd is None:
+        return engine_class(request, threads)
+    measures = tuple(name for name in request.measures if name not in PASSAGE_MEASURES)
+    gait_engine = engine_class(request._replace(measures=measures), threads)
+    return PassageEngine(request, request.slope_sd, gait_engine)
 
 
 ENGINE_CLASSES = {

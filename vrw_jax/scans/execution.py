@@ -71,6 +71,7 @@ def scan(
     on_progress: ProgressCallback | None = None,
     dask: str | None = None,
     tol: float | None = None,
+    slope_sd: float | None = None,
 ) -> xr.Dataset:
     """Return the steady gait of every sample with its outcome and margins, as a labeled dataset.
 
@@ -101,6 +102,9 @@ def scan(
             sample is computed by the simplest model whose error bound permits it (see
             `vrw.measure_to_tolerance`). The dataset holds `rung` and the errors, such as
             `speed_error`.
+        slope_sd: standard deviation of random slopes, rad, which adds "mean_steps",
+            "mean_steps_error" and "failure_probability" to the measures (see `vrw.first_passage`).
+            A sample takes about a second, and 16 are written at a time by default.
 
     Returns:
         A dataset over the axes of the design.
@@ -127,6 +131,7 @@ def scan(
         cycle_options=cycle_options,
         chunk=chunk,
         tol=tol,
+        slope_sd=slope_sd,
     )
     with resolve_executor(dask) as executor:
         return run_scan(scan_plan, store, on_progress=on_progress, executor=executor)

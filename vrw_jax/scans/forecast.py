@@ -30,7 +30,7 @@ def forecast_scan(plan: ScanPlan, store: str | Path | None = None) -> dict[str, 
     Time and memory are measured by computing samples that are spread over the design.
     """
     layout, n_samples = plan.layout, plan.design.size
-    catalog = select_catalog(plan.request.model, plan.request.tol)
+    catalog = select_catalog(plan.request.model, plan.request.tol, plan.request.slope_sd)
     existing_store = None if store is None else find_store(plan, Path(store), verify=False)
     missing_chunks = (
         list(range(layout.n_chunks))

@@ -8,6 +8,7 @@ from vrw_jax.cycles import CollocationFinder
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     MEASURES,
+    PASSAGE_MEASURES,
     STEP_MEASURES,
     UNILATERAL_DIFFERENTIABLE_NAMES,
     measure_attrs,
@@ -101,9 +102,26 @@ ERROR_SUFFIX = "_error"
 """Suffix of the variable that contains the error of a measure."""
 
 
-def select_catalog(model: AbstractWheel, tol: float | None = None) -> MeasureCatalog:
-    """Return the catalog of a model, or that of scans to a tolerance if `tol` is given."""
-    return CATALOGS[model.capabilities.gait_method] if tol is None else TOLERANCE_CATALOG
+def select_catalog(
+    model: AbstractWheel, tol: float | None = None, slope_sd: float | None = None
+) -> MeasureCatalog:
+    """Return the catalog of a model, or that of scans to a tolerance if `tol` is given.
+
+    If `slope_sd` is given, it contains measures of walks over random slopes too.
+    """
+    if tol is not None:
+        return TOLERANCE_CATALOG
+    catalog = CATALOGS[model.capabilities.gait_method]
+    return catalog if slope_sd is None else add_passage_measures(catalog)
+
+
+def add_passage_measures(catalog: MeasureCatalog) -> MeasureCatalog:
+    """Return a catalog with the measures of walks over random slopes, which take a second each."""
+    return catalog._replace(
+        requestable=(*catalog.requestable, *PASSAGE_MEASURES),
+        default_measures=tuple(PASSAGE_MEASURES),
+        forecast_samples_per_core=1,
+    )
 
 
 def error_variable_name(measure: str) -> str:
@@ -162,6 +180,11 @@ def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, 
     for name in names:
         requested_derivative = parse_derivative(name)
         if requested_derivative is None:
+            if name in PASSAGE_MEASURES and name not in known_names:
+                raise ValueError(
+                    f"{name!r} is a measure of walks over random slopes, whose standard deviation "
+                    "is missing: give slope_sd, in rad, and no tol."
+                )
             if name not in known_names:
                 raise ValueError(
                     f"{name!r} is no measure of a scan{suggest_name(name, known_names)}: "

@@ -45,6 +45,11 @@ MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples of a scan, chosen because it takes over a day and some hundred GB."""
 
 
+PASSAGE_CHUNK_SIZE = 16
+"""Number of samples that are written at a time if walks over random slopes are measured, chosen
+because each sample takes a second or more."""
+
+
 STORED_KINDS = {"StepOptions": "Options"}
 """Names of classes in stores, if they differ from the names in Python."""
 
@@ -97,7 +102,7 @@ class ScanPlan:
     @property
     def settings(self) -> dict[str, object]:
         """Return the settings that a store must have so that the scan can continue in it."""
-        measures, base, model, options, cycle_options, tol = self.request
+        measures, base, model, options, cycle_options, tol, slope_sd = self.request
         fixed_names = (name for name in PARAMETER_NAMES if name not in self.design.names)
         return {
             "design": self.design.describe_identity(),
@@ -109,7 +114,11 @@ class ScanPlan:
             "cycle_options": _record_fields(cycle_options),
             "dtype": str(base.damping.dtype),
             "chunk": list(self.layout.chunk_shape),
-        } | ({} if tol is None else {"tol": tol})
+        } | {
+            name: value
+            for name, value in (("tol", tol), ("slope_sd", slope_sd))
+            if value is not None
+        }
 
     @property
     def store_attrs(self) -> dict[str, object]:
@@ -140,6 +149,7 @@ def plan_scan(
     chunk: int | None = None,
     config_text: str = "",
     tol: float | None = None,
+    slope_sd: float | None = None,
 ) -> ScanPlan:
     """Return the checked plan of a scan, with the layout of its result; nothing is computed."""
     if not isinstance(design, AbstractDesign):
@@ -154,7 +164,8 @@ def plan_scan(
     options.check_tolerances(np.dtype(base.damping.dtype))
     finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
     finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
-    chunk = batch_sizes.SCAN_CHUNK_SIZE if chunk is None else check_int("chunk", chunk)
+    default_chunk = batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else PASSAGE_CHUNK_SIZE
+    chunk = default_chunk if chunk is None else check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
             f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
@@ -171,7 +182,14 @@ def plan_scan(
             f"model={describe_models('scan', FRICTION_NAME)}."
         )
     tol = None if tol is None else _check_tolerance(model, check_positive("tol", tol))
-    catalog = select_catalog(model, tol)
+    if slope_sd is not None:
+        slope_sd = check_positive("slope_sd", slope_sd)
+        if tol is not None:
+            raise ValueError(
+                "tol and slope_sd are both given, but a scan to a tolerance has no measures of "
+                "walks over random slopes: drop one of them."
+            )
+    catalog = select_catalog(model, tol, slope_sd)
     requested_measures = (
         catalog.default_measures if measures is None else check_names("measures", measures)
     )
@@ -183,7 +201,7 @@ def plan_scan(
         for variable_name in (name, error_variable_name(name))[: 1 + bool(tol)]
     )
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
-    request = EvaluationRequest(names, base, model, options, cycle_options, tol)
+    request = EvaluationRequest(names, base, model, options, cycle_options, tol, slope_sd)
     layout = _make_layout(
         design, tuple(variable_names | dict.fromkeys(catalog.always_included)), base, chunk
     )
