@@ -150,7 +150,7 @@ def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -
     The function is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in sizes:
-        return function(*trees)
+        return function(*jax.device_put(trees))
     call_on_device = lambda *rows: function(*jax.device_put(rows))
     return jax.device_put(map_in_numpy_batches(call_on_device, sizes, *trees))
 
