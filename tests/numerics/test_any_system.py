@@ -456,7 +456,7 @@ def test_contact_problems_have_one_solution_several_or_none():
         assert float(jnp.min(result.gap)) >= -1e-12
         np.testing.assert_allclose(result.force * result.gap, 0.0, atol=1e-12)
         np.testing.assert_allclose(result.gap, matrix @ result.force + free, atol=1e-12)
-    with pytest.raises(ValueError, match=r"free \(2,\)"):
+    with pytest.raises(ValueError, match=r"free_gap \(2,\)"):
         enumerate_lcp_solutions(np.eye(3), np.zeros(2))
     with pytest.raises(ValueError, match="not finite"):
         enumerate_lcp_solutions([[np.nan]], [1.0])
