@@ -61,6 +61,7 @@ FRICTION = {
 }
 """By function: the margin to the friction needed at the fore foot that it tells."""
 SLOW_FUNCTIONS = {
+    "first_passage",
     "basin_share",
     "measure_basins",
     "smallest_disturbance",
@@ -164,6 +165,9 @@ GAITS = {
     "gait_sensitivity": lambda m: is_successful(
         lambda: vrw.gait_sensitivity(PULLED_WHEEL, ("period",), model=m)
     ),
+    "first_passage": lambda m: is_successful(
+        lambda: vrw.first_passage(PULLED_WHEEL, 0.005, model=m, n_walkers=256, max_steps=20_000)
+    ),
     "basin_share": lambda m: is_successful(
         lambda: vrw.basin_share(PULLED_WHEEL, PULLED_BOX, model=m, n_starts=2)
     ),
@@ -223,7 +227,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     assert taking - {"return_map"} == set(OUTCOMES) | set(GAITS)
     # These report no margin of friction, or only how it varies.
     measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
-    measured |= {"basin_share", "smallest_disturbance", "measure_basins"}
+    measured |= {"first_passage", "basin_share", "smallest_disturbance", "measure_basins"}
     assert taking - measured == set(FRICTION)
 
 
