@@ -42,3 +42,5 @@ class ModelCapabilities:
     that the model does not support measures to a tolerance."""
     passage_method: PassageMethod = PassageMethod.SAMPLING
     """Method of `first_passage`."""
+    begins_within_step: bool = False
+    """Whether the model has `finish_step`, so that a step can be disturbed at any instant."""

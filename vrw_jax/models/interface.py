@@ -47,8 +47,6 @@ class AbstractWheel(eqx.Module):
     """Kind of the compiled batch kernel: the paper's "phases", "legs", or "" for none."""
     is_compliant: ClassVar[bool] = True
     """Whether springs and dampers affect the motion. Tuning and scans vary them only then."""
-    can_begin_within_step: ClassVar[bool] = False
-    """Whether the model has `finish_step`, so that a step can be disturbed at any instant."""
 
     def __repr__(self) -> str:
         if is_traced(self):
@@ -136,7 +134,7 @@ class AbstractWheel(eqx.Module):
         - `distance`: distance between both feet in the double support of the step, m;
         - `state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
-        Only models with `can_begin_within_step` have it.
+        Only models whose capabilities have `begins_within_step` implement this method.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
 

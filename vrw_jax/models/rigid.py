@@ -86,11 +86,11 @@ class RigidWheel(AbstractWheel):
         gait_method=GaitMethod.RETURN_MAP,
         commands=frozenset({"branch", "explore"}),
         passage_method=PassageMethod.QUADRATURE,
+        begins_within_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False
-    can_begin_within_step: ClassVar[bool] = True
 
     friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(

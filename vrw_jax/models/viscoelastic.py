@@ -111,11 +111,11 @@ class ViscoelasticWheel(AbstractWheel):
         config_name="viscoelastic",
         gait_method=GaitMethod.COLLOCATION,
         commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
+        begins_within_step=True,
     )
     parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     batch_kernel: ClassVar[str] = "phases"
-    can_begin_within_step: ClassVar[bool] = True
 
     friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(

@@ -102,7 +102,7 @@ def measure_basins(
             basin_share_result = compute_basin_share(gait, bounds, n_starts, max_steps)
             record_value("basin_share", i, basin_share_result.share)
             record_value("basin_share_error", i, basin_share_result.share_error)
-        if checked_model.can_begin_within_step:
+        if checked_model.capabilities.begins_within_step:
             disturbance_result = compute_smallest_disturbance(gait, None, max_steps)
             record_value("smallest_disturbance", i, disturbance_result.size)
             record_value("smallest_disturbance_error", i, disturbance_result.size_error)

@@ -164,7 +164,7 @@ def smallest_disturbance(
     """
     max_steps = check_int("max_steps", max_steps)
     gait = StableGait.find("vrw.smallest_disturbance", params, model, cycle, options)
-    if not gait.model.can_begin_within_step:
+    if not gait.model.capabilities.begins_within_step:
         raise ValueError(
             f"{type(gait.model).__name__} cannot begin within a step, so that disturbances within "
             "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb starts "
