@@ -29,6 +29,7 @@ SLOW_PAGES = {
     "docs/howto/numpyro.md", "docs/howto/own_constraint.md",
     "docs/studies/beyond_the_border.md", "docs/studies/borders.md",
     "docs/studies/double_support.md", "docs/studies/friction.md",
+    "docs/studies/one_peak_or_two.md",
     "docs/verification/contact.md",
 }  # fmt: skip
 """Pages that compile for long, or that a test of their own runs in the quick suite."""
