@@ -136,7 +136,7 @@ TYPICAL_GAIT_CLAIMS = ClaimGroup(
           "{peaks}, of {peak:.1f} N", lambda n: n.peaks == 1,
           "smooth maxima of λ2 inside phases; jumps are no peaks"),
     Claim("foot 2 only rises after collision II", "§4 (d), Fig. 8", "ż2 > 0",
-          "least rise between samples {rise:.2f} mm", lambda n: n.normal_rise > 0.0, SIGN_REASON),
+          "least rise between samples {rise:.2f} mm", lambda n: n.rise > 0.0, SIGN_REASON),
     Claim("mechanical energy falls monotonically", "§3.5, eq. (29)", "Ė ≤ 0",
           "largest change between samples {energy_rise:.0e} J, "
           "{energy_lost:.1f} J lost between landings",
