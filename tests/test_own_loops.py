@@ -34,7 +34,7 @@ def test_the_loop_increases_its_objective_and_satisfies_its_margins(page_names):
 def test_the_map_shows_the_requested_derivatives(page_names):
     result = page_names["map_"]
     assert tuple(result)[:3] == page_names["names"]
-    assert list(Path().glob("*.png"))
+    assert list(Path("figures").glob("*.png"))
     slope = result["d dls_fraction / d damping"].sel(damping=160.0, slope=0.3).item()
     above, below = (vrw.limit_cycle(vrw.WheelParams(damping=160.0 + h)) for h in (0.1, -0.1))
     np.testing.assert_allclose(slope, (above.dls_fraction - below.dls_fraction) / 0.2, rtol=1e-5)
