@@ -40,6 +40,9 @@ print(json.dumps({
 }))
 """
 
+CALL_TEST = "\ntest_the_cost_of_transport_is_the_weight_times_the_sine_of_the_slope()\n"
+"""Call of the test that the page shows."""
+
 
 def changed(source: str, change: str) -> str:
     """Return the source with the lines of a change that begin with + inserted below the others."""
@@ -53,13 +56,15 @@ def changed(source: str, change: str) -> str:
 def test_a_measure_added_by_the_how_to_works_wherever_measures_are_named(tmp_path):
     """In a steady gait the energy lost per distance is the weight times the slope's sine."""
     shutil.copytree(ROOT / "vrw_jax", tmp_path / "vrw_jax")
-    change = HOWTO.read_text().partition("```diff\n")[2].partition("```")[0]
+    change, _, page_end = HOWTO.read_text().partition("```diff\n")[2].partition("```")
+    page_test = page_end.partition("```python\n")[2].partition("```")[0]
     for part in change.split("--- ")[1:]:
         path, _, lines = part.partition("\n")
         (tmp_path / path).write_text(changed((tmp_path / path).read_text(), lines))
     cache = os.environ.get("VRW_TEST_CACHE", str(ROOT / ".jax_cache"))
+    program = USE + page_test + CALL_TEST
     run = subprocess.run(
-        [sys.executable, "-c", USE, cache], cwd=tmp_path, capture_output=True, text=True,
+        [sys.executable, "-c", program, cache], cwd=tmp_path, capture_output=True, text=True,
         env=os.environ | {"PYTHONPATH": str(tmp_path)}, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-2000:]
