@@ -21,7 +21,7 @@ def test_the_papers_model_is_chosen_at_sufficient_friction():
     choice = vrw.choose_model(vrw.WheelParams(), START, friction=50.0)
     assert int(choice.model_code) == ModelCode.VISCOELASTIC
     assert isinstance(choice.model, vrw.ViscoelasticWheel)
-    assert "margins hold" in choice.why
+    assert "all its margins are positive" in choice.why
 
 
 def test_the_unilateral_model_is_chosen_with_a_reason_at_low_friction():
@@ -65,7 +65,7 @@ def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
         ModelCode.VISCOELASTIC,
     ]
     rows = [describe_reason(int(reason)) for reason in step.choice.reason_code]
-    assert ["margins hold" in text for text in rows] == [True, False, False, True]
+    assert ["all its margins are positive" in text for text in rows] == [True, False, False, True]
     assert "scuffs" in rows[1]
     assert list(SELECTION_MARGINS)[int(step.choice.reason_code[1]) - 1] == "clearance_sls1"
     assert "slide" in rows[2]
