@@ -73,7 +73,7 @@ def test_the_saltation_formula_agrees(forward_jacobian):
     def through(phase, y, duration):
         ending = lambda y: (flow(phase.vector_field, y, duration),) * 2
         matrix, end = jax.jacfwd(ending, has_aux=True)(y)
-        gradient = jax.grad(lambda y: phase.guards.values(y)[0])(end)
+        gradient = jax.grad(lambda y: phase.guards.evaluate(y)[0])(end)
         f = phase.vector_field(end)
         return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
 

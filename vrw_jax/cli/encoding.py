@@ -9,10 +9,10 @@ ERROR_HANDLER_NAME = "vrw_spell"
 """Name of the handler of encoding errors, chosen because no other library uses it."""
 
 ASCII_SPELLINGS = {
-    "α": "alpha", "θ": "theta", "λ": "lambda", "μ": "mu", "ρ": "rho", "σ": "sigma", "φ": "phi",
-    "Δ": "Delta ", "∂": "d", "\u0307": "'", "\u0308": "''", "²": "^2", "ᵀ": "^T", "·": ".",
-    "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'", "“": '"', "”": '"',
-    "§": "section ",
+    "α": "alpha", "θ": "theta", "κ": "kappa", "λ": "lambda", "μ": "mu", "ρ": "rho", "σ": "sigma",
+    "φ": "phi", "Δ": "Delta ", "∂": "d", "\u0307": "'", "\u0308": "''", "²": "^2", "ᵀ": "^T",
+    "·": ".", "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'",
+    "“": '"', "”": '"', "§": "section ",
 }  # fmt: skip
 """Replacements of the characters beyond ASCII that commands print."""
 

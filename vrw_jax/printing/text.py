@@ -104,8 +104,8 @@ def format_markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) 
 
 
 _MATHTEXT_SYMBOLS = {
-    "θ": r"\theta ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ", "Δ": r"\Delta ",
-    "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
+    "θ": r"\theta ", "κ": r"\kappa ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ",
+    "Δ": r"\Delta ", "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
     "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
 }  # fmt: skip
 _SYMBOL_PATTERN = re.compile(
