@@ -96,6 +96,7 @@ def test_slow_gaits_of_other_dampings_reach_the_slope_too(damping):
     assert_ends_at_the_slope(down_to_the_slope(damping, 0.34))
 
 
+@pytest.mark.slow  # its branch takes more than a minute
 def test_the_shipped_branch_on_unilateral_contact_reaches_both_ends_of_its_range():
     """At 0.5201 a leg meets its stopper as its foot lands: the two impacts do not commute."""
     branch = vrw.continue_branch(

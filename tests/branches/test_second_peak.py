@@ -45,6 +45,7 @@ def reference_rate(stiffness, gait):
     return max(rates)
 
 
+@pytest.mark.slow  # a branch with peaks compiles for more than a minute
 def test_a_branch_locates_where_the_second_peak_disappears(gait):
     branch = vrw.continue_branch(
         SOFT, "stiffness", (840.0, 910.0), cycle=gait, cycle_options=FINE, force_peaks=True
