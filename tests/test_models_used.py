@@ -104,7 +104,7 @@ OUTCOMES = {
         max_steps=1,
     ).outcome.values.ravel()[0],
 }
-"""By function: how a step ends from `LIFTING`."""
+"""By function: the outcome of a step from `LIFT_OFF_START`."""
 
 
 @pytest.mark.parametrize("name", OUTCOMES)

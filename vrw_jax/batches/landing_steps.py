@@ -66,8 +66,8 @@ def step_batch_after_landing(
     """Return one step of every lane from landing to landing on uneven ground.
 
     Args:
-        wheels: parameters in the order of PARAMETER_NAMES, (9, lanes); the slope is that of the
-            line under both feet.
+        parameter_rows: parameters in the order of PARAMETER_NAMES, (9, lanes); the slope is that of
+            the line under both feet.
         states: (theta+, dtheta+) just after a landing with both feet held, in the frame of that
             line, (2, lanes), rad, rad/s.
         next_slopes: slopes of the lines on which the steps end, (lanes,), rad.

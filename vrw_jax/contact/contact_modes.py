@@ -137,7 +137,9 @@ def _make_foot_equations(
         lambda value: jnp.where(value == jnp.inf, 1.0, jnp.where(jnp.isfinite(value), value, 0.0)),
         friction,
     )
-    normal_factor = map_friction(lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction)
+    normal_force_factor = map_friction(
+        lambda value: jnp.where(value == jnp.inf, 0.0, 1.0), friction
+    )
     is_sticking = _make_pair(lambda i: slot_modes[i] == ContactMode.STICK)
     is_sliding = _make_pair(
         lambda i: (slot_modes[i] == ContactMode.SLIP_DOWN) | (slot_modes[i] == ContactMode.SLIP_UP)
@@ -157,12 +159,16 @@ def _make_foot_equations(
         is_loaded=_make_pair(lambda i: is_sticking[i] | is_sliding[i]),
         unit_force_transverse=_make_pair(
             lambda i: select_by_mode(
-                i, 1.0, friction_factor[i] * cos[i] - _friction_of_slot(i, normal_factor) * sin[i]
+                i,
+                1.0,
+                friction_factor[i] * cos[i] - _friction_of_slot(i, normal_force_factor) * sin[i],
             )
         ),
         unit_force_radial=_make_pair(
             lambda i: select_by_mode(
-                i, 0.0, friction_factor[i] * sin[i] + _friction_of_slot(i, normal_factor) * cos[i]
+                i,
+                0.0,
+                friction_factor[i] * sin[i] + _friction_of_slot(i, normal_force_factor) * cos[i],
             )
         ),
         weight_transverse=_make_pair(lambda i: select_by_mode(i, 1.0, -sin[i])),

@@ -70,17 +70,17 @@ def _find_force_extrema(
 ) -> PhaseExtrema:
     """Return the extrema of the normal force on the fore foot, or on both feet, in a phase."""
 
-    def acceleration_of(q: Array, v: Array) -> Array:
+    def acceleration_at(q: Array, v: Array) -> Array:
         return jnp.stack(phase.acceleration(phase.motion_at(tuple(q), tuple(v)))[: phase.n_dof])
 
-    def force_of(q: Array, v: Array) -> Array:
+    def normal_force_at(q: Array, v: Array) -> Array:
         instant = PhaseInstant(phase, phase.motion_at(tuple(q), tuple(v)), None)
         force = jnp.asarray(instant.fore_force.normal)
         if with_rear_foot and instant.rear_force is not None:
             force = force + instant.rear_force.normal
         return force
 
-    return find_extrema(motion, acceleration_of, force_of)
+    return find_extrema(motion, acceleration_at, normal_force_at)
 
 
 class _ForcePeaks(NamedTuple):

@@ -50,10 +50,10 @@ def solve_rigid_passage(
 
     def evaluate_kernel_row(x: Array) -> tuple[Array, Array]:
         """Return the row of the survival operator at x, and the probability of failure."""
-        cosine_to_reach = lambda target_state: (
+        cosine_for_state = lambda target_state: (
             (target_state - vertical_map.offset(x)) / vertical_map.amplitude
         )
-        target_cosine = cosine_to_reach(nodes)
+        target_cosine = cosine_for_state(nodes)
         is_reached = jnp.abs(target_cosine) < 1.0
         target_cosine = jnp.where(is_reached, target_cosine, 0.0)
         standardized_deviation = (
@@ -64,7 +64,7 @@ def solve_rigid_passage(
         )
         state_density = state_density / (vertical_map.amplitude * jnp.sqrt(1.0 - target_cosine**2))
         flattest_slope = vertical_map.slope_of_maximum - jnp.arccos(
-            jnp.clip(cosine_to_reach(0.0), -1.0, 1.0)
+            jnp.clip(cosine_for_state(0.0), -1.0, 1.0)
         )
         return jnp.where(is_reached, state_density, 0.0) * weights, ndtr(
             (flattest_slope - mean_slope) / slope_sd

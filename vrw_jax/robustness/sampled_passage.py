@@ -186,7 +186,7 @@ def sample_passage(
     """Return the first passage from walks of these groups, until the relative error is `tol`.
 
     Args:
-        groups: walkers at the gait.
+        walker_groups: groups of walkers at the gait.
         spectral_radius: of the gait.
         tol: relative error.
         max_steps: number of steps after which no further walks begin.
@@ -346,12 +346,10 @@ def _solve_step_probability(
     is the ratio of the relative errors of p and of the given probability.
     """
     p = last_step_failure_probability
+    if n_lines == 1:
+        return p, 1.0
     for _ in range(N_FIXED_POINT_ITERATIONS):
-        p = (
-            min(last_step_failure_probability / (1.0 - p) ** (n_lines - 1), 0.9 / n_lines)
-            if n_lines > 1
-            else p
-        )
+        p = min(last_step_failure_probability / (1.0 - p) ** (n_lines - 1), 0.9 / n_lines)
     return p, 1.0 / (1.0 - (n_lines - 1) * p / (1.0 - p))
 
 
