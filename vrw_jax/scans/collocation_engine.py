@@ -56,7 +56,8 @@ class CollocationEngine:
         """Initialize the engine; `threads` is the number of CPU threads, by default one per
         core.
         """
-        measures, base, model, options, cycle_options, *_ = request
+        measures, base, model = request.measures, request.base, request.model
+        options, cycle_options = request.options, request.cycle_options
         self._threads = count_cores() if threads is None else threads
         self._base, self._model, self._options = base, model, options
         requested_derivatives = tuple(

@@ -51,7 +51,8 @@ class UnilateralEngine:
     """Engine that evaluates samples with unilateral contact and a fixed set of measures."""
 
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        measures, base, model, options, *_ = request
+        measures, base = request.measures, request.base
+        model, options = request.model, request.options
         self._base, self._model = base, model
         self._threads = count_cores() if threads is None else threads
         derivatives = tuple(
@@ -161,7 +162,7 @@ class LadderEngine:
     """Engine that evaluates each sample with the simplest valid model."""
 
     def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        self._measures, self._base, self._model, *_ = request
+        self._measures, self._base, self._model = request.measures, request.base, request.model
         self._paper_model = ViscoelasticWheel()
         paper_measures = (
             measure
@@ -219,9 +220,9 @@ class ToleranceEngine:
     """Engine that computes measures to a tolerance; see `vrw.measure_to_tolerance`."""
 
     def __init__(self, request: EvaluationRequest) -> None:
-        self._measures, self._base, self._model, *_, tol = request
-        assert tol is not None
-        self._tol = tol
+        assert request.tol is not None
+        self._measures, self._base, self._model = request.measures, request.base, request.model
+        self._tol = request.tol
 
     def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the results by variable; `columns` contains the values of each swept parameter,
