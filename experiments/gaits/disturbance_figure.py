@@ -40,8 +40,8 @@ def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure
         ("faster", result.forward_sizes, plots.LEG_1_COLOR),
     )
     for phase, label in enumerate(PHASE_LABELS):
-        is_in_phase = result.phase_indices == phase
-        times = result.times[is_in_phase]
+        is_in_phase = result.profile_phase_indices == phase
+        times = result.profile_times[is_in_phase]
         if phase == 1:
             profile.axvspan(times[0], times[-1], color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
         profile.text(
@@ -55,7 +55,7 @@ def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure
     profile.set_xlabel("time after the landing [s]")
     profile.set_ylabel("smallest change of $\\dot\\theta$ [rad/s]")
     profile.set_ylim(bottom=0.0)
-    profile.set_xlim(result.times[0], result.times[-1])
+    profile.set_xlim(result.profile_times[0], result.profile_times[-1])
     profile.legend()
     branch.plot(basins.damping, basins.smallest_disturbance, "o-", color="black", markersize=2.5)
     branch.set_xlabel(format_axis_label("damping"))

@@ -15,7 +15,7 @@ def estimate_probability(fails, n_samples=40_000):
     random, n = np.random.default_rng(0), len(DIRECTION)
     density = fit_failure_density(lambda e: (fails(e), fails(e)), n, random)
     deviations = density.draw_samples(n_samples, random)
-    log_ratios = GaussianMixture.isotropic(n, 1.0).compute_log_density(deviations)
+    log_ratios = GaussianMixture.make_isotropic_gaussian(n, 1.0).compute_log_density(deviations)
     weights = np.exp(log_ratios - density.compute_log_density(deviations)) * fails(deviations)
     return np.mean(weights), np.std(weights) / np.sqrt(n_samples)
 

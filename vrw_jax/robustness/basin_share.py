@@ -21,20 +21,22 @@ from vrw_jax.simulation import (
 from vrw_jax.validation import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.wheel import Outcome, WheelParams
 
-Sampling = Literal["sobol", "random"]
+StartSampling = Literal["sobol", "random"]
 StartBox = Mapping[str, float | tuple[float, float]]
-"""Bounds of each component of a start, by name; a single number is fixed."""
+"""Bounds (lower, upper) of each component of a start, by its name. A single number fixes the
+component."""
 
 
 class BasinShare(AbstractPrintable):
     """Share of a box of starts from which a wheel ends up on its gait.
 
     - `share`: share of the starts whose walk arrives at the gait;
-    - `share_error`: standard error of the share for independent starts;
+    - `share_error`: standard error of `share` for independent starts;
     - `walking_share`: share of the starts that still walk after 1, 2, ... steps, on the gait or
       not, shape (max_steps,);
-    - `walking_share_error`: standard errors of these shares, shape (max_steps,);
-    - `elsewhere_share`: share of the starts that walk `max_steps` steps and are not on the gait;
+    - `walking_share_error`: standard errors of `walking_share`, shape (max_steps,);
+    - `elsewhere_share`: share of the starts that walk `max_steps` steps and do not arrive at the
+      gait;
     - `failure_shares`: share of the starts by the name of the outcome that ends their walk;
     - `n_starts`: number of starts.
 
@@ -58,9 +60,9 @@ class BasinShare(AbstractPrintable):
     n_starts: int = eqx.field(static=True)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return label and text of each share, with its error."""
+        """Return the label and the text of each share, with its standard error."""
         n = len(self.walking_share)
-        walking_fraction, walking_fraction_error = (
+        final_walking_share, final_walking_share_error = (
             self.walking_share[-1],
             self.walking_share_error[-1],
         )
@@ -68,7 +70,7 @@ class BasinShare(AbstractPrintable):
             ("ends up on the gait", f"{self.share:.4f} (standard error {self.share_error:.4f})"),
             (
                 f"walks after {n} steps",
-                f"{walking_fraction:.4f} (standard error {walking_fraction_error:.4f})",
+                f"{final_walking_share:.4f} (standard error {final_walking_share_error:.4f})",
             ),
         ]
         text_rows += [(name, f"{share:.4f}") for name, share in self.failure_shares.items()]
@@ -85,18 +87,18 @@ def basin_share(
     options: StepOptions | None = None,
     n_starts: int = 4096,
     max_steps: int = 200,
-    sampling: Sampling = "sobol",
+    sampling: StartSampling = "sobol",
     seed: int = 0,
 ) -> BasinShare:
     """Return the share of a box of starts from which the wheel ends up on its gait.
 
-    The starts are spread evenly over `box`. A walk has arrived when its section state differs from
-    that of the gait by less than 1e-6 in the wheel's own units. The gait must be stable, so that it
-    is kept from there on.
+    The starts are spread evenly over `box`. A walk arrives at the gait if its section state differs
+    from that of the gait by less than 1e-6 in units of the wheel (`compute_wheel_units`). The gait
+    must be stable, so that the walk stays on it.
 
-    The errors are standard errors of a binomial share, with one start added on either side, so that
-    they are positive for shares of 0 and 1. They hold for `sampling="random"`. Points of a
-    scrambled Sobol' sequence have smaller errors in most boxes.
+    The errors are standard errors of a binomial share. One start is added on either side, so that
+    the error is positive for a share of 0 or 1. The errors hold for `sampling="random"`. In most
+    boxes, points of a scrambled Sobol' sequence have smaller errors than these.
 
     Args:
         params: the wheel.
@@ -126,84 +128,91 @@ def basin_share(
         0.75
     """
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
-    check_choice("sampling", sampling, get_args(Sampling))
-    seed, bounds = check_int("seed", seed, 0), parse_box(box)
-    gait = StableGait.find("vrw.basin_share", params, model, cycle, options)
-    return compute_basin_share(gait, bounds, n_starts, max_steps, sampling, seed)
+    check_choice("sampling", sampling, get_args(StartSampling))
+    seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box)
+    stable_gait = StableGait.from_cycle("vrw.basin_share", params, model, cycle, options)
+    return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
 
 
-class BoxBounds(NamedTuple):
-    """Names and bounds of the components of starts."""
+class StartBoxBounds(NamedTuple):
+    """Names and bounds of the components of starts, in rad, rad/s and m/s."""
 
-    names: tuple[str, ...]
-    lower: np.ndarray
-    upper: np.ndarray
+    component_names: tuple[str, ...]
+    lower_bounds: np.ndarray
+    upper_bounds: np.ndarray
 
 
 def compute_basin_share(
-    gait: StableGait,
-    bounds: BoxBounds,
+    stable_gait: StableGait,
+    box_bounds: StartBoxBounds,
     n_starts: int,
     max_steps: int,
     sampling: str = "sobol",
     seed: int = 0,
 ) -> BasinShare:
-    """Return the result of `basin_share` for a gait and checked arguments."""
-    unit_points = _draw_unit_points(len(bounds.names), n_starts, sampling, seed)
-    starts = bounds.lower + (bounds.upper - bounds.lower) * unit_points
-    if bounds.names == POST_LANDING_NAMES:
-        starts = invert_landing(gait.params, starts)
-    is_reachable = np.isfinite(starts).all(-1)
-    is_on_gait, n_stepped = np.zeros(n_starts, bool), np.zeros(n_starts, int)
-    outcome = np.full(n_starts, int(Outcome.BAD_INPUT))
-    if is_reachable.any():
-        walks = walk_to_gait(gait, starts[is_reachable], max_steps)
-        is_on_gait[is_reachable], outcome[is_reachable] = walks.is_on_gait, walks.outcome
-        n_stepped[is_reachable] = walks.n_stepped
-    n_stepped[is_on_gait] = max_steps
-    walking_share = np.mean(n_stepped[:, None] >= np.arange(1, max_steps + 1), 0)
-    share_by_failure = {code.name: float(np.mean(outcome == code)) for code in Outcome if code}
-    share = float(is_on_gait.mean())
+    """Return the `BasinShare` of a stable gait for validated arguments of `basin_share`."""
+    n_components = len(box_bounds.component_names)
+    random_generator = np.random.default_rng(seed)
+    if sampling == "random":
+        unit_points = random_generator.random((n_starts, n_components))
+    else:
+        from scipy.stats import qmc  # This import is slow.
+
+        sobol_sampler = qmc.Sobol(n_components, rng=random_generator)
+        unit_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
+    starts = (
+        box_bounds.lower_bounds + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_points
+    )
+    if box_bounds.component_names == POST_LANDING_NAMES:
+        starts = invert_landing(stable_gait.params, starts)
+    is_start_reachable = np.isfinite(starts).all(-1)
+    is_on_gait, n_steps_walked = np.zeros(n_starts, bool), np.zeros(n_starts, int)
+    walk_outcomes = np.full(n_starts, int(Outcome.BAD_INPUT))
+    if is_start_reachable.any():
+        arrival_result = walk_to_gait(stable_gait, starts[is_start_reachable], max_steps)
+        is_on_gait[is_start_reachable], walk_outcomes[is_start_reachable] = (
+            arrival_result.is_on_gait,
+            arrival_result.outcome,
+        )
+        n_steps_walked[is_start_reachable] = arrival_result.n_stepped
+    n_steps_walked[is_on_gait] = max_steps
+    walking_share = np.mean(n_steps_walked[:, None] >= np.arange(1, max_steps + 1), 0)
+    share_by_failure = {
+        outcome_code.name: float(np.mean(walk_outcomes == outcome_code))
+        for outcome_code in Outcome
+        if outcome_code
+    }
+    arrival_share = float(is_on_gait.mean())
     return BasinShare(
-        share=share,
-        share_error=compute_share_error(share, n_starts),
+        share=arrival_share,
+        share_error=compute_share_error(arrival_share, n_starts),
         walking_share=walking_share,
         walking_share_error=compute_share_error(walking_share, n_starts),
-        elsewhere_share=float(np.mean((outcome == Outcome.STEPPED) & ~is_on_gait)),
+        elsewhere_share=float(np.mean((walk_outcomes == Outcome.STEPPED) & ~is_on_gait)),
         failure_shares={name: value for name, value in share_by_failure.items() if value > 0.0},
         n_starts=n_starts,
     )
 
 
-def compute_share_error(share: Any, n: int) -> Any:
-    """Return the standard error of a share of n independent draws, or of an array of shares.
+def compute_share_error(share: Any, n_draws: int) -> Any:
+    """Return the standard error of a share of `n_draws` independent draws, or of an array of
+    shares.
 
-    One draw on either side is added (Laplace's rule of succession), so that the error is never
-    zero.
+    One draw on either side is added (Laplace's rule of succession), so that the error is positive.
     """
-    smoothed_share = (share * n + 1.0) / (n + 2.0)
-    return (smoothed_share * (1.0 - smoothed_share) / n) ** 0.5
+    smoothed_share = (share * n_draws + 1.0) / (n_draws + 2.0)
+    return (smoothed_share * (1.0 - smoothed_share) / n_draws) ** 0.5
 
 
-def _draw_unit_points(n_dims: int, n_points: int, sampling: str, seed: int) -> np.ndarray:
-    """Return points of the unit cube, (n_points, n_dims)."""
-    if sampling == "random":
-        return np.random.default_rng(seed).random((n_points, n_dims))
-    from scipy.stats import qmc  # This import is slow.
+def parse_start_box(box: StartBox) -> StartBoxBounds:
+    """Return the names and bounds of the components of the starts.
 
-    sobol_exponent = (n_points - 1).bit_length()
-    generator = np.random.default_rng(seed)
-    return qmc.Sobol(n_dims, rng=generator).random_base2(sobol_exponent)[:n_points]
-
-
-def parse_box(box: StartBox) -> BoxBounds:
-    """Return names and bounds of the components of the starts.
-
-    Raises `TypeError` or `ValueError` unless the box bounds all components of one kind.
+    Raise TypeError if the box is not a mapping. Raise ValueError unless the box bounds all
+    components of one kind of start.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
-    for names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
-        if set(box) == set(names):
+    for component_names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
+        if set(box) == set(component_names):
             break
     else:
         raise ValueError(
@@ -211,10 +220,12 @@ def parse_box(box: StartBox) -> BoxBounds:
             f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
             "each a number or two bounds."
         )
-    is_number = lambda value: np.ndim(value) == 0
-    bounds = [
-        (check_real(name, box[name]),) * 2 if is_number(box[name]) else check_range(name, box[name])
-        for name in names
+    is_fixed_value = lambda value: np.ndim(value) == 0
+    component_bounds = [
+        (check_real(component_name, box[component_name]),) * 2
+        if is_fixed_value(box[component_name])
+        else check_range(component_name, box[component_name])
+        for component_name in component_names
     ]
-    lower, upper = np.array(bounds).T
-    return BoxBounds(names, lower, upper)
+    lower_bounds, upper_bounds = np.array(component_bounds).T
+    return StartBoxBounds(component_names, lower_bounds, upper_bounds)

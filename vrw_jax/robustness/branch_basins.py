@@ -1,4 +1,4 @@
-"""Basins of the gaits along a branch."""
+"""Sizes of the basins of attraction of the gaits along a branch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vrw_jax.branches import Branch
 from vrw_jax.measures import measure_attrs
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_box
+from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_start_box
 from vrw_jax.robustness.gait_arrival import StableGait
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
 from vrw_jax.runtime import with_default_settings
@@ -25,7 +25,7 @@ BASIN_VARIABLE_ATTRS = {
     "smallest_disturbance": ("rad/s", "smallest change of dtheta that leaves the basin"),
     "smallest_disturbance_error": ("rad/s", "error of that change"),
 }
-"""Unit and meaning of each variable of the result."""
+"""Unit and meaning of each variable of the dataset that `measure_basins` returns."""
 
 
 @with_default_settings
@@ -41,11 +41,11 @@ def measure_basins(
 ) -> xr.Dataset:
     """Return the sizes of the basins of the stable gaits along a branch.
 
-    The result has `n_points` points of the branch, evenly spaced over its points, both ends
+    The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
     included. Its coordinate is the parameter of the branch. Numbers of unstable gaits are NaN. With
     a `box`, the variables include `basin_share` and `basin_share_error` (see `basin_share`). For
     models that can begin within a step, they include `smallest_disturbance` and
-    `smallest_disturbance_error`, rad/s (see the function of that name).
+    `smallest_disturbance_error`, rad/s (see `smallest_disturbance`).
 
     Args:
         branch: a branch of gaits of one step, from `continue_branch`.
@@ -71,12 +71,12 @@ def measure_basins(
     checked_model, checked_options = check_model(model), check_options(options)
     n_points, n_starts = check_int("n_points", n_points), check_int("n_starts", n_starts)
     max_steps = check_int("max_steps", max_steps)
-    bounds = None if box is None else parse_box(box)
-    attrs = branch.dataset.attrs
-    if attrs.get("model") != repr(checked_model):
+    box_bounds = None if box is None else parse_start_box(box)
+    branch_attrs = branch.dataset.attrs
+    if branch_attrs.get("model") != repr(checked_model):
         raise ValueError(
-            f"the branch is one of {attrs.get('model', 'a map')}, but model is {checked_model!r}: "
-            "give the model of the branch."
+            f"the branch is one of {branch_attrs.get('model', 'a map')}, but model is "
+            f"{checked_model!r}: give the model of the branch."
         )
     n_branch_points = len(branch.values)
     if n_branch_points == 0:
@@ -89,64 +89,64 @@ def measure_basins(
     )
     values_by_variable: dict[str, np.ndarray] = {}
 
-    def record_value(variable_name: str, point_position: int, value: float) -> None:
+    def record_value(variable_name: str, result_index: int, variable_value: float) -> None:
         values_by_variable.setdefault(variable_name, np.full(len(point_indices), np.nan))[
-            point_position
-        ] = value
+            result_index
+        ] = variable_value
 
-    for i, point in enumerate(point_indices):
-        if not branch.stable[point]:
+    for result_index, point_index in enumerate(point_indices):
+        if not branch.stable[point_index]:
             continue
-        gait = _gait_at_point(branch, int(point), checked_model, checked_options)
-        if bounds is not None:
-            basin_share_result = compute_basin_share(gait, bounds, n_starts, max_steps)
-            record_value("basin_share", i, basin_share_result.share)
-            record_value("basin_share_error", i, basin_share_result.share_error)
+        stable_gait = _load_branch_gait(branch, int(point_index), checked_model, checked_options)
+        if box_bounds is not None:
+            basin_share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
+            record_value("basin_share", result_index, basin_share_result.share)
+            record_value("basin_share_error", result_index, basin_share_result.share_error)
         if checked_model.capabilities.begins_within_step:
-            disturbance_result = compute_smallest_disturbance(gait, None, max_steps)
-            record_value("smallest_disturbance", i, disturbance_result.size)
-            record_value("smallest_disturbance_error", i, disturbance_result.size_error)
+            disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
+            record_value("smallest_disturbance", result_index, disturbance_result.size)
+            record_value("smallest_disturbance_error", result_index, disturbance_result.size_error)
     make_attrs = lambda parameter_name: dict(
         zip(("units", "long_name"), BASIN_VARIABLE_ATTRS[parameter_name], strict=True)
     )
-    variables = {
-        parameter_name: xr.Variable("point", x, make_attrs(parameter_name))
-        for parameter_name, x in values_by_variable.items()
+    basin_variables = {
+        parameter_name: xr.Variable("point", variable_values, make_attrs(parameter_name))
+        for parameter_name, variable_values in values_by_variable.items()
     }
     parameter_name = branch.parameter
-    coordinates = {
+    branch_coordinates = {
         parameter_name: xr.Variable(
             "point", branch.values[point_indices], measure_attrs(parameter_name)
         )
     }
-    title = {"title": f"Basins of the gaits along {parameter_name}"}
-    return xr.Dataset(variables, coordinates, attrs | title)
+    title_attr = {"title": f"Basins of the gaits along {parameter_name}"}
+    return xr.Dataset(basin_variables, branch_coordinates, branch_attrs | title_attr)
 
 
-def _gait_at_point(
-    branch: Branch, point: int, model: AbstractWheel, options: StepOptions
+def _load_branch_gait(
+    branch: Branch, point_index: int, model: AbstractWheel, options: StepOptions
 ) -> StableGait:
-    """Return the gait at a point of a branch.
+    """Return the gait of one step at a point of a branch.
 
-    Raises `ValueError` unless the gait repeats after one step.
+    Raise ValueError unless the gait repeats after one step.
     """
-    attrs, dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
+    branch_attrs, float_dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
     parameter_values = {
-        name: jnp.asarray(attrs[f"parameter_{name}"], dtype)
-        for name in PARAMETER_NAMES
-        if f"parameter_{name}" in attrs
+        parameter_name: jnp.asarray(branch_attrs[f"parameter_{parameter_name}"], float_dtype)
+        for parameter_name in PARAMETER_NAMES
+        if f"parameter_{parameter_name}" in branch_attrs
     }
-    params = WheelParams(**parameter_values, n_legs=attrs["parameter_n_legs"])
-    branch_value = jnp.asarray(branch.values[point], dtype)
+    params = WheelParams(**parameter_values, n_legs=branch_attrs["parameter_n_legs"])
+    branch_value = jnp.asarray(branch.values[point_index], float_dtype)
     point_model, params = model.with_parameter(params, branch.parameter, branch_value)
-    section_state = np.asarray(branch.dataset.section_state.values[point])[None]
-    gait = StableGait(params, point_model, options, section_state)
+    section_state = np.asarray(branch.dataset.section_state.values[point_index])[None]
+    stable_gait = StableGait(params, point_model, options, section_state)
     next_section_state = step_batch(
         params, section_state, model=point_model, options=options
     ).section_state
-    if not gait.contains(next_section_state)[0]:
+    if not stable_gait.is_on_gait(next_section_state)[0]:
         raise ValueError(
             "a gait of the branch does not repeat after one step, but basins along branches are "
             "those of gaits of one step: continue a branch with period_n=1."
         )
-    return gait
+    return stable_gait

@@ -1,8 +1,8 @@
-"""Gaussian mixtures fitted to rare failures, from which failing walks are drawn with known weights.
+"""Gaussian mixtures fitted to rare failures of walks, for importance sampling.
 
 The fit is the cross-entropy method (Rubinstein and Kroese 2004). The standard deviation of the
-slopes is inflated until failures are frequent. A mixture is then fitted to the failures, and the
-inflation is lowered to 1 in stages.
+slopes is multiplied by an inflation so large that failures are frequent. A mixture is then fitted
+to the failures, and the inflation decreases to 1 in stages.
 """
 
 from collections.abc import Callable
@@ -10,53 +10,55 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DeviationSampler = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Function that runs one walk for each row of standardized slope deviations. It returns whether
-each walk fails in its last step, and whether each walk fails in any step."""
+RunDeviationWalks = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Function that runs one walk for each standardized sequence of slopes, shape (walks, lines). It
+returns two boolean arrays of shape (walks,): whether a walk fails in its last step, and whether a
+walk fails in any step."""
 
 
 @dataclass(frozen=True)
-class DensityOptions:
-    """Options of the fitted density."""
+class FailureDensityOptions:
+    """Options of the Gaussian mixture that is fitted to failing walks."""
 
-    n_samples: int = 6144
+    max_walks_per_stage: int = 6144
     """Largest number of walks of each stage. The value is chosen because fits to fewer walks vary
     by tens of per cent."""
-    n_components: int = 4
-    """Number of Gaussians. The value is chosen because the paper's wheel fails in two ways, and
-    each failing region is curved."""
-    nominal_fraction: float = 0.1
-    """Fraction of walks that are drawn without bias. Its inverse bounds all weights. These walks
-    also find failures that the fit missed, if such failures are frequent enough to matter."""
-    wide_fraction: float = 0.2
+    n_gaussians: int = 4
+    """Number of Gaussians of a fit. The value is chosen because the paper's wheel fails in two
+    ways, and each failing region is curved."""
+    nominal_walk_fraction: float = 0.1
+    """Fraction of walks that are drawn from the nominal density of the slopes. Its inverse bounds
+    all likelihood ratios. These walks also find frequent failures that the fit missed."""
+    wide_walk_fraction: float = 0.2
     """Fraction of walks that are drawn from the fitted Gaussians with larger standard deviations.
-    These walks bound the weights where the failures extend beyond the fit."""
-    wide_factor: float = 1.7
-    """Factor of these standard deviations."""
-    n_refits: int = 2
+    These walks bound the likelihood ratios where failures extend beyond the fit."""
+    widening_factor: float = 1.7
+    """Factor of the standard deviations of the wide Gaussians."""
+    n_uninflated_fits: int = 2
     """Number of fits without inflation. The value is chosen because the second fit uses failures
     that the first one produces."""
     min_failure_fraction: float = 0.15
-    """Fraction of failing walks at which the inflation is large enough. The value is chosen because
-    about a third of failing walks fail in their last step."""
-    inflation_factor: float = 1.3
-    """Factor between successive inflations."""
-    max_inflation: float = 20.0
-    """Largest inflation. The value is chosen because rarer failures have probabilities below
-    1e-80."""
+    """Fraction of failing walks at which the slopes are inflated enough. The value is chosen
+    because about a third of failing walks fail in their last step."""
+    slope_inflation_factor: float = 1.3
+    """Factor between successive inflations of the slopes' standard deviation."""
+    max_slope_inflation: float = 20.0
+    """Largest inflation of the slopes' standard deviation. The value is chosen because failures
+    that need more inflation have probabilities below 1e-80."""
     effective_samples_per_dimension: float = 60.0
-    """Smallest effective number of failures at the next, smaller inflation, per dimension. The
-    value is chosen because each Gaussian in five dimensions has 20 parameters."""
-    covariance_floor: float = 0.02
-    """Variance that is added in every direction. It bounds the weights if failures are few."""
+    """Smallest effective number of failures per dimension at the next, smaller inflation. The value
+    is chosen because each Gaussian in five dimensions has 20 parameters."""
+    min_gaussian_variance: float = 0.02
+    """Variance that is added to each Gaussian in every direction. It bounds the likelihood ratios
+    if failures are few."""
     n_em_iterations: int = 25
     """Number of iterations of expectation maximization. The value is chosen because later
-    iterations change the variance of the weights by less than 5 %."""
+    iterations change the variance of the likelihood ratios by less than 5 %."""
     n_em_samples: int = 2000
-    """Number of failures that are drawn by weight for a fit."""
+    """Number of failures that are drawn by weight for each fit."""
 
 
-DENSITY_OPTIONS = DensityOptions()
+FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 
 
 @dataclass(frozen=True)
@@ -64,190 +66,249 @@ class GaussianMixture:
     """Mixture of Gaussians over standardized slope deviations."""
 
     component_weights: np.ndarray  # (components,), sum 1
-    means: np.ndarray  # (components, dimensions)
-    cholesky_factors: (
+    component_means: np.ndarray  # (components, dimensions)
+    covariance_cholesky_factors: (
         np.ndarray
     )  # Cholesky factors of the covariances, (components, dimensions, dimensions)
 
     @classmethod
-    def isotropic(cls, n_dimensions: int, scale: float) -> "GaussianMixture":
-        """Return one Gaussian of mean zero with the same standard deviation `scale` in all
-        directions.
-        """
-        return cls(np.ones(1), np.zeros((1, n_dimensions)), scale * np.eye(n_dimensions)[None])
+    def make_isotropic_gaussian(
+        cls, n_dimensions: int, standard_deviation: float
+    ) -> "GaussianMixture":
+        """Return one Gaussian of mean zero with the same standard deviation in all directions."""
+        return cls(
+            np.ones(1), np.zeros((1, n_dimensions)), standard_deviation * np.eye(n_dimensions)[None]
+        )
 
-    def with_component(self, other_mixture: "GaussianMixture", weight: float) -> "GaussianMixture":
-        """Return the mixture of this mixture and another one, which has the total weight
-        `weight`.
+    def add_component(
+        self, other_mixture: "GaussianMixture", other_weight: float
+    ) -> "GaussianMixture":
+        """Return the mixture of this mixture and `other_mixture`, which has the total weight
+        `other_weight`.
         """
         return GaussianMixture(
             np.concatenate(
-                [(1.0 - weight) * self.component_weights, weight * other_mixture.component_weights]
+                [
+                    (1.0 - other_weight) * self.component_weights,
+                    other_weight * other_mixture.component_weights,
+                ]
             ),
-            np.concatenate([self.means, other_mixture.means]),
-            np.concatenate([self.cholesky_factors, other_mixture.cholesky_factors]),
+            np.concatenate([self.component_means, other_mixture.component_means]),
+            np.concatenate(
+                [self.covariance_cholesky_factors, other_mixture.covariance_cholesky_factors]
+            ),
         )
 
-    def widen(self, factor: float) -> "GaussianMixture":
-        """Return the mixture with standard deviations multiplied by `factor`."""
-        return GaussianMixture(self.component_weights, self.means, factor * self.cholesky_factors)
+    def widen(self, deviation_factor: float) -> "GaussianMixture":
+        """Return the mixture with all standard deviations multiplied by `deviation_factor`."""
+        return GaussianMixture(
+            self.component_weights,
+            self.component_means,
+            deviation_factor * self.covariance_cholesky_factors,
+        )
 
-    def compute_component_log_densities(self, deviations: np.ndarray) -> np.ndarray:
-        """Return the logarithm of each component's weighted density, (components, samples)."""
+    def compute_component_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
+        """Return the logarithm of the weighted density of each Gaussian, shape (components,
+        samples).
+        """
         log_densities = []
-        for component_weight, component_mean, cholesky_factor in zip(
-            self.component_weights, self.means, self.cholesky_factors, strict=True
+        for component_weight, component_mean, covariance_cholesky_factor in zip(
+            self.component_weights,
+            self.component_means,
+            self.covariance_cholesky_factors,
+            strict=True,
         ):
-            whitened = np.linalg.solve(cholesky_factor, (deviations - component_mean).T)
-            log_scale = np.sum(np.log(np.diag(cholesky_factor)))
-            log_constant = (
+            whitened_deviations = np.linalg.solve(
+                covariance_cholesky_factor, (slope_deviations - component_mean).T
+            )
+            log_cholesky_determinant = np.sum(np.log(np.diag(covariance_cholesky_factor)))
+            log_normalization = (
                 np.log(component_weight)
-                - log_scale
+                - log_cholesky_determinant
                 - 0.5 * len(component_mean) * np.log(2.0 * np.pi)
             )
-            log_densities.append(log_constant - 0.5 * np.sum(whitened**2, 0))
+            log_densities.append(log_normalization - 0.5 * np.sum(whitened_deviations**2, 0))
         return np.stack(log_densities)
 
-    def compute_log_density(self, deviations: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the density at each sample, (samples,)."""
-        densities: np.ndarray = np.logaddexp.reduce(
-            self.compute_component_log_densities(deviations), 0
+    def compute_log_density(self, slope_deviations: np.ndarray) -> np.ndarray:
+        """Return the logarithm of the mixture's density at each sample, shape (samples,)."""
+        log_densities: np.ndarray = np.logaddexp.reduce(
+            self.compute_component_log_densities(slope_deviations), 0
         )
-        return densities
+        return log_densities
 
-    def draw_samples(self, n_samples: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent samples, (samples, dimensions)."""
-        component_index = generator.choice(
+    def draw_samples(self, n_samples: int, random_generator: np.random.Generator) -> np.ndarray:
+        """Return independent samples of the mixture, shape (samples, dimensions)."""
+        component_indices = random_generator.choice(
             len(self.component_weights), n_samples, p=self.component_weights
         )
-        standard_normal = generator.standard_normal((n_samples, self.means.shape[1]))
-        deviations = self.means[component_index]
-        for member_index, cholesky_factor in enumerate(self.cholesky_factors):
-            is_member = component_index == member_index
-            deviations[is_member] += standard_normal[is_member] @ cholesky_factor.T
-        return deviations
+        normal_samples = random_generator.standard_normal(
+            (n_samples, self.component_means.shape[1])
+        )
+        slope_deviations = self.component_means[component_indices]
+        for component_index, covariance_cholesky_factor in enumerate(
+            self.covariance_cholesky_factors
+        ):
+            is_from_component = component_indices == component_index
+            slope_deviations[is_from_component] += (
+                normal_samples[is_from_component] @ covariance_cholesky_factor.T
+            )
+        return slope_deviations
 
 
-def fit_mixture(
-    deviations: np.ndarray, generator: np.random.Generator, options: DensityOptions
+def fit_gaussian_mixture(
+    slope_deviations: np.ndarray,
+    random_generator: np.random.Generator,
+    density_options: FailureDensityOptions,
 ) -> GaussianMixture:
     """Return a Gaussian mixture fitted to samples by expectation maximization.
 
     The initial means are samples far from each other (Arthur and Vassilvitskii 2007).
 
-    - `deviations`: samples, (samples, dimensions).
+    - `slope_deviations`: samples, shape (samples, dimensions).
     """
-    n_samples, n_dimensions = deviations.shape
-    covariance_floor = options.covariance_floor * np.eye(n_dimensions)
-    means = deviations[generator.integers(n_samples)][None]
-    for _ in range(options.n_components - 1):
-        distances = np.min(np.sum((deviations[:, None] - means) ** 2, -1), 1)
-        total_distance = np.sum(distances)
-        selection_probabilities = distances / total_distance if total_distance > 0.0 else None
-        means = np.concatenate(
-            [means, deviations[generator.choice(n_samples, p=selection_probabilities)][None]]
+    n_samples, n_dimensions = slope_deviations.shape
+    covariance_floor = density_options.min_gaussian_variance * np.eye(n_dimensions)
+    component_means = slope_deviations[random_generator.integers(n_samples)][None]
+    for _ in range(density_options.n_gaussians - 1):
+        squared_distances = np.min(
+            np.sum((slope_deviations[:, None] - component_means) ** 2, -1), 1
         )
-    covariance = np.cov(deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
-    cholesky_factors = np.tile(np.linalg.cholesky(covariance), (len(means), 1, 1))
-    mixture = GaussianMixture(np.full(len(means), 1.0 / len(means)), means, cholesky_factors)
-    for _ in range(options.n_em_iterations):
-        log_densities = mixture.compute_component_log_densities(deviations)
-        membership = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
-        component_counts = (
-            np.sum(membership, 1) + 1.0
-        )  # One more sample prevents an empty component.
-        means = (membership @ deviations + mixture.means) / component_counts[:, None]
-        cholesky_factors = np.empty_like(mixture.cholesky_factors)
+        total_squared_distance = np.sum(squared_distances)
+        selection_probabilities = (
+            squared_distances / total_squared_distance if total_squared_distance > 0.0 else None
+        )
+        component_means = np.concatenate(
+            [
+                component_means,
+                slope_deviations[random_generator.choice(n_samples, p=selection_probabilities)][
+                    None
+                ],
+            ]
+        )
+    covariance = np.cov(slope_deviations.T).reshape(n_dimensions, n_dimensions) + covariance_floor
+    cholesky_factors = np.tile(np.linalg.cholesky(covariance), (len(component_means), 1, 1))
+    gaussian_mixture = GaussianMixture(
+        np.full(len(component_means), 1.0 / len(component_means)), component_means, cholesky_factors
+    )
+    for _ in range(density_options.n_em_iterations):
+        log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
+        membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
+        effective_component_sizes = (
+            np.sum(membership_probabilities, 1) + 1.0
+        )  # One more sample prevents an empty Gaussian.
+        component_means = (
+            membership_probabilities @ slope_deviations + gaussian_mixture.component_means
+        ) / effective_component_sizes[:, None]
+        cholesky_factors = np.empty_like(gaussian_mixture.covariance_cholesky_factors)
         for component_index, (component_membership, component_mean) in enumerate(
-            zip(membership, means, strict=True)
+            zip(membership_probabilities, component_means, strict=True)
         ):
-            centered = deviations - component_mean
-            covariance = (component_membership * centered.T) @ centered / component_counts[
-                component_index
-            ] + covariance_floor
+            centered_deviations = slope_deviations - component_mean
+            covariance = (
+                component_membership * centered_deviations.T
+            ) @ centered_deviations / effective_component_sizes[component_index] + covariance_floor
             cholesky_factors[component_index] = np.linalg.cholesky(covariance)
-        mixture = GaussianMixture(
-            component_counts / np.sum(component_counts), means, cholesky_factors
+        gaussian_mixture = GaussianMixture(
+            effective_component_sizes / np.sum(effective_component_sizes),
+            component_means,
+            cholesky_factors,
         )
-    return mixture
+    return gaussian_mixture
 
 
 def fit_failure_density(
-    run_walks: DeviationSampler,
+    run_walks: RunDeviationWalks,
     n_dimensions: int,
-    generator: np.random.Generator,
-    options: DensityOptions = DENSITY_OPTIONS,
+    random_generator: np.random.Generator,
+    density_options: FailureDensityOptions = FAILURE_DENSITY_OPTIONS,
 ) -> GaussianMixture | None:
-    """Return a density from which walks often fail in their last step; None if no walk failed.
+    """Return a density of slopes on which walks often fail in their last step.
 
-    The density contains a fraction of the nominal density, which is standard normal.
+    The slopes are standardized: the nominal density is standard normal. The returned mixture
+    contains a fraction of the nominal density. Return None if no walk failed.
     """
-    nominal_density = GaussianMixture.isotropic(n_dimensions, 1.0)
-    inflation = 1.0
+    nominal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, 1.0)
+    slope_inflation = 1.0
     while True:
-        density = GaussianMixture.isotropic(n_dimensions, inflation)
-        deviations = density.draw_samples(options.n_samples, generator)
-        has_failed_last, has_failed = run_walks(deviations)
-        if np.mean(has_failed) >= options.min_failure_fraction:
+        proposal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation)
+        slope_deviations = proposal_density.draw_samples(
+            density_options.max_walks_per_stage, random_generator
+        )
+        has_failed_last, has_walk_failed = run_walks(slope_deviations)
+        if np.mean(has_walk_failed) >= density_options.min_failure_fraction:
             break
-        inflation *= options.inflation_factor
-        if inflation > options.max_inflation:
+        slope_inflation *= density_options.slope_inflation_factor
+        if slope_inflation > density_options.max_slope_inflation:
             return None
-    n_refits = 0
+    n_finished_fits = 0
     while True:
         if not np.any(has_failed_last):
             return None
-        failing_deviations = deviations[has_failed_last]
-        log_proposal_density = density.compute_log_density(failing_deviations)
-        next_inflation, weights = _lower_inflation(
-            failing_deviations, log_proposal_density, inflation, options
+        failing_deviations = slope_deviations[has_failed_last]
+        log_proposal_density = proposal_density.compute_log_density(failing_deviations)
+        next_slope_inflation, failure_weights = _lower_slope_inflation(
+            failing_deviations, log_proposal_density, slope_inflation, density_options
         )
-        chosen_indices = generator.choice(len(failing_deviations), options.n_em_samples, p=weights)
-        fitted_mixture = fit_mixture(failing_deviations[chosen_indices], generator, options)
-        wide_mixture = fitted_mixture.widen(options.wide_factor)
-        fitted_mixture = fitted_mixture.with_component(wide_mixture, options.wide_fraction)
-        n_refits += inflation == 1.0
-        if n_refits == options.n_refits:
-            return fitted_mixture.with_component(nominal_density, options.nominal_fraction)
-        inflation = next_inflation
-        density = fitted_mixture.with_component(
-            GaussianMixture.isotropic(n_dimensions, inflation), options.nominal_fraction
+        resampled_indices = random_generator.choice(
+            len(failing_deviations), density_options.n_em_samples, p=failure_weights
         )
-        deviations = density.draw_samples(options.n_samples, generator)
-        has_failed_last, _ = run_walks(deviations)
+        fitted_mixture = fit_gaussian_mixture(
+            failing_deviations[resampled_indices], random_generator, density_options
+        )
+        wide_mixture = fitted_mixture.widen(density_options.widening_factor)
+        fitted_mixture = fitted_mixture.add_component(
+            wide_mixture, density_options.wide_walk_fraction
+        )
+        n_finished_fits += slope_inflation == 1.0
+        if n_finished_fits == density_options.n_uninflated_fits:
+            return fitted_mixture.add_component(
+                nominal_density, density_options.nominal_walk_fraction
+            )
+        slope_inflation = next_slope_inflation
+        proposal_density = fitted_mixture.add_component(
+            GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
+            density_options.nominal_walk_fraction,
+        )
+        slope_deviations = proposal_density.draw_samples(
+            density_options.max_walks_per_stage, random_generator
+        )
+        has_failed_last, _ = run_walks(slope_deviations)
 
 
-def _lower_inflation(
+def _lower_slope_inflation(
     failing_deviations: np.ndarray,
     log_proposal_density: np.ndarray,
-    inflation: float,
-    options: DensityOptions,
+    slope_inflation: float,
+    density_options: FailureDensityOptions,
 ) -> tuple[float, np.ndarray]:
-    """Return the smallest inflation at which enough failures have weight, and their weights
-    there.
+    """Return the smallest inflation at which enough failures have weight, and the weights of the
+    failures at that inflation.
     """
 
-    def compute_weights(inflation_of_target: float) -> np.ndarray:
-        log_target_density = GaussianMixture.isotropic(
-            failing_deviations.shape[1], inflation_of_target
+    def compute_weights(target_inflation: float) -> np.ndarray:
+        log_target_density = GaussianMixture.make_isotropic_gaussian(
+            failing_deviations.shape[1], target_inflation
         ).compute_log_density(failing_deviations)
         log_weights = log_target_density - log_proposal_density
-        weights = np.exp(log_weights - np.max(log_weights))
-        normalized_weights: np.ndarray = weights / np.sum(weights)
+        unnormalized_weights = np.exp(log_weights - np.max(log_weights))
+        normalized_weights: np.ndarray = unnormalized_weights / np.sum(unnormalized_weights)
         return normalized_weights
 
-    n_required = min(
-        options.effective_samples_per_dimension * failing_deviations.shape[1],
+    min_effective_samples = min(
+        density_options.effective_samples_per_dimension * failing_deviations.shape[1],
         0.3 * len(failing_deviations),
     )
-    has_enough_samples = lambda w: 1.0 / np.sum(w**2) >= n_required
-    next_inflation = inflation
-    while next_inflation > 1.0:
-        candidate_inflation = max(next_inflation / 1.05, 1.0)
+    has_enough_samples = lambda failure_weights: (
+        1.0 / np.sum(failure_weights**2) >= min_effective_samples
+    )
+    next_slope_inflation = slope_inflation
+    while next_slope_inflation > 1.0:
+        candidate_slope_inflation = max(next_slope_inflation / 1.05, 1.0)
         if (
-            not has_enough_samples(compute_weights(candidate_inflation))
-            and next_inflation < inflation
+            not has_enough_samples(compute_weights(candidate_slope_inflation))
+            and next_slope_inflation < slope_inflation
         ):
             break
-        next_inflation = candidate_inflation
-    return next_inflation, compute_weights(next_inflation)
+        next_slope_inflation = candidate_slope_inflation
+    return next_slope_inflation, compute_weights(next_slope_inflation)

@@ -1,4 +1,4 @@
-"""Mean number of steps until a wheel fails on uneven ground (first passage, metastability)."""
+"""Mean number of steps until a wheel fails on uneven ground (first-passage time)."""
 
 from typing import Any
 
@@ -19,12 +19,12 @@ from vrw_jax.simulation import ModelLike, check_model, check_options, check_sing
 from vrw_jax.validation import check_int, check_not_traced, check_positive, is_traced
 from vrw_jax.wheel import Outcome, WheelParams
 
-MAX_NODES = 3200
+MAX_QUADRATURE_NODES = 3200
 """Largest number of quadrature nodes, chosen because a matrix of this size takes 80 MB."""
 
 SAMPLED_STEP_TOLERANCE = 1e-6
-"""Tolerance of sampled steps. The value is chosen because the error of an event's time is then a
-ten-thousandth of its standard deviation on slopes that matter."""
+"""Tolerance of sampled steps. The value is chosen because the error of an event time is then small:
+a ten-thousandth of the standard deviation that random slopes cause."""
 
 
 class PassageStatus(StatusCode):
@@ -43,18 +43,20 @@ class FirstPassage(AbstractPrintable):
 
     - `mean_steps`: mean from the quasi-stationary distribution, 1/(1 - kappa_1);
     - `mean_steps_from_gait`: mean from the gait, before a landing on a line of the mean slope. With
-      samples, the relative error is at most 1.5 times that of `mean_steps`;
-    - `failure_probability`: probability 1 - kappa_1 to fail in one step from the quasi-stationary
-      distribution;
-    - `kappa_2`: second eigenvalue, the rate at which the effect of the start decays. With samples,
-      the error is some hundredths;
-    - `error`: error estimate of `mean_steps`, with samples at a confidence of 99 %;
+      samples, its relative error is at most 1.5 times that of `mean_steps`;
+    - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
+      distribution fails;
+    - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays.
+      With samples, its error is some hundredths;
+    - `error`: error estimate of `mean_steps`. With samples, it is half a confidence interval of 99
+      %;
     - `states`: states of the quasi-stationary distribution. With quadrature, they are squared rates
-      with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states, the
-      slope last;
+      with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states with
+      the slope as last component;
     - `weights`: weights of the states, whose sum is 1;
     - `status`: a `PassageStatus`;
-    - `end_names`, `end_fractions`: outcomes that end walks, and the fraction of each;
+    - `end_names`, `end_fractions`: outcomes that end walks, and the fraction of walks that each
+      outcome ends;
     - `n_steps`: number of sampled steps; 0 with quadrature.
 
     Examples:
@@ -79,28 +81,33 @@ class FirstPassage(AbstractPrintable):
 
     @property
     def kappa_1(self) -> Scalar:
-        """Return the leading eigenvalue, which is the probability to survive a step."""
+        """Return the leading eigenvalue of the survival operator, which is the probability to
+        survive a step.
+        """
         return 1.0 - self.failure_probability
 
     @property
     def ending(self) -> str:
-        """Return whether the error is within the tolerance, as a sentence."""
+        """Return a sentence about whether the error is within the tolerance."""
         return describe_ending(self.status, PassageStatus)
 
     def summary_rows(self) -> list[TextRow]:
-        """Return the rows of the printed result as pairs of label and text."""
-        ends = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
-        sampled_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
+        """Return pairs of label and text for means, probability, outcomes and status."""
+        outcome_fractions = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
+        sampled_steps_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
         return [
             ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
             ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
             ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
             (
                 "ends",
-                ", ".join(f"{end_name} {100 * fraction:.3g} %" for end_name, fraction in ends)
+                ", ".join(
+                    f"{outcome_name} {100 * outcome_fraction:.3g} %"
+                    for outcome_name, outcome_fraction in outcome_fractions
+                )
                 or "none",
             ),
-            ("sampled steps", sampled_text),
+            ("sampled steps", sampled_steps_text),
             ("status", self.ending),
         ]
 
@@ -121,15 +128,17 @@ def first_passage(
     """Return the mean number of steps until failure on random slopes (Byl and Tedrake 2009).
 
     The slopes of the lines that join the footholds are independent and normal, with mean
-    `params.slope`. A walk ends at the first step whose outcome is not STEPPED; a slope outside its
-    domain is such a step. On the paper's wheel a failure is a departure from its sequence of phases
-    and mostly no fall; `UnilateralWheel` continues.
+    `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A step onto a slope
+    outside its domain also ends the walk. On the paper's wheel a failure is a departure from the
+    sequence of phases, and mostly no fall. `UnilateralWheel` continues after such a departure.
 
-    For the rigid wheel the kernel of its one-dimensional map is known, and quadrature gives means
-    of any length. It needs `RigidWheel(stop_at_lift_off=False)`. `mean_steps` then has first
-    derivatives with respect to `params` and `slope_sd`. For other models, walks are sampled, with
-    failures made frequent by importance sampling, so that long lives take as many steps as short
-    ones. The error is then half the width of a 99 % confidence interval.
+    For the rigid wheel the kernel of its one-dimensional map has a closed form, and quadrature
+    gives means of any length. The model must be `RigidWheel(stop_at_lift_off=False)`. `mean_steps`
+    then has first derivatives with respect to `params` and `slope_sd`.
+
+    For other models, walks are sampled. Importance sampling makes failures frequent, so that the
+    number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
+    confidence interval.
 
     Args:
         params: the wheel, whose slope is the mean slope.
@@ -162,30 +171,31 @@ def first_passage(
     tol = None if tol is None else check_positive("tol", tol)
     resolved_model: Any = check_model(resolve_model(params, model))
     if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
-        return _solve_by_quadrature(
+        return _solve_passage_by_quadrature(
             params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
         )
     check_not_traced("vrw.first_passage", "take the rigid wheel", params, slope_sd)
     if options is None:
         options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
-    return _estimate_by_sampling(
+    return _estimate_passage_by_sampling(
         params,
         float(slope_sd),
         resolved_model,
         check_options(options),
         seed=seed,
         n_walkers=n_walkers,
-        tol=tol or 0.02,
+        relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
 
 
-def _solve_by_quadrature(
-    params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, tol: float
+def _solve_passage_by_quadrature(
+    params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, relative_tolerance: float
 ) -> FirstPassage:
-    """Return the first passage of the rigid wheel by quadrature.
+    """Return the first-passage times of the rigid wheel by quadrature.
 
-    The number of nodes is doubled until the error is within `tol`, unless the arguments are traced.
+    The number of nodes is doubled until the error is within `relative_tolerance`. Traced arguments
+    use `n_nodes` once. Raise ValueError if the model stops at lift-off or the wheel has no gait.
     """
     if model.stop_at_lift_off:
         raise ValueError(
@@ -203,28 +213,39 @@ def _solve_by_quadrature(
     coarse_passage = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
     while True:
         fine_passage = solve_rigid_passage(params, slope_sd, model, n_nodes)
-        mean_steps = [1.0 / x.survival.failure_probability for x in (coarse_passage, fine_passage)]
-        error = lax.stop_gradient(jnp.abs(mean_steps[1] - mean_steps[0]))
-        meets_tolerance = error <= tol * mean_steps[1]
-        if is_traced(params, slope_sd) or bool(meets_tolerance) or n_nodes >= MAX_NODES:
+        mean_steps_estimates = [
+            1.0 / passage.survival_analysis.failure_probability
+            for passage in (coarse_passage, fine_passage)
+        ]
+        mean_steps_error = lax.stop_gradient(
+            jnp.abs(mean_steps_estimates[1] - mean_steps_estimates[0])
+        )
+        is_within_tolerance = mean_steps_error <= relative_tolerance * mean_steps_estimates[1]
+        if (
+            is_traced(params, slope_sd)
+            or bool(is_within_tolerance)
+            or n_nodes >= MAX_QUADRATURE_NODES
+        ):
             break
         coarse_passage, n_nodes = fine_passage, 2 * n_nodes
-    status = jnp.where(meets_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET)
+    passage_status = jnp.where(
+        is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
+    )
     return FirstPassage(
-        mean_steps=mean_steps[1],
+        mean_steps=mean_steps_estimates[1],
         mean_steps_from_gait=fine_passage.mean_steps_from_gait,
-        failure_probability=fine_passage.survival.failure_probability,
-        kappa_2=fine_passage.survival.kappa_2,
-        error=error,
-        states=fine_passage.nodes[:, None],
-        weights=fine_passage.survival.distribution,
-        status=status.astype(jnp.int32),
-        end_fractions=jnp.ones(1, mean_steps[1].dtype),
+        failure_probability=fine_passage.survival_analysis.failure_probability,
+        kappa_2=fine_passage.survival_analysis.kappa_2,
+        error=mean_steps_error,
+        states=fine_passage.squared_rate_nodes[:, None],
+        weights=fine_passage.survival_analysis.quasi_stationary_weights,
+        status=passage_status.astype(jnp.int32),
+        end_fractions=jnp.ones(1, mean_steps_estimates[1].dtype),
         end_names=(Outcome.FELL_BACK.name,),
     )
 
 
-def _estimate_by_sampling(
+def _estimate_passage_by_sampling(
     params: WheelParams,
     slope_sd: float,
     model: Any,
@@ -232,24 +253,27 @@ def _estimate_by_sampling(
     *,
     seed: int,
     n_walkers: int,
-    tol: float,
+    relative_tolerance: float,
     max_steps: int,
 ) -> FirstPassage:
-    """Return the first passage of a model by sampled walks."""
-    cycle: Any = limit_cycle(params, model=model)
-    if int(cycle.outcome) != Outcome.STEPPED:
+    """Return the first-passage times of a model by sampled walks.
+
+    Raise ValueError if the wheel has no gait, or if hardly any step succeeds.
+    """
+    limit_cycle_result: Any = limit_cycle(params, model=model)
+    if int(limit_cycle_result.outcome) != Outcome.STEPPED:
         raise ValueError(
-            f"this wheel has no gait from which a walk could begin: {cycle.why} Take a wheel for "
-            "which vrw.limit_cycle finds a gait."
+            "this wheel has no gait from which a walk could begin: "
+            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
         )
-    generator = np.random.default_rng(seed)
-    section_state = np.asarray(cycle.section_state)
+    random_generator = np.random.default_rng(seed)
+    section_state = np.asarray(limit_cycle_result.section_state)
     walker_groups = WalkerGroups(
-        params, section_state, slope_sd, model, options, n_walkers, generator
+        params, section_state, slope_sd, model, options, n_walkers, random_generator
     )
     try:
         sampled_passage = sample_passage(
-            walker_groups, float(cycle.spectral_radius), tol, max_steps
+            walker_groups, float(limit_cycle_result.spectral_radius), relative_tolerance, max_steps
         )
     except ExtinctGroupError as error:
         raise ValueError(
@@ -258,24 +282,29 @@ def _estimate_by_sampling(
         ) from error
     failure_probability = sampled_passage.failure_probability
     mean_steps = 1.0 / failure_probability if failure_probability else np.inf
-    meets_tolerance = sampled_passage.relative_error <= tol
-    status = PassageStatus.CONVERGED if meets_tolerance else PassageStatus.TOLERANCE_NOT_MET
-    status = status if failure_probability else PassageStatus.NO_FAILURE
-    convert_to_array = lambda x: jnp.asarray(x, params.damping.dtype)
+    is_within_tolerance = sampled_passage.relative_error <= relative_tolerance
+    passage_status = (
+        PassageStatus.CONVERGED if is_within_tolerance else PassageStatus.TOLERANCE_NOT_MET
+    )
+    passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
+    to_float_array = lambda values: jnp.asarray(values, params.damping.dtype)
     return FirstPassage(
-        mean_steps=convert_to_array(mean_steps),
-        mean_steps_from_gait=convert_to_array(sampled_passage.mean_steps_from_gait),
-        failure_probability=convert_to_array(failure_probability),
-        kappa_2=convert_to_array(sampled_passage.kappa_2),
-        error=convert_to_array(
+        mean_steps=to_float_array(mean_steps),
+        mean_steps_from_gait=to_float_array(sampled_passage.mean_steps_from_gait),
+        failure_probability=to_float_array(failure_probability),
+        kappa_2=to_float_array(sampled_passage.kappa_2),
+        error=to_float_array(
             mean_steps * sampled_passage.relative_error if failure_probability else np.inf
         ),
-        states=convert_to_array(sampled_passage.states),
-        weights=convert_to_array(
-            np.full(len(sampled_passage.states), 1.0 / len(sampled_passage.states))
+        states=to_float_array(sampled_passage.quasi_stationary_states),
+        weights=to_float_array(
+            np.full(
+                len(sampled_passage.quasi_stationary_states),
+                1.0 / len(sampled_passage.quasi_stationary_states),
+            )
         ),
-        status=jnp.asarray(int(status), jnp.int32),
-        end_fractions=convert_to_array(list(sampled_passage.fraction_by_outcome.values())),
+        status=jnp.asarray(int(passage_status), jnp.int32),
+        end_fractions=to_float_array(list(sampled_passage.fraction_by_outcome.values())),
         end_names=tuple(sampled_passage.fraction_by_outcome),
-        n_steps=sampled_passage.n_steps,
+        n_steps=sampled_passage.n_sampled_steps,
     )

@@ -1,4 +1,4 @@
-"""Walks from many starts of one wheel, until each walk is on a stable gait or has failed."""
+"""Walks from many starts of one wheel, each until it is on a stable gait or fails."""
 
 import functools
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 @dataclass(frozen=True)
 class ArrivalOptions:
-    """Options of the test that a walk has arrived at a gait."""
+    """Options of the test whether a walk has arrived at a gait."""
 
-    max_distance: float = 1e-6
-    """Largest difference of a section state from one of the gait, in the wheel's own units.
+    max_gait_distance: float = 1e-6
+    """Largest difference between a section state and one of the gait, in units of the wheel.
 
-    It is chosen because it is far above the errors of a step and of a gait, and far below the
-    distances of most gaits from the borders of their basins."""
-    steps_per_round: int = 10
-    """Number of steps between two tests, chosen because a round of few steps costs many calls."""
+    The value is chosen because it is far above the errors of a step and of a gait, and far below
+    the distances of most gaits from the borders of their basins."""
+    steps_per_arrival_test: int = 10
+    """Number of steps between two tests, chosen because tests after fewer steps cost many calls."""
 
 
 ARRIVAL_OPTIONS = ArrivalOptions()
 
 
 class StableGait(NamedTuple):
-    """Stable gait of one wheel, with the wheel, model and options of its steps."""
+    """Stable gait of one wheel, together with the wheel, the model and the options of its steps."""
 
     params: WheelParams
     model: AbstractWheel
@@ -43,9 +43,9 @@ class StableGait(NamedTuple):
     section_states: np.ndarray  # before the landing of each step, (period_n, m)
 
     @classmethod
-    def find(
+    def from_cycle(
         cls,
-        function: str,
+        caller_name: str,
         params: WheelParams,
         model: ModelLike | None,
         cycle: AbstractCycle | None,
@@ -53,11 +53,11 @@ class StableGait(NamedTuple):
     ) -> "StableGait":
         """Return the gait of `cycle`, or by default that of `limit_cycle`.
 
-        Raise a TypeError or a ValueError if an argument is invalid or the gait is not stable.
-        `function` is the name of the caller for messages.
+        Raise TypeError or ValueError if an argument is invalid or the gait is not stable. Messages
+        contain `caller_name`, the name of the public function.
         """
-        check_not_traced(function, "map vrw.walk over the starts", params, options, cycle)
-        check_single_wheel(params, f"call {function} for one wheel after the other")
+        check_not_traced(caller_name, "map vrw.walk over the starts", params, options, cycle)
+        check_single_wheel(params, f"call {caller_name} for one wheel after the other")
         checked_model = check_model(model).fallback_model  # valid for any start
         checked_options = check_options(options)
         checked_options.check_tolerances(np.dtype(params.damping.dtype))
@@ -69,64 +69,83 @@ class StableGait(NamedTuple):
                 f"this wheel has no gait that could have a basin: {cycle.why} Take a wheel for "
                 "which vrw.limit_cycle finds a gait."
             )
-        radius = float(floquet.compute_spectral_radius(cycle.monodromy_value))
-        if not radius < 1.0:
+        spectral_radius = float(floquet.compute_spectral_radius(cycle.monodromy_value))
+        if not spectral_radius < 1.0:
             raise ValueError(
-                f"the gait has spectral radius {radius:.6g}, so that it is not stable and has no "
-                "basin: take a wheel whose gait has a spectral radius below 1."
+                f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
+                "and has no basin: take a wheel whose gait has a spectral radius below 1."
             )
-        states = [np.asarray(cycle.section_state)[None]]
+        section_states = [np.asarray(cycle.section_state)[None]]
         for _ in range(cycle.period_n):
-            step = step_batch(params, states[-1], model=checked_model, options=checked_options)
-            states.append(step.section_state)
-        gait = cls(params, checked_model, checked_options, np.concatenate(states[:-1]))
-        if not gait.contains(states[-1])[0]:
+            gait_step = step_batch(
+                params, section_states[-1], model=checked_model, options=checked_options
+            )
+            section_states.append(gait_step.section_state)
+        stable_gait = cls(
+            params, checked_model, checked_options, np.concatenate(section_states[:-1])
+        )
+        if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
                 f"cycle does not repeat after {cycle.period_n} steps of this wheel with "
                 f"{type(checked_model).__name__}: give a cycle of the same wheel and model."
             )
-        return gait
+        return stable_gait
 
-    def contains(self, states: np.ndarray, arrival: ArrivalOptions = ARRIVAL_OPTIONS) -> np.ndarray:
-        """Return whether each section state is one of the gait's section states."""
-        units = self.model.section_units(
+    def is_on_gait(
+        self, section_states: np.ndarray, arrival_options: ArrivalOptions = ARRIVAL_OPTIONS
+    ) -> np.ndarray:
+        """Return whether each section state agrees with one of the gait's, shape (states,)."""
+        state_units = self.model.section_units(
             compute_wheel_units(self.params.symbols()), self.params.n_legs
         )
-        n = self.model.n_continuous(self.params)
-        differences = (states[:, None, :n] - self.section_states[:, :n]) / np.asarray(units)[:n]
-        return np.abs(differences).max(-1).min(-1) <= arrival.max_distance
+        n_continuous = self.model.n_continuous(self.params)
+        scaled_differences = (
+            section_states[:, None, :n_continuous] - self.section_states[:, :n_continuous]
+        ) / np.asarray(state_units)[:n_continuous]
+        return np.abs(scaled_differences).max(-1).min(-1) <= arrival_options.max_gait_distance
 
 
-class WalkVerdicts(NamedTuple):
-    """Ends of walks, with a leading axis over starts."""
+class ArrivalWalkResult(NamedTuple):
+    """Outcomes of walks towards a gait, with a leading axis over starts."""
 
     is_on_gait: np.ndarray
-    outcome: np.ndarray  # an Outcome, STEPPED if the walk goes on
-    n_stepped: np.ndarray  # number of steps until the gait, the failure or the largest number
+    outcome: np.ndarray  # an Outcome, STEPPED if the walk continues
+    n_stepped: np.ndarray  # steps until the arrival at the gait, the failure or max_steps
 
 
 def walk_to_gait(
-    gait: StableGait,
-    starts: np.ndarray,
+    stable_gait: StableGait,
+    start_states: np.ndarray,
     max_steps: int,
-    arrival: ArrivalOptions = ARRIVAL_OPTIONS,
-) -> WalkVerdicts:
-    """Return the end of a walk of at most `max_steps` steps from each section state."""
-    n_starts = len(starts)
-    is_on_gait, outcome = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
-    n_stepped = np.zeros(n_starts, int)
-    embed: Any = jax.vmap(functools.partial(gait.model.embed_section, gait.params))
-    states = np.array(embed(jnp.asarray(starts)))
-    walking, n_walked = np.arange(n_starts), 0
-    while len(walking) and n_walked < max_steps:
-        n_round_steps = min(arrival.steps_per_round, max_steps - n_walked)
-        walks = step_batch(
-            gait.params, states[walking], n_round_steps, model=gait.model, options=gait.options
+    arrival_options: ArrivalOptions = ARRIVAL_OPTIONS,
+) -> ArrivalWalkResult:
+    """Return the result of a walk of at most `max_steps` steps from each section state."""
+    n_starts = len(start_states)
+    is_on_gait, walk_outcomes = np.zeros(n_starts, bool), np.full(n_starts, int(Outcome.STEPPED))
+    n_steps_by_walk = np.zeros(n_starts, int)
+    embed_section_states: Any = jax.vmap(
+        functools.partial(stable_gait.model.embed_section, stable_gait.params)
+    )
+    section_states = np.array(embed_section_states(jnp.asarray(start_states)))
+    walking_indices, n_steps_walked = np.arange(n_starts), 0
+    while len(walking_indices) and n_steps_walked < max_steps:
+        n_steps_to_test = min(arrival_options.steps_per_arrival_test, max_steps - n_steps_walked)
+        walk_results = step_batch(
+            stable_gait.params,
+            section_states[walking_indices],
+            n_steps_to_test,
+            model=stable_gait.model,
+            options=stable_gait.options,
         )
-        states[walking], outcome[walking] = walks.section_state, walks.outcome
-        n_stepped[walking] += walks.n_stepped
-        has_stepped = walks.outcome == Outcome.STEPPED
-        is_on_gait[walking] = has_stepped & gait.contains(walks.section_state, arrival)
-        walking = walking[has_stepped & ~is_on_gait[walking]]
-        n_walked += n_round_steps
-    return WalkVerdicts(is_on_gait, outcome, n_stepped)
+        section_states[walking_indices], walk_outcomes[walking_indices] = (
+            walk_results.section_state,
+            walk_results.outcome,
+        )
+        n_steps_by_walk[walking_indices] += walk_results.n_stepped
+        has_stepped = walk_results.outcome == Outcome.STEPPED
+        is_on_gait[walking_indices] = has_stepped & stable_gait.is_on_gait(
+            walk_results.section_state, arrival_options
+        )
+        walking_indices = walking_indices[has_stepped & ~is_on_gait[walking_indices]]
+        n_steps_walked += n_steps_to_test
+    return ArrivalWalkResult(is_on_gait, walk_outcomes, n_steps_by_walk)

@@ -1,4 +1,6 @@
-"""Gait sensitivity norm: variation of a measure of a gait on slightly uneven ground."""
+"""Gait sensitivity norm, which is the variation of a measure of a gait on slightly uneven
+ground.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,15 +32,16 @@ class GaitSensitivity(AbstractPrintable):
     """Gait sensitivity norms of several measures, each in the measure's unit per rad of slope.
 
     The norm is the standard deviation of a measure in a long walk over independent slopes, divided
-    by the standard deviation of the slopes. The slopes vary little. The norm is infinite if the
-    gait is not stable. The squares of the three parts add up to the square of the norm.
+    by the standard deviation of the slopes, in the limit of small deviations. The norm is infinite
+    if the gait is not stable. The squares of `ending_step`, `beginning_step` and `later_steps` add
+    up to the square of the norm.
 
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response to a line of the step that ends on this line;
     - `beginning_step`: signed response to a line of the step that begins on this line;
     - `later_steps`: root of the sum of the squared responses of all later steps;
     - `spectral_radius`: spectral radius of the gait's return map;
-    - `outcome`: Outcome.STEPPED, or the reason of a missing gait; all numbers are then zero;
+    - `outcome`: Outcome.STEPPED, or the reason why there is no gait; all numbers are then zero;
     - `measures`: names of the measures.
 
     Examples:
@@ -58,7 +61,7 @@ class GaitSensitivity(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return whether the norms are finite, with the reason, as a sentence."""
+        """Return a sentence about whether the norms are finite, with the reason."""
         if self.outcome != Outcome.STEPPED:
             return describe_ending(self.outcome, Outcome)
         if self.spectral_radius < 1.0:
@@ -69,17 +72,22 @@ class GaitSensitivity(AbstractPrintable):
         """Return label and text of each measure, with the parts of its norm."""
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
-        rows = []
-        for i, name in enumerate(self.measures):
-            measure = MEASURES[name]
-            unit = f"{measure.display_unit} per rad".strip()
-            parts_text = (
-                f"step that ends on a line: {float(self.ending_step[i]):.6g}, "
-                f"step that begins on it: {float(self.beginning_step[i]):.6g}, "
-                f"later steps: {float(self.later_steps[i]):.6g}"
+        text_rows = []
+        for measure_index, measure_name in enumerate(self.measures):
+            measure = MEASURES[measure_name]
+            sensitivity_unit = f"{measure.display_unit} per rad".strip()
+            norm_parts_text = (
+                f"step that ends on a line: {float(self.ending_step[measure_index]):.6g}, "
+                f"step that begins on it: {float(self.beginning_step[measure_index]):.6g}, "
+                f"later steps: {float(self.later_steps[measure_index]):.6g}"
             )
-            rows.append((measure.label, f"{float(self.norm[i]):.6g} {unit} ({parts_text})"))
-        return [*rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
+            text_rows.append(
+                (
+                    measure.label,
+                    f"{float(self.norm[measure_index]):.6g} {sensitivity_unit} ({norm_parts_text})",
+                )
+            )
+        return [*text_rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
 
 
 @with_default_settings
@@ -94,13 +102,13 @@ def gait_sensitivity(
     """Return the gait sensitivity norm of each measure of a step.
 
     The slopes of the lines that join the footholds are independent, with mean `params.slope`. A
-    line enters two steps: the one that ends on it and the one that begins on it. The response of
-    all later steps is summed by a discrete Lyapunov equation (Hobbelen and Wisse 2007, who sum over
-    a few steps).
+    line influences two steps directly: the step that ends on the line and the step that begins on
+    it. A discrete Lyapunov equation sums the response of all later steps. Hobbelen and Wisse (2007)
+    sum over a few steps.
 
-    Norms are differentiable with respect to `params` in every mode. With margins and other measures
-    that durations and the first landing do not determine, the gradient needs second derivatives of
-    a step, which compile for minutes. With unilateral contact there are values only.
+    Norms are differentiable with respect to `params` in every mode. Margins depend on more than
+    durations and the first landing. Their gradients need second derivatives of a step, whose
+    compilation takes minutes. With unilateral contact, norms have no derivatives.
 
     Args:
         params: the wheel, whose slope is the mean slope.
@@ -123,30 +131,42 @@ def gait_sensitivity(
         >>> print(f"{jax.grad(norm)(vrw.WheelParams()).damping:.5f} s/rad per N s/m")
         0.01431 s/rad per N s/m
     """
-    names = check_names("measures", measures)
+    measure_names = check_names("measures", measures)
     model = resolve_model(params, model)
-    finder = resolve_finder(params, model, options)
+    cycle_finder = resolve_finder(params, model, options)
     step_measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
-    known_names = tuple(name for name in finder.differentiable_measures if name in step_measures)
-    for name in names or ("nothing",):
+    known_measure_names = tuple(
+        measure_name
+        for measure_name in cycle_finder.differentiable_measures
+        if measure_name in step_measures
+    )
+    for measure_name in measure_names or ("nothing",):
         check_known_name(
-            name, known_names, f"measure of a step of {finder.model.model_name} wheels"
+            measure_name,
+            known_measure_names,
+            f"measure of a step of {cycle_finder.model.model_name} wheels",
         )
-    cycle: Any = limit_cycle(params, guess=guess, model=model, options=options)
-    if not is_traced(cycle) and int(cycle.outcome) != Outcome.STEPPED:
+    limit_cycle_result: Any = limit_cycle(params, guess=guess, model=model, options=options)
+    if not is_traced(limit_cycle_result) and int(limit_cycle_result.outcome) != Outcome.STEPPED:
         raise ValueError(
-            f"this wheel has no gait whose sensitivity could be computed: {cycle.why} Take a wheel "
-            "for which vrw.limit_cycle finds a gait."
+            "this wheel has no gait whose sensitivity could be computed: "
+            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
         )
-    norms = compute_gait_sensitivity(finder.slope_response(params, cycle, names))
-    zero_without_gait = lambda value: jnp.where(cycle.outcome == Outcome.STEPPED, value, 0.0)
-    radius = floquet.compute_spectral_radius(lax.stop_gradient(cycle.monodromy_value))
+    sensitivity_norms = compute_gait_sensitivity(
+        cycle_finder.slope_response(params, limit_cycle_result, measure_names)
+    )
+    zero_without_gait = lambda value: jnp.where(
+        limit_cycle_result.outcome == Outcome.STEPPED, value, 0.0
+    )
+    spectral_radius = floquet.compute_spectral_radius(
+        lax.stop_gradient(limit_cycle_result.monodromy_value)
+    )
     return GaitSensitivity(
-        norm=zero_without_gait(norms.norm),
-        ending_step=zero_without_gait(norms.ending_step),
-        beginning_step=zero_without_gait(norms.beginning_step),
-        later_steps=zero_without_gait(norms.later_steps),
-        spectral_radius=zero_without_gait(radius),
-        outcome=cycle.outcome,
-        measures=names,
+        norm=zero_without_gait(sensitivity_norms.norm),
+        ending_step=zero_without_gait(sensitivity_norms.ending_step),
+        beginning_step=zero_without_gait(sensitivity_norms.beginning_step),
+        later_steps=zero_without_gait(sensitivity_norms.later_steps),
+        spectral_radius=zero_without_gait(spectral_radius),
+        outcome=limit_cycle_result.outcome,
+        measures=measure_names,
     )

@@ -2,9 +2,9 @@
 
 Groups of walkers walk over random slopes until the effect of the start has decayed. A walker that
 fails is replaced by a copy of another walker of its group (Fleming and Viot). So all walkers have
-the quasi-stationary distribution. Then walks of a few steps are drawn from a density under which
-many walks fail in their last step. Likelihood ratios give the probability of that failure without
-bias. Groups are independent, so that their spread gives the error.
+the quasi-stationary distribution. Then walks of a few steps are drawn from a density on which many
+walks fail in their last step. Likelihood ratios give the probability of that failure without bias.
+Groups are independent, so that the spread between groups gives the error.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import numpy as np
 from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.numerics import StepOptions
 from vrw_jax.robustness.failure_density import (
-    DENSITY_OPTIONS,
+    FAILURE_DENSITY_OPTIONS,
     GaussianMixture,
     fit_failure_density,
 )
@@ -27,38 +27,39 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class PassageSamplingOptions:
-    """Options of sampled first passages."""
+    """Options of first-passage times from sampled walks."""
 
-    n_groups: int = 32
-    """Number of independent groups of walkers. The value is chosen because the quantile for 99 % is
-    then within 7 % of that of the normal distribution."""
+    n_walker_groups: int = 32
+    """Number of independent groups of walkers. The value is chosen because the quantile for 99 % of
+    Student's distribution is then within 7 % of that of the normal distribution."""
     negligible_line_effect: float = 0.01
     """Effect of a line on a later state, relative to that on the next state, below which the line's
     slope is drawn without bias. The result has no bias for any value. The value is chosen because
-    weights are then similar."""
+    likelihood ratios are then similar."""
     max_biased_lines: int = 12
     """Largest number of lines whose slopes are drawn with a bias. The value is chosen because fits
     in more dimensions need more samples."""
-    min_counted_failures: float = 0.2
+    min_failures_for_counting: float = 0.2
     """Expected number of failures over the biased lines above which failures are counted without
-    bias. The value is chosen because both methods then need as many steps."""
+    bias. The value is chosen because counting and importance sampling then need equally many steps.
+    """
     min_forgetting_steps: int = 6
     """Smallest number of steps after which the effect of the start counts as decayed."""
     max_forgetting_steps: int = 100
-    """Largest number of these steps. The value is chosen because gaits with slower decay are almost
-    unstable."""
-    max_first_rounds: int = 40
+    """Largest number of steps after which the effect of the start counts as decayed. The value is
+    chosen because gaits with slower decay are almost unstable."""
+    max_gait_rounds: int = 40
     """Largest number of rounds of walks from the gait. The value is chosen because more rounds are
     needed only if most walks fail within three steps."""
-    n_regression_steps: int = 4
+    n_kappa_2_steps: int = 4
     """Number of steps whose states before and after are used to estimate kappa_2."""
-    min_rounds: int = 4
-    """Smallest number of rounds of all walkers. The value is chosen because the error of fewer
-    rounds is uncertain."""
-    remaining_start_fraction: float = 0.1
-    """Fraction of the start's effect that remains, relative to the tolerance."""
-    confidence: float = 0.99
-    """Confidence of the error estimate."""
+    min_sampling_rounds: int = 4
+    """Smallest number of rounds of all walkers. The value is chosen because the error estimate of
+    fewer rounds is uncertain."""
+    max_start_effect_per_tol: float = 0.1
+    """Largest fraction of the start's effect that may remain, divided by the tolerance."""
+    confidence_level: float = 0.99
+    """Confidence level of the error estimate."""
 
 
 PASSAGE_SAMPLING_OPTIONS = PassageSamplingOptions()
@@ -68,29 +69,29 @@ N_FIXED_POINT_ITERATIONS = 60
 two or more."""
 
 MIN_RELATIVE_SINGULAR_VALUE = 0.003
-"""Smallest relative singular value of standardized states that enters the regression. The value is
-chosen because noise dominates smaller ones: a landing with two feet held leaves two degrees of
-freedom."""
+"""Smallest singular value of standardized states that enters the regression, relative to the
+largest one. The value is chosen because noise dominates smaller ones: a landing with two feet held
+leaves two degrees of freedom."""
 
 
 class ExtinctGroupError(ValueError):
-    """Error for a group of walkers of which no walker survived a step."""
+    """Error that is raised if no walker of a group survives a step."""
 
 
 class SampledPassage(NamedTuple):
-    """First passage of a model, estimated from samples."""
+    """First-passage times of a model, estimated from samples."""
 
     failure_probability: float  # of one step from the quasi-stationary distribution
-    relative_error: float  # half confidence interval, plus the start's remaining effect
+    relative_error: float  # half a confidence interval, plus the remaining effect of the start
     mean_steps_from_gait: float
     kappa_2: float
-    states: np.ndarray  # of the quasi-stationary distribution, the slope last, (n, entries)
+    quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
     fraction_by_outcome: dict[str, float]
-    n_steps: int
+    n_sampled_steps: int
 
 
 class WalkerGroups:
-    """Groups of walkers side by side on random slopes. All walkers start at the gait."""
+    """Groups of walkers on random slopes, simulated as one batch. All walkers start at the gait."""
 
     def __init__(
         self,
@@ -105,28 +106,28 @@ class WalkerGroups:
     ) -> None:
         self.params, self.model, self.step_options = params, model, step_options
         self.mean_slope, self.slope_sd, self.random = float(params.slope), slope_sd, generator
-        self.n_groups, self.n_continuous = options.n_groups, int(model.n_continuous(params))
+        self.n_groups, self.n_continuous = options.n_walker_groups, int(model.n_continuous(params))
         group_size = -(-n_walkers // self.n_groups)
         self.states = self.gait_states = np.tile(section_state, (self.n_groups * group_size, 1))
         self.slopes = np.full(len(self.states), self.mean_slope)
         self.n_steps = 0
         self.weight_by_outcome: dict[int, float] = {}
 
-    def run_walks(self, deviations: np.ndarray) -> StepBatchResult:
-        """Return walks from the states of the walkers, over lines of standardized slope deviations.
+    def run_walks(self, slope_deviations: np.ndarray) -> StepBatchResult:
+        """Return walks from the states of the walkers over lines of given slopes.
 
         Walk i starts at walker i modulo the number of walkers.
 
-        - `deviations`: standardized deviations of the slopes, (walks, lines).
+        - `slope_deviations`: standardized deviations of the slopes, shape (walks, lines).
         """
-        slopes = self.mean_slope + self.slope_sd * deviations
-        walker_indices = np.arange(len(deviations)) % len(self.states)
-        line_slopes = np.concatenate([self.slopes[walker_indices, None], slopes], 1)
-        wheels = eqx.tree_at(lambda wheel: wheel.slope, self.params, line_slopes)
+        landing_slopes = self.mean_slope + self.slope_sd * slope_deviations
+        walker_indices = np.arange(len(slope_deviations)) % len(self.states)
+        line_slopes = np.concatenate([self.slopes[walker_indices, None], landing_slopes], 1)
+        wheels_on_lines = eqx.tree_at(lambda wheel: wheel.slope, self.params, line_slopes)
         walk_results = step_batch(
-            wheels,
+            wheels_on_lines,
             self.states[walker_indices],
-            deviations.shape[1],
+            slope_deviations.shape[1],
             model=self.model,
             options=self.step_options,
         )
@@ -135,31 +136,35 @@ class WalkerGroups:
         )
         return walk_results
 
-    def record_failures(self, outcome: np.ndarray, weights: np.ndarray) -> None:
-        """Add the weights of failed walks to the totals of their outcomes."""
-        for outcome_code in np.unique(outcome[weights > 0.0]):
-            weight = float(np.sum(weights[outcome == outcome_code]))
+    def record_failures(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
+        """Add the weights of failed walks to the total weight of each outcome."""
+        for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
+            outcome_weight = float(np.sum(walk_weights[walk_outcomes == outcome_code]))
             self.weight_by_outcome[int(outcome_code)] = (
-                self.weight_by_outcome.get(int(outcome_code), 0.0) + weight
+                self.weight_by_outcome.get(int(outcome_code), 0.0) + outcome_weight
             )
 
     def restart_at_gait(self) -> None:
         """Set all walkers to the gait, on lines of the mean slope."""
         self.states, self.slopes = self.gait_states, np.full(len(self.gait_states), self.mean_slope)
 
-    def get_markov_states(self) -> np.ndarray:
-        """Return section states with the slope of the line last, (walkers, entries)."""
+    def get_states_with_slopes(self) -> np.ndarray:
+        """Return section states with the slope as last component, shape (walkers, components).
+
+        A section state and the slope of its line determine the distribution of the next ones
+        (Markov property).
+        """
         return np.concatenate([self.states, self.slopes[:, None]], 1)
 
-    def advance_walkers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Take one step of every walker, and replace the failed ones.
+    def step_and_replace_failures(self) -> tuple[np.ndarray, np.ndarray]:
+        """Take one step of every walker, and replace walkers that fail by copies of others.
 
         Return whether each walker survived, and the standardized deviations of the slopes on which
-        walkers landed. Raises `ExtinctGroupError` if no walker of a group survived.
+        walkers landed. Raise `ExtinctGroupError` if no walker of a group survived.
         """
         n_walkers = len(self.states)
-        deviations = self.random.standard_normal((n_walkers, 1))
-        walk_results = self.run_walks(deviations)
+        slope_deviations = self.random.standard_normal((n_walkers, 1))
+        walk_results = self.run_walks(slope_deviations)
         is_alive: np.ndarray = walk_results.outcome == Outcome.STEPPED
         self.record_failures(walk_results.outcome, (~is_alive).astype(float))
         source_walkers = np.arange(n_walkers).reshape(self.n_groups, -1)
@@ -172,18 +177,19 @@ class WalkerGroups:
                 group_walkers[is_group_alive], np.sum(~is_group_alive)
             )
         self.states = walk_results.section_state[source_walkers.ravel()]
-        self.slopes = self.mean_slope + self.slope_sd * deviations[source_walkers.ravel(), 0]
-        return is_alive, deviations[:, 0]
+        self.slopes = self.mean_slope + self.slope_sd * slope_deviations[source_walkers.ravel(), 0]
+        return is_alive, slope_deviations[:, 0]
 
 
 def sample_passage(
     walker_groups: WalkerGroups,
     spectral_radius: float,
-    tol: float,
+    relative_tolerance: float,
     max_steps: int,
-    options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
+    sampling_options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS,
 ) -> SampledPassage:
-    """Return the first passage from walks of these groups, until the relative error is `tol`.
+    """Return first-passage times from walks of groups of walkers, until the error is within
+    tolerance.
 
     Args:
         walker_groups: groups of walkers at the gait.
@@ -197,90 +203,113 @@ def sample_passage(
     """
     from scipy import stats  # This import is slow.
 
-    student_quantile = float(
-        stats.t.ppf(0.5 * (1.0 + options.confidence), walker_groups.n_groups - 1)
+    student_t_quantile = float(
+        stats.t.ppf(0.5 * (1.0 + sampling_options.confidence_level), walker_groups.n_groups - 1)
     )
-    count_steps_to = lambda remaining_fraction: int(
+    count_decay_steps = lambda remaining_fraction: int(
         np.ceil(np.log(remaining_fraction) / np.log(np.clip(spectral_radius, 0.01, 0.99)))
     )
-    step_limits = options.min_forgetting_steps, options.max_forgetting_steps
-    n_forgetting_steps = int(
-        np.clip(count_steps_to(options.remaining_start_fraction * tol), *step_limits)
+    forgetting_step_limits = (
+        sampling_options.min_forgetting_steps,
+        sampling_options.max_forgetting_steps,
     )
-    surviving_fractions = _count_first_steps(
-        walker_groups, n_forgetting_steps, tol / student_quantile, options
+    n_forgetting_steps = int(
+        np.clip(
+            count_decay_steps(sampling_options.max_start_effect_per_tol * relative_tolerance),
+            *forgetting_step_limits,
+        )
+    )
+    surviving_fractions = _estimate_survival_from_gait(
+        walker_groups, n_forgetting_steps, relative_tolerance / student_t_quantile, sampling_options
     )
     walker_groups.restart_at_gait()
-    transitions = []
+    step_transitions = []
     for _ in range(n_forgetting_steps):
-        states_before = walker_groups.get_markov_states()
-        is_alive, deviations = walker_groups.advance_walkers()
-        transitions.append((states_before, is_alive, deviations, walker_groups.get_markov_states()))
+        states_before = walker_groups.get_states_with_slopes()
+        is_alive, slope_deviations = walker_groups.step_and_replace_failures()
+        step_transitions.append(
+            (states_before, is_alive, slope_deviations, walker_groups.get_states_with_slopes())
+        )
     kappa_2 = _estimate_kappa_2(
-        transitions[-options.n_regression_steps :], walker_groups.n_continuous
+        step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
     )
     walker_groups.weight_by_outcome.clear()
-    n_lines = min(count_steps_to(options.negligible_line_effect), options.max_biased_lines)
-    sample_round: Callable[[], np.ndarray] | None
-    if n_lines * np.mean(~is_alive) > options.min_counted_failures:
-        n_lines = 1
-        sample_round = lambda: (~walker_groups.advance_walkers()[0]).astype(float)
+    n_biased_lines = min(
+        count_decay_steps(sampling_options.negligible_line_effect),
+        sampling_options.max_biased_lines,
+    )
+    sample_failure_weights: Callable[[], np.ndarray] | None
+    if n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting:
+        n_biased_lines = 1
+        sample_failure_weights = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(
+            float
+        )
     else:
-        sample_round = _make_biased_round(walker_groups, n_lines)
-    group_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
+        sample_failure_weights = _make_biased_sampler(walker_groups, n_biased_lines)
+    group_weight_sums, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
     failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = max(kappa_2, spectral_radius) ** (n_forgetting_steps + n_lines - 1)
-    while sample_round and (
-        n_rounds < options.min_rounds
-        or (relative_error > tol and walker_groups.n_steps < max_steps)
+    remaining_start_effect = max(kappa_2, spectral_radius) ** (
+        n_forgetting_steps + n_biased_lines - 1
+    )
+    while sample_failure_weights and (
+        n_sampling_rounds < sampling_options.min_sampling_rounds
+        or (relative_error > relative_tolerance and walker_groups.n_steps < max_steps)
     ):
-        group_sums += sample_round().reshape(walker_groups.n_groups, -1).mean(1)
-        n_rounds += 1
-        last_step_failure_probability = float(np.mean(group_sums)) / n_rounds
+        group_weight_sums += sample_failure_weights().reshape(walker_groups.n_groups, -1).mean(1)
+        n_sampling_rounds += 1
+        last_step_failure_probability = float(np.mean(group_weight_sums)) / n_sampling_rounds
         if last_step_failure_probability > 0.0:
-            failure_probability, amplification = _solve_step_probability(
-                last_step_failure_probability, n_lines
+            failure_probability, error_amplification = _solve_failure_probability(
+                last_step_failure_probability, n_biased_lines
             )
-            standard_error = np.std(group_sums, ddof=1) / np.sqrt(walker_groups.n_groups) / n_rounds
+            standard_error = (
+                np.std(group_weight_sums, ddof=1)
+                / np.sqrt(walker_groups.n_groups)
+                / n_sampling_rounds
+            )
             sampling_error = (
-                student_quantile * amplification * standard_error / last_step_failure_probability
+                student_t_quantile
+                * error_amplification
+                * standard_error
+                / last_step_failure_probability
             )
             relative_error = float(sampling_error + remaining_start_effect)
-    mean_from_gait = np.inf
+    mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
-        mean_from_gait = float(
+        mean_steps_from_gait = float(
             np.sum(surviving_fractions[1:-1]) + surviving_fractions[-1] / failure_probability
         )
     total_weight = sum(walker_groups.weight_by_outcome.values())
     return SampledPassage(
         failure_probability=failure_probability,
         relative_error=relative_error,
-        mean_steps_from_gait=mean_from_gait,
+        mean_steps_from_gait=mean_steps_from_gait,
         kappa_2=kappa_2,
-        states=walker_groups.get_markov_states(),
+        quasi_stationary_states=walker_groups.get_states_with_slopes(),
         fraction_by_outcome={
-            Outcome(outcome_code).name: weight / total_weight
-            for outcome_code, weight in sorted(
+            Outcome(outcome_code).name: outcome_weight / total_weight
+            for outcome_code, outcome_weight in sorted(
                 walker_groups.weight_by_outcome.items(),
-                key=lambda outcome_weight: -outcome_weight[1],
+                key=lambda outcome_and_weight: -outcome_and_weight[1],
             )
         },
-        n_steps=walker_groups.n_steps,
+        n_sampled_steps=walker_groups.n_steps,
     )
 
 
-def _count_first_steps(
+def _estimate_survival_from_gait(
     walker_groups: WalkerGroups,
     n_steps: int,
-    relative_error: float,
-    options: PassageSamplingOptions,
+    relative_tolerance: float,
+    sampling_options: PassageSamplingOptions,
 ) -> np.ndarray:
     """Return the fractions of walks from the gait that survive 0, 1, ... `n_steps` steps.
 
-    Rounds of all walkers are repeated until the last fraction has this relative standard error.
+    Rounds of all walkers are repeated until the last fraction has the relative standard error
+    `relative_tolerance`.
     """
     n_survivors, n_walks = np.zeros(n_steps + 1), 0
-    for _ in range(options.max_first_rounds):
+    for _ in range(sampling_options.max_gait_rounds):
         walker_groups.restart_at_gait()
         walk_results = walker_groups.run_walks(
             walker_groups.random.standard_normal((len(walker_groups.gait_states), n_steps))
@@ -288,111 +317,130 @@ def _count_first_steps(
         n_walks += len(walker_groups.gait_states)
         n_walks_by_length = np.bincount(walk_results.n_stepped, minlength=n_steps + 1)
         n_survivors += np.cumsum(n_walks_by_length[::-1])[::-1]
-        if n_walks - n_survivors[-1] < relative_error**2 * n_walks * n_survivors[-1]:
+        if n_walks - n_survivors[-1] < relative_tolerance**2 * n_walks * n_survivors[-1]:
             break
     return n_survivors / n_walks
 
 
-def _make_biased_round(
-    walker_groups: WalkerGroups, n_lines: int
+def _make_biased_sampler(
+    walker_groups: WalkerGroups, n_biased_lines: int
 ) -> Callable[[], np.ndarray] | None:
-    """Return a function that runs one walk from every walker over `n_lines` lines; None without
-    failures.
+    """Return a function that runs one walk from every walker over `n_biased_lines` lines.
 
     The function returns the likelihood ratios of walks that fail in their last step, and 0 for
-    other walks. The mean of these weights is the probability of such a failure.
+    other walks. The mean of these weights is the probability of such a failure. Return None if no
+    walk fails.
     """
 
-    def find_failures(deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        walk_results = walker_groups.run_walks(deviations)
-        has_failed = walk_results.outcome != Outcome.STEPPED
-        return has_failed & (walk_results.n_stepped == n_lines - 1), has_failed
+    def find_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        walk_results = walker_groups.run_walks(slope_deviations)
+        has_walk_failed = walk_results.outcome != Outcome.STEPPED
+        return has_walk_failed & (walk_results.n_stepped == n_biased_lines - 1), has_walk_failed
 
     density_options = dataclasses.replace(
-        DENSITY_OPTIONS, n_samples=min(DENSITY_OPTIONS.n_samples, len(walker_groups.states))
+        FAILURE_DENSITY_OPTIONS,
+        max_walks_per_stage=min(
+            FAILURE_DENSITY_OPTIONS.max_walks_per_stage, len(walker_groups.states)
+        ),
     )
     failure_density = fit_failure_density(
-        find_failures, n_lines, walker_groups.random, density_options
+        find_failures, n_biased_lines, walker_groups.random, density_options
     )
     if failure_density is None:
         return None
-    nominal_density = GaussianMixture.isotropic(n_lines, 1.0)
+    nominal_density = GaussianMixture.make_isotropic_gaussian(n_biased_lines, 1.0)
 
-    def sample_round() -> np.ndarray:
-        deviations = failure_density.draw_samples(len(walker_groups.states), walker_groups.random)
-        walk_results = walker_groups.run_walks(deviations)
+    def sample_failure_weights() -> np.ndarray:
+        slope_deviations = failure_density.draw_samples(
+            len(walker_groups.states), walker_groups.random
+        )
+        walk_results = walker_groups.run_walks(slope_deviations)
         has_failed_last = (walk_results.outcome != Outcome.STEPPED) & (
-            walk_results.n_stepped == n_lines - 1
+            walk_results.n_stepped == n_biased_lines - 1
         )
         likelihood_ratios = np.exp(
-            nominal_density.compute_log_density(deviations)
-            - failure_density.compute_log_density(deviations)
+            nominal_density.compute_log_density(slope_deviations)
+            - failure_density.compute_log_density(slope_deviations)
         )
-        weights = np.where(has_failed_last, likelihood_ratios, 0.0)
-        walker_groups.record_failures(walk_results.outcome, weights)
-        return weights
+        failure_weights = np.where(has_failed_last, likelihood_ratios, 0.0)
+        walker_groups.record_failures(walk_results.outcome, failure_weights)
+        return failure_weights
 
-    return sample_round
+    return sample_failure_weights
 
 
-def _solve_step_probability(
-    last_step_failure_probability: float, n_lines: int
+def _solve_failure_probability(
+    last_step_failure_probability: float, n_biased_lines: int
 ) -> tuple[float, float]:
-    """Return p with p (1 - p)^(n_lines - 1) = `last_step_failure_probability`, and an error
-    amplification.
+    """Return the failure probability p of a step, and the amplification of its relative error.
 
-    The equation holds if each step from the quasi-stationary distribution fails with probability p.
-    The walk then fails in the last of `n_lines` steps with the given probability. The amplification
-    is the ratio of the relative errors of p and of the given probability.
+    Each step from the quasi-stationary distribution fails with probability p. So a walk fails in
+    the last of `n_biased_lines` steps with probability p (1 - p)^(n_biased_lines - 1), which is
+    `last_step_failure_probability`. The amplification is the relative error of p divided by that of
+    this probability.
     """
     p = last_step_failure_probability
-    if n_lines == 1:
+    if n_biased_lines == 1:
         return p, 1.0
     for _ in range(N_FIXED_POINT_ITERATIONS):
-        p = min(last_step_failure_probability / (1.0 - p) ** (n_lines - 1), 0.9 / n_lines)
-    return p, 1.0 / (1.0 - (n_lines - 1) * p / (1.0 - p))
+        p = min(
+            last_step_failure_probability / (1.0 - p) ** (n_biased_lines - 1), 0.9 / n_biased_lines
+        )
+    return p, 1.0 / (1.0 - (n_biased_lines - 1) * p / (1.0 - p))
 
 
-def _estimate_kappa_2(transitions: Sequence[tuple[np.ndarray, ...]], n_continuous: int) -> float:
+def _estimate_kappa_2(
+    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous: int
+) -> float:
     """Return the second eigenvalue of the survival operator, projected on quadratic functions.
 
-    Transitions are states before a step, survival, deviations of the slopes on which the step ends,
-    and states after the step. The projection is the extended dynamic mode decomposition (Williams,
-    Kevrekidis and Rowley 2015). Polynomials of that deviation have a mean of zero in any state.
-    They remove most of the noise from the regression. As the slopes become equal, the eigenvalue
-    becomes the leading multiplier of the gait.
+    A transition consists of states before a step, survival, deviations of the slopes on which the
+    step ends, and states after the step. The projection is the extended dynamic mode decomposition
+    (Williams, Kevrekidis and Rowley 2015). Hermite polynomials of the deviations have a mean of
+    zero in any state. As regressors, they remove most of the noise. As the slopes become equal, the
+    eigenvalue becomes the leading multiplier of the gait.
     """
     states_before, is_alive, landing_deviations, states_after = (
-        np.concatenate(transition_parts) for transition_parts in zip(*transitions, strict=True)
+        np.concatenate(transition_parts) for transition_parts in zip(*step_transitions, strict=True)
     )
     state_center = states_before.mean(0)
     coordinate_indices = [
         i for i in (*range(n_continuous), states_before.shape[1] - 1) if np.ptp(states_before[:, i])
     ]
     state_scale = states_before[:, coordinate_indices].std(0)
-    standardize = lambda states: (states - state_center)[:, coordinate_indices] / state_scale
-    _, singular_values, directions = np.linalg.svd(standardize(states_before), full_matrices=False)
-    is_resolved = singular_values > MIN_RELATIVE_SINGULAR_VALUE * singular_values[0]
-    directions = (
-        directions[is_resolved] * np.sqrt(len(states_before)) / singular_values[is_resolved, None]
+    standardize_states = lambda states: (states - state_center)[:, coordinate_indices] / state_scale
+    _, singular_values, principal_directions = np.linalg.svd(
+        standardize_states(states_before), full_matrices=False
     )
-    first_indices, second_indices = np.triu_indices(len(directions))
+    is_direction_resolved = singular_values > MIN_RELATIVE_SINGULAR_VALUE * singular_values[0]
+    principal_directions = (
+        principal_directions[is_direction_resolved]
+        * np.sqrt(len(states_before))
+        / singular_values[is_direction_resolved, None]
+    )
+    first_indices, second_indices = np.triu_indices(len(principal_directions))
 
     def evaluate_features(states: np.ndarray) -> np.ndarray:
-        z = standardize(states) @ directions.T
+        z = standardize_states(states) @ principal_directions.T
         return np.concatenate(
             [np.ones((len(z), 1)), z, z[:, first_indices] * z[:, second_indices]], 1
         )
 
-    image_values, basis_values = (
+    next_features, quadratic_features = (
         np.where(is_alive[:, None], evaluate_features(states_after), 0.0),
         evaluate_features(states_before),
     )
-    linear_features = basis_values[:, : 1 + len(directions)]
+    linear_features = quadratic_features[:, : 1 + len(principal_directions)]
     hermite_polynomials = landing_deviations[:, None], landing_deviations[:, None] ** 2 - 1.0
-    regressors = np.concatenate(
-        [basis_values, *(linear_features * polynomial for polynomial in hermite_polynomials)], 1
+    regression_inputs = np.concatenate(
+        [
+            quadratic_features,
+            *(linear_features * hermite_polynomial for hermite_polynomial in hermite_polynomials),
+        ],
+        1,
     )
-    coefficients = np.linalg.lstsq(regressors, image_values, rcond=None)[0]
-    eigenvalue_moduli = np.sort(np.abs(np.linalg.eigvals(coefficients[: basis_values.shape[1]])))
+    regression_coefficients = np.linalg.lstsq(regression_inputs, next_features, rcond=None)[0]
+    eigenvalue_moduli = np.sort(
+        np.abs(np.linalg.eigvals(regression_coefficients[: quadratic_features.shape[1]]))
+    )
     return float(eigenvalue_moduli[-2])

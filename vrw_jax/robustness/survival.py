@@ -1,8 +1,8 @@
-"""Leading eigenvalues of a survival operator, and the mean first-passage times that follow.
+"""Leading eigenvalues of a survival operator, and mean first-passage times.
 
-The operator K is given by a matrix: (K f)(i) is the mean of f over the states that survive one step
-from state i. F(i) is the probability of failure there, so that K 1 = 1 - F. The source is Byl and
-Tedrake, "Metastable walking machines" (2009).
+The operator K is given by a matrix: (K f)(i) is the mean of f over the states after one step from
+state i, where failures count as 0. F(i) is the probability that this step fails: K 1 = 1 - F.
+The source is Byl and Tedrake, "Metastable walking machines" (2009).
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ MAX_POWER_ITERATIONS = 5000
 kappa_1."""
 
 POWER_ITERATION_TOLERANCE = 1e-15
-"""Change of an eigenvector at which power iteration ends, chosen near round-off."""
+"""Relative change of an eigenvector at which power iteration ends, chosen near round-off."""
 
 
 class SurvivalAnalysis(NamedTuple):
@@ -26,44 +26,46 @@ class SurvivalAnalysis(NamedTuple):
 
     failure_probability: Scalar  # 1 - kappa_1, without cancellation
     kappa_2: Scalar
-    distribution: Float[Array, " n"]  # quasi-stationary weights of the nodes, sum 1
-    right_eigenvector: Float[Array, " n"]  # scaled to a mean of 1 over the distribution
+    quasi_stationary_weights: Float[Array, " n"]  # of the nodes, sum 1
+    survival_eigenvector: Float[Array, " n"]  # scaled to a mean of 1 over the distribution
 
 
-def analyze_survival(
+def analyze_survival_operator(
     survival_matrix: Float[Array, "n n"], failure_probabilities: Float[Array, " n"]
 ) -> SurvivalAnalysis:
     """Return the leading eigenvalues and eigenvectors of a survival operator.
 
-    Let q be the distribution and u the right eigenvector, with q.1 = q.u = 1. The failure
-    probability is q.F. Its first derivatives are those of q.(F - K (u - 1)) with q and u held
-    fixed.
+    Let q be the quasi-stationary distribution and u the right eigenvector, with q.1 = q.u = 1. The
+    failure probability is q.F. Its first derivatives are those of q.(F - K (u - 1)) with q and u
+    held fixed.
     """
     K = lax.stop_gradient(survival_matrix)
-    distribution = _iterate_power(K.T)
-    unnormalized_eigenvector = _iterate_power(K)
-    right_eigenvector = unnormalized_eigenvector / (distribution @ unnormalized_eigenvector)
+    quasi_stationary_weights = _compute_leading_eigenvector(K.T)
+    unscaled_eigenvector = _compute_leading_eigenvector(K)
+    survival_eigenvector = unscaled_eigenvector / (quasi_stationary_weights @ unscaled_eigenvector)
     eigenvalues = jnp.sort(jnp.abs(jnp.linalg.eigvals(K)))
-    correction = survival_matrix @ (right_eigenvector - 1.0)
-    failure_probability = distribution @ (
-        failure_probabilities - (correction - lax.stop_gradient(correction))
+    eigenvector_correction = survival_matrix @ (survival_eigenvector - 1.0)
+    failure_probability = quasi_stationary_weights @ (
+        failure_probabilities - (eigenvector_correction - lax.stop_gradient(eigenvector_correction))
     )
-    return SurvivalAnalysis(failure_probability, eigenvalues[-2], distribution, right_eigenvector)
+    return SurvivalAnalysis(
+        failure_probability, eigenvalues[-2], quasi_stationary_weights, survival_eigenvector
+    )
 
 
-def _iterate_power(matrix: Array) -> Array:
+def _compute_leading_eigenvector(matrix: Array) -> Array:
     """Return the leading eigenvector of a matrix, scaled to a sum of 1.
 
-    Power iteration keeps the relative accuracy of small entries, because sums of products have no
-    cancellation.
+    The method is power iteration. Its sums have only positive terms and no cancellation, so that
+    small components are relatively accurate.
     """
 
-    def is_running(carry: tuple) -> Array:
-        iteration, _, relative_change = carry
+    def has_not_converged(loop_state: tuple) -> Array:
+        iteration, _, relative_change = loop_state
         return (iteration < MAX_POWER_ITERATIONS) & (relative_change > POWER_ITERATION_TOLERANCE)
 
-    def iterate(carry: tuple) -> tuple:
-        iteration, vector, _ = carry
+    def apply_matrix(loop_state: tuple) -> tuple:
+        iteration, vector, _ = loop_state
         next_vector = matrix @ vector
         next_vector = next_vector / jnp.sum(next_vector)
         return (
@@ -74,25 +76,31 @@ def _iterate_power(matrix: Array) -> Array:
 
     n = matrix.shape[0]
     initial_vector = jnp.full(n, 1.0 / n, matrix.dtype)
-    return lax.while_loop(is_running, iterate, (0, initial_vector, jnp.ones((), matrix.dtype)))[1]
+    return lax.while_loop(
+        has_not_converged, apply_matrix, (0, initial_vector, jnp.ones((), matrix.dtype))
+    )[1]
 
 
 def compute_mean_steps(
-    survival: SurvivalAnalysis,
+    survival_analysis: SurvivalAnalysis,
     survival_matrix: Array,
-    survival_row: Array,
-    failure_at_start: Scalar,
+    start_survival_row: Array,
+    start_failure_probability: Scalar,
 ) -> Scalar:
     """Return the mean number of steps from one start, including the failing step.
 
-    The mean is m = 1 + K m. The solution is the sum of M u, with M = 1/(1 - kappa_1), and a
-    remainder g with (I - K + u q) g = 1 - u, which stays small.
+    The mean m solves m = 1 + K m. The solution is M u + g with M = 1/(1 - kappa_1). The remainder g
+    solves (I - K + u q) g = 1 - u and stays small.
 
-    - `survival_row`: row of the operator at the start;
-    - `failure_at_start`: probability of failure there.
+    - `start_survival_row`: row of the survival operator at the start;
+    - `start_failure_probability`: probability that the first step fails.
     """
-    p, u, q = survival.failure_probability, survival.right_eigenvector, survival.distribution
+    p, u, q = (
+        survival_analysis.failure_probability,
+        survival_analysis.survival_eigenvector,
+        survival_analysis.quasi_stationary_weights,
+    )
     n = len(u)
-    remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
-    life_at_start = (1.0 - failure_at_start + survival_row @ (u - 1.0)) / (1.0 - p)
-    return life_at_start / p + 1.0 - life_at_start + survival_row @ remainder
+    bounded_remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
+    survival_factor = (1.0 - start_failure_probability + start_survival_row @ (u - 1.0)) / (1.0 - p)
+    return survival_factor / p + 1.0 - survival_factor + start_survival_row @ bounded_remainder
