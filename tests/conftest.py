@@ -24,7 +24,7 @@ LONGEST_COMPILATIONS = (
     "test_rigid", "test_reference", "test_one_sided_stoppers", "test_scan", "test_engines",
     "test_atlas_failures", "test_events", "test_scales", "test_ground_derivatives", "test_margins",
     "test_lane_engine", "test_outcomes", "test_reproduction", "test_ground_batches",
-    "test_snippets", "test_oracle", "test_simd", "test_cli", "test_stores", "test_settling",
+    "test_snippets", "test_reference_code", "test_simd", "test_cli", "test_stores", "test_settling",
     "test_restitution", "test_layers", "test_phases", "test_robustness", "test_wrong_calls",
     "test_inputs", "test_checked",
 )  # fmt: skip

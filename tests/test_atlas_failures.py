@@ -26,7 +26,7 @@ def import_atlas_module(name):
 @pytest.mark.parametrize("name", failures.NAMES)
 def test_a_case_has_a_reference_rows_a_figure_and_a_section_of_the_page(name):
     case = import_atlas_module(name).CASE
-    assert all((case.title, case.breaks, case.truth, case.source))
+    assert all((case.title, case.breaks, case.reference, case.source))
     assert any(row["case"] == name for row in FAILURE_TABLE)
     assert (ROOT / "docs" / "figures" / f"failure_{name}.png").exists()
     problems = failures.PROBLEMS.read_text()
@@ -120,15 +120,15 @@ def test_a_method_that_finds_no_event_does_not_report_a_failure():
 
 
 @pytest.mark.parametrize(
-    ("name", "system", "start", "truth"),
+    ("name", "system", "start", "reference"),
     [
-        ("pinned_pendulum", "SYSTEM", "START", lambda m: m.truth(3)),
+        ("pinned_pendulum", "SYSTEM", "START", lambda m: m.reference(3)),
         ("singular_field", "QUESTIONS", (1.0,), lambda m: [m.QUESTIONS[0][2]]),
         ("grazing", "make_stopped_oscillator", None, lambda m: [m.compute_touch_time(m.W, 1e-4)]),
         ("tangent_guards", "circle", (1.0, 0.0, 0.0), lambda m: [m.entry(1e-4)]),
     ],
 )
-def test_event_times_are_within_1e_12_of_their_closed_forms(name, system, start, truth):
+def test_event_times_are_within_1e_12_of_their_closed_forms(name, system, start, reference):
     case = import_atlas_module(name)
     created = getattr(case, system)
     if name == "singular_field":
@@ -138,7 +138,7 @@ def test_event_times_are_within_1e_12_of_their_closed_forms(name, system, start,
     if name == "tangent_guards":
         created = created(1e-4)
     start = getattr(case, start) if isinstance(start, str) else start
-    times = truth(case)
+    times = reference(case)
     walk_result = run_library(created, start, len(times), 10.0)
     np.testing.assert_allclose(walk_result.times, times, rtol=0.0, atol=1e-12)
 
@@ -153,7 +153,7 @@ def test_a_grazing_event_at_tight_tolerance_is_within_two_roundings_of_its_state
 
 def test_clutches_lock_and_slip_at_the_times_of_the_modelica_reference():
     case = import_atlas_module("clutches")
-    times, rate = case.truth()
+    times, rate = case.reference()
     gaps = {event: times[event - 1] - result for event, result in case.PUBLISHED_TIMES.items()}
     # Their solver's tolerance is in the locks; where a lock breaks only the clock counts.
     assert max(abs(gap) for gap in gaps.values()) < 5e-6
@@ -208,10 +208,10 @@ def test_successive_corner_impacts_are_reported_and_simultaneous_ones_simulated(
     start = case.make_start_state()
     walk_result = run_library(case.SIMULTANEOUS_IMPACTS, start, case.BOUNCES, case.LIMIT)
     assert walk_result.says == "ZENO"
-    assert abs(walk_result.times[-1] - case.TRUTH["end of the bounces"]) < 1e-14
+    assert abs(walk_result.times[-1] - case.REFERENCE["end of the bounces"]) < 1e-14
     single_result = run_library(case.SUCCESSIVE_IMPACTS, start, 20, case.LIMIT)
     assert single_result.says == "ZENO"
-    assert abs(single_result.times[-1] - case.TRUTH["first impact"]) < 1e-14
+    assert abs(single_result.times[-1] - case.REFERENCE["first impact"]) < 1e-14
 
 
 def test_both_formulations_of_the_slider_crank_keep_the_energy_up_to_the_first_impact():
@@ -261,8 +261,8 @@ def test_the_slider_crank_reference_agrees_with_forty_digits_in_other_coordinate
     case = import_atlas_module("slider_crank")
     with mp.workdps(40):
         result = simulate_bounces()
-    for name, truth in case.TRUTH.items():
-        assert abs(float(result[name]) / truth - 1.0) < 1e-15, name
+    for name, reference in case.REFERENCE.items():
+        assert abs(float(result[name]) / reference - 1.0) < 1e-15, name
 
 
 @pytest.mark.slow

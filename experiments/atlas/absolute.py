@@ -1,11 +1,11 @@
-"""The slider–crank with play in nine absolute coordinates, 40 digits: its case's truth.
+"""The slider–crank with play in nine absolute coordinates, 40 digits: its case's reference.
 
     python -m experiments.atlas.absolute
 
 Three bodies with their middles' places and angles, six equations of joints, and one for each corner
 in contact; forces of joints and corners are multipliers. Steps of the midpoint rule, extrapolated;
 an event is Newton's on the last step's length. Nothing is shared with cases/slider_crank but the
-numbers of the mechanism. Prints what `TRUTH` there holds; minutes.
+numbers of the mechanism. Prints what `REFERENCE` there holds; minutes.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """Where derivatives err: borders, many steps, meeting multipliers, modes.
 
-The oracle is the formulation of `tests/oracle` at 35 digits with central differences, or, over many
-steps and where a step has no double support, steps by isolated roots (see `events`) with
-extrapolated central differences.
+The reference is the formulation of `tests/reference_code` at 35 digits with central differences.
+Over many steps, and if a step has no double support, the reference is steps by isolated roots (see
+`events`) with extrapolated central differences.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from experiments.atlas.events import START, Rows
 from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from experiments.speed.peers import hy
-from experiments.work_precision.truth import VARIED_PARAMETERS, load
-from tests.oracle import multiprecision
-from tests.oracle.hub_form import HubForm
-from tests.oracle.multiprecision import Flow, Number, Vector
+from experiments.work_precision.reference_values import VARIED_PARAMETERS, load
+from tests.reference_code import multiprecision
+from tests.reference_code.hub_form import HubForm
+from tests.reference_code.multiprecision import Flow, Number, Vector
 from vrw_jax import Outcome
 from vrw_jax.continuation import floquet
 from vrw_jax.wheel import transitions
@@ -91,16 +91,16 @@ def borders() -> Rows:
                 x = [mp.mpf(float(v)) for v in start]
                 x[1] += sign * size
                 ends.append(hub.walk(hub.land(x, p)[0], p, about).section_state)
-            truth = np.array([float((a - b) / (2 * size)) for a, b in zip(*ends, strict=True)])
+            reference = np.array([float((a - b) / (2 * size)) for a, b in zip(*ends, strict=True)])
             value = np.array([float((a + b) / 2) for a, b in zip(*ends, strict=True)])
             jacobian, image = derive(jnp.asarray(start), params)
-            miss = np.max(np.abs(np.asarray(jacobian)[:, 1] - truth))
+            miss = np.max(np.abs(np.asarray(jacobian)[:, 1] - reference))
             yield {
                 "border": name,
                 "edge": f"{edge:.6g}",
                 "distance": f"{distance:.0e}",
-                "derivative": f"{np.max(np.abs(truth)):.4g}",
-                "derivative_error": f"{miss / max(np.max(np.abs(truth)), 1.0):.1e}",
+                "derivative": f"{np.max(np.abs(reference)):.4g}",
+                "derivative_error": f"{miss / max(np.max(np.abs(reference)), 1.0):.1e}",
                 "value_error": f"{np.max(np.abs(np.asarray(image) - value)):.1e}",
                 "durations": " ".join(f"{d:.2g}" for d in about),
             }
@@ -197,7 +197,7 @@ def scuffing() -> Rows:
         shares = np.append(shares, [[distance, float(time) / distance]], 0)
         ends = [at(damping + sign * h) for sign in (1, -1)]
         up, down = (dip.lowest(y, p, (dls, float(time)))[0] for y, p, dls in ends)
-        truth = float((up - down) / (2 * h))
+        reference = float((up - down) / (2 * h))
         value, derivative = map(float, derive(jnp.asarray(float(damping))))
         yield {
             "edge": mp.nstr(edge, 12),
@@ -205,8 +205,8 @@ def scuffing() -> Rows:
             "time_s": f"{float(time):.3g}",
             "clearance_m": f"{float(low):.4e}",
             "value_error": f"{abs(value - float(low)):.1e}",
-            "derivative": f"{truth:.4e}",
-            "derivative_error": f"{abs(derivative - truth):.1e}",
+            "derivative": f"{reference:.4e}",
+            "derivative_error": f"{abs(derivative - reference):.1e}",
         }
 
 
@@ -244,7 +244,7 @@ def growth() -> Rows:
         }
         near = (sides[1] - sides[-1]) / (2.0 * size)
         far = (sides[2] - sides[-2]) / (4.0 * size)
-        truth = (4.0 * near - far) / 3.0
+        reference = (4.0 * near - far) / 3.0
         for count in range(1, N_GROWTH_STEPS + 1):
             by_params, by_x = step(params, jnp.asarray(values_array))
             by_x = np.asarray(by_x)
@@ -256,7 +256,7 @@ def growth() -> Rows:
             lowest.append(float(rear.normal))
             values_array = np.asarray(vrw.return_map(params, values_array))
             if count in SHOWN_STEP_COUNTS:
-                miss = np.max(np.abs(by_damping - truth[count - 1]))
+                miss = np.max(np.abs(by_damping - reference[count - 1]))
                 yield {
                     "damping": f"{damping:g}",
                     "steps": count,
@@ -311,8 +311,8 @@ FROM_MEETING = np.logspace(-1.5, -13.0, 24)
 def meeting() -> Rows:
     """Errors of derivatives where two eigenvalues of a matrix meet, over the distance s.
 
-    The matrix is that of eigenvalues DOUBLE +- sqrt(s), in a frame that hides it; the truth has 35
-    digits, the entries are doubles.
+    The matrix is that of eigenvalues DOUBLE +- sqrt(s), in a frame that hides it. The reference
+    has 35 digits, and the elements of the matrix are 64-bit numbers.
     """
     mp.mp.prec = 120
     turned = lambda rows: FRAME * mp.matrix(rows) * FRAME**-1
@@ -359,9 +359,9 @@ def modes() -> Rows:
 
     A walk starts 1 % off the gait; its last step's duration tends to the period.
     """
-    truth = load()
-    rows, starts = truth["rows"][:GAITS], truth["start"][:GAITS]
-    exactly = truth["d_cycle"][:GAITS, 2:].sum(1) * rows
+    reference = load()
+    rows, starts = reference["rows"][:GAITS], reference["start"][:GAITS]
+    exactly = reference["d_cycle"][:GAITS, 2:].sum(1) * rows
     size = np.linalg.norm(exactly, axis=1)
     wheel = lambda row: vrw.WheelParams(**dict(zip(VARIED_PARAMETERS, row, strict=True)))
     model, options = vrw.ViscoelasticWheel(), vrw.StepOptions()

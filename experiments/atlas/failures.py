@@ -57,7 +57,7 @@ def as_text(name: str, row: Row) -> dict[str, str]:
         "method": row.method,
         "verdict": row.verdict,
         "found": f"{row.found:.15g}",
-        "truth": f"{row.truth:.15g}",
+        "reference": f"{row.reference:.15g}",
         "error": "-" if math.isinf(row.error) else f"{row.error:.1e}",
         "within": f"{row.is_within_request:.3g}",
         "condition": f"{row.condition:.3g}",
@@ -104,7 +104,7 @@ def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
 
 
 def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """What this library answers rightly where the truth is a closed form, or has all digits."""
+    """What this library answers rightly where the reference is a closed form, or has all digits."""
     return [
         row
         for row in rows
@@ -132,7 +132,7 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         ]
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *result_list, f"{max(errors):.0e}" if errors else "-"])
-        origins.append([link, case.breaks, case.truth, case.source])
+        origins.append([link, case.breaks, case.reference, case.source])
         header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
                   "ms", "options; version"]  # fmt: skip
         table = format_markdown(header, methods)

@@ -2,7 +2,7 @@
 
 The paper's five coordinates with multipliers drift off their constraints; a fixed-step penalty
 contact, as general physics engines have it, needs no events and pays with accuracy. Equations are
-those of `tests/oracle`.
+those of `tests/reference_code`.
 """
 
 import json
@@ -13,15 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.oracle import five_coordinates as oracle
-from tests.oracle import five_coordinates_equations as equations
-from tests.oracle.constrained_wheel import Wheel
+from tests.reference_code import five_coordinates as reference
+from tests.reference_code import five_coordinates_equations as equations
+from tests.reference_code.constrained_wheel import Wheel
 
-TRUTH = json.loads(Path(oracle.__file__).with_name("truth.json").read_text())["cases"][0]
-PARAMS = {name: float(value) for name, value in TRUTH["params"].items()}
-START = np.array([float(v) for v in TRUTH["step"]["start"]])
-EXACT_SECTION_STATE = np.array([float(v) for v in TRUTH["step"]["section_state"]])
-PERIOD = sum(float(v) for v in TRUTH["step"]["durations"])
+REFERENCE = json.loads(Path(reference.__file__).with_name("reference_values.json").read_text())[
+    "cases"
+][0]
+PARAMS = {name: float(value) for name, value in REFERENCE["params"].items()}
+START = np.array([float(v) for v in REFERENCE["step"]["start"]])
+EXACT_SECTION_STATE = np.array([float(v) for v in REFERENCE["step"]["section_state"]])
+PERIOD = sum(float(v) for v in REFERENCE["step"]["durations"])
 
 DRIFT_STEP = 5e-3  # s: the fast mode's rate times it is 1
 DRIFT_AT = (100, 1000, 10_000, 100_000)  # steps
@@ -29,7 +31,7 @@ BAUMGARTE = 50.0  # 1/s: both roots of the constraint's error
 
 
 class ConstrainedWheel:
-    """The oracle's wheel, and what its phases are followed with."""
+    """The reference's wheel, and what its phases are followed with."""
 
     def __init__(self, stabilised: str) -> None:
         self.wheel, self.stabilised = Wheel(PARAMS), stabilised
@@ -107,7 +109,7 @@ def exchange(q, v):
     length = PARAMS["locked_length"]
     x = q[0] + q[3] * math.sin(q[2]) - length * math.sin(new)
     z = q[1] + q[3] * math.cos(q[2]) - length * math.cos(new)
-    _, rates, _ = oracle.exchange_labels(PARAMS, q, v)
+    _, rates, _ = reference.exchange_labels(PARAMS, q, v)
     return np.array([x, z, new, length, q[3]]), rates
 
 
@@ -115,7 +117,7 @@ def drift() -> Iterator[dict[str, object]]:
     """How far feet leave the ground and their places, over integrator steps, three treatments."""
     for stabilised in ("none", "Baumgarte", "projection"):
         body = ConstrainedWheel(stabilised)
-        q, v = oracle.pre_impact(PARAMS, START)
+        q, v = reference.pre_impact(PARAMS, START)
         count, lost_values, height, begin = 0, False, 0.0, time.process_time()
         while not lost_values:
             q, v = exchange(q, v)
@@ -173,8 +175,8 @@ def penalty_step(h: float, held_values: float) -> dict[str, object]:
     wheel, mass = Wheel(PARAMS), PARAMS["leg_mass"]
     k = mass * (RATIO / h) ** 2
     c = 2.0 * math.sqrt(k * mass)
-    q, v = oracle.pre_impact(PARAMS, START)
-    q, v, _ = oracle.exchange_labels(PARAMS, q, v)
+    q, v = reference.pre_impact(PARAMS, START)
+    q, v, _ = reference.exchange_labels(PARAMS, q, v)
     anchor = np.array(equations.feet(q, wheel.pack))
     lifted, swung, locked, count = False, False, False, 0
     begin = time.process_time()

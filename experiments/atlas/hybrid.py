@@ -300,7 +300,7 @@ def make_row(
     walk_result: MethodRun,
     quantity: str,
     solution: float,
-    truth: float,
+    reference: float,
     *,
     relative: bool = False,
     condition: float = 1.0,
@@ -315,7 +315,7 @@ def make_row(
         if rounding[-1] > EXACT_ERROR:
             says += f", one rounding: {rounding[-1]:.1e}"
     return Row(
-        quantity, walk_result.method, solution, truth, compute_error(solution, truth,
+        quantity, walk_result.method, solution, reference, compute_error(solution, reference,
         relative=relative), says,
         walk_result.admits, walk_result.work, walk_result.seconds, walk_result.options,
         walk_result.version,

@@ -134,7 +134,7 @@ def first_order() -> Rows:
         params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LANES,)), params)
         landing = transitions.land(params.symbols(), *START)
         y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)[:1]
-        truth = peers.Heyoka(1e-15)(y, peers.pack(params)[:1])[0, :6]
+        reference = peers.Heyoka(1e-15)(y, peers.pack(params)[:1])[0, :6]
         for leg, run in runs.items():
             call = lambda run=run, params=params: jax.block_until_ready(
                 run(params, jnp.tile(START, (LANES, 1)))
@@ -143,7 +143,7 @@ def first_order() -> Rows:
             yield {
                 "c_over_m": f"{rate:.4g}",
                 "leg": leg,
-                "error": f"{np.max(np.abs(np.asarray(result[0]) - truth)):.2e}",
+                "error": f"{np.max(np.abs(np.asarray(result[0]) - reference)):.2e}",
                 "steps_sls1": int(steps[0]),
                 "us_per_gait": f"{measure_cpu_seconds(call) / LANES * 1e6:.4g}",
                 "ended_on_stopper": bool(guard[0] == 0),

@@ -1,4 +1,4 @@
-"""Gaits without a closed form in 40 digits: the truth of walkers and of the woodpecker.
+"""Gaits without a closed form in 40 digits: the reference of walkers and of the woodpecker.
 
     python -m experiments.atlas.many_digits
 

@@ -31,16 +31,16 @@ def _run_peer(name: str, *arguments: str) -> dict:
 
 
 def make_rows(
-    name: str, case: str, truths: dict[str, float], *arguments: str, relative: bool = False
+    name: str, case: str, references: dict[str, float], *arguments: str, relative: bool = False
 ) -> Iterator[Row]:
-    """What `elsewhere/NAME` answers to a case's questions, beside their truths."""
+    """What `elsewhere/NAME` answers to a case's questions, beside their references."""
     result = _run_peer(name, *arguments)
     answers = {a["name"]: a for a in result.get("answers", ()) if a["case"] == case}
-    for question, truth in truths.items():
+    for question, reference in references.items():
         answer = answers.get(question, {"value": math.nan, "work": 0, "seconds": 0.0})
         solution = float(answer["value"])
         yield Row(
-            question, name.capitalize(), solution, truth, compute_error(solution, truth,
+            question, name.capitalize(), solution, reference, compute_error(solution, reference,
             relative=relative),
             answer.get("says", result.get("says", "")), answer.get("admits", not answers),
             answer["work"], answer["seconds"], answer.get("options", result.get("options", "none")),

@@ -19,7 +19,7 @@ class Row(NamedTuple):
     quantity: str
     method: str
     found: float
-    truth: float
+    reference: float
     error: float  # absolute, or relative where the case says so
     says: str  # its own code, message or exception
     admits: bool  # whether that is a failure told, and not success claimed
@@ -27,8 +27,8 @@ class Row(NamedTuple):
     seconds: float  # CPU time of a call that has been compiled before
     options: str
     version: str
-    condition: float = 1.0  # by how much a unit error of the state moves the truth
-    digits: int | None = None  # of a published truth; None: a closed form, or all digits
+    condition: float = 1.0  # by how much a unit error of the state moves the reference
+    digits: int | None = None  # of a published reference; None: a closed form, or all digits
 
     @property
     def requested_tolerance(self) -> float:
@@ -59,15 +59,15 @@ class Case(NamedTuple):
 
     title: str
     breaks: str
-    truth: str
+    reference: str
     source: str
     rows: Callable[[], Iterable[Row]]
     draw: Callable[[Figure, list[dict[str, str]]], None]
 
 
-def compute_error(solution: float, truth: float, *, relative: bool = False) -> float:
+def compute_error(solution: float, reference: float, *, relative: bool = False) -> float:
     """Error; infinite where nothing was found."""
-    gap = abs(solution - truth) / (abs(truth) if relative else 1.0)
+    gap = abs(solution - reference) / (abs(reference) if relative else 1.0)
     return gap if math.isfinite(gap) else math.inf
 
 

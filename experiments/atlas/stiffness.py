@@ -56,7 +56,7 @@ def measure_over_rates() -> Rows:
         landing = transitions.land(params.symbols(), *START)
         y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)
         packed = peers.pack(params)
-        truth = peers.Heyoka(1e-15)(y, packed)[0, :6]
+        reference = peers.Heyoka(1e-15)(y, packed)[0, :6]
         peer = lambda steps, *more, y=y, packed=packed: (
             1,
             functools.partial(steps, y, packed, *more),
@@ -88,9 +88,9 @@ def measure_over_rates() -> Rows:
                 "solver": solver,  # that `vrw.steps` took
                 "us_per_gait": f"{minimum[name] * 1e6:.4g}",
                 "work": f"{work:.0f}",  # evaluations of peers, tried steps of the library
-                "error": f"{np.max(np.abs(values - truth)):.2e}",
+                "error": f"{np.max(np.abs(values - reference)):.2e}",
                 "outcome": (outcome if good else Outcome.SOLVER_FAILED).name,
-                "duration_sls1": f"{truth[4]:.6g}",
+                "duration_sls1": f"{reference[4]:.6g}",
             }
 
 

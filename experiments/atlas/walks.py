@@ -14,7 +14,7 @@ from vrw_jax.hybrid import MonitoredFunctions, PhaseEnd, integrate_phase
 from vrw_jax.models.viscoelastic import DiffraxPhase, make_diffrax_phase
 from vrw_jax.wheel import Motion, dynamics, make_phases, transitions
 
-ORACLE = Path(__file__).parents[2] / "tests" / "oracle"
+REFERENCE = Path(__file__).parents[2] / "tests" / "reference_code"
 BLOCK = 1000
 WALKED_STEP_COUNTS = (1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
@@ -70,9 +70,9 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
 
 def long_walk() -> Iterator[dict[str, object]]:
     """Many steps of Table 1's wheel from its limit cycle, at four tolerances."""
-    truth = json.loads((ORACLE / "truth.json").read_text())["cases"][0]["cycle"]
-    first = np.array([float(value) for value in truth["section_state"]])
-    period = float(truth["period"])
+    reference = json.loads((REFERENCE / "reference_values.json").read_text())["cases"][0]["cycle"]
+    first = np.array([float(value) for value in reference["section_state"]])
+    period = float(reference["period"])
     params = vrw.WheelParams()
 
     def walk(x: jax.Array, tolerance: jax.Array) -> tuple:

@@ -73,7 +73,7 @@ def flatten_derivatives(by_input: dict, names: Sequence[str]) -> np.ndarray:
 
 def in_batches(n: int, repeats: int) -> list[tuple]:
     """Return tolerance, columns, microseconds per lane, and the errors of values and columns."""
-    rows, states, truth = draw_wheels_near_gaits(n)
+    rows, states, reference = draw_wheels_near_gaits(n)
     params, selection, every = make_wheels(rows), slice(min(n, 512)), COLUMNS["all twelve"]
     tight = vrw.StepOptions.tight()
     exact = vrw.step_batch(
@@ -99,7 +99,7 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
         )
         run_result, of_values = timed(choose(1.0), ())
         values = np.concatenate([run_result.section_state, run_result.durations], 1)
-        error = np.quantile(np.max(np.abs(values - truth), 1), 0.99)
+        error = np.quantile(np.max(np.abs(values - reference), 1), 0.99)
         row = (f"{tolerance:.0e}", "", "none", f"{of_values:.2f}", "1", f"{error:.1e}")
         table.append((*row, ""))
         for factor, (name, requested) in itertools.product((1.0, 20.0), COLUMNS.items()):

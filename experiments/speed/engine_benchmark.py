@@ -143,16 +143,16 @@ def candidates(durations):
         )  # fmt: skip
 
 
-def compare(rows, states, truth, repeats):
+def compare(rows, states, reference, repeats):
     """Return the table: engine, method, tolerance, p99 error, steps per second and first call."""
     table, runs = [], []
-    for engine, method, tolerance, share, make in candidates(truth[:, 3:]):
+    for engine, method, tolerance, share, make in candidates(reference[:, 3:]):
         n = max(int(share * len(rows)), 16)
         run = make(rows[:n], states[:n])
         begin = time.perf_counter()
         run_result = run()
         first = time.perf_counter() - begin
-        error = np.quantile(np.max(np.abs(run_result - truth[:n]), 1), 0.99)
+        error = np.quantile(np.max(np.abs(run_result - reference[:n]), 1), 0.99)
         entry = {"engine": engine, "method": method, "tolerance": tolerance, "p99_error": error}
         table.append(entry | {"lanes": n, "first_call_s": first, "times": []})
         runs.append(run)
@@ -307,8 +307,8 @@ def main():
         return
     with use_one_core():
         start_without_cache()
-        rows, states, truth = draw_wheels_near_gaits(chosen.lanes)
-        table = compare(rows, states, truth, chosen.repeats)
+        rows, states, reference = draw_wheels_near_gaits(chosen.lanes)
+        table = compare(rows, states, reference, chosen.repeats)
         shares, cost = cost_of_failures(rows, states, chosen.repeats)
     write(table, shares, cost, chosen.out)
 

@@ -116,7 +116,7 @@ def style_of(rows: list[Row]) -> dict[str, dict]:
 
 
 def of_lanes(row: Row) -> int:
-    """Lanes that have a truth among those measured."""
+    """Lanes that have a reference among those measured."""
     return min(int(row["lanes"]), 256)
 
 

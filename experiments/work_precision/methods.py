@@ -42,7 +42,7 @@ class Method(NamedTuple):
     precision: str
     settings: tuple  # tolerances, meshes or step lengths, loosest first
     make: Callable[[Any, np.ndarray, np.ndarray], Run]
-    lanes: int = 256  # measured at once; the lanes of the truth, repeated or cut
+    lanes: int = 256  # measured at once; the lanes of the reference, repeated or cut
 
 
 # --- One step.

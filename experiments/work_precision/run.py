@@ -2,11 +2,12 @@
 
     python -m experiments.work_precision.run [--at-most N] [--only TEXT] [--again] [--redraw]
 
-256 wheels near their own limit cycles (see `truth`) by each of METHODS of `methods`. Error: largest
-over the parts of a quantity, against a truth of 20 digits; p50, p99 and worst over lanes; failed
-lanes are counted. Time: CPU time of one core per gait, median of repeats, scaled by a reference
-(numba's step) timed just before and after, because machines are shared. Results are kept method by
-method in a table: a run that was stopped goes on. Then charts and tables are drawn from it.
+Each of METHODS of `methods` computes 256 wheels near their limit cycles (see `reference_values`).
+Error: largest over the parts of a quantity, against references of 20 digits; p50, p99 and worst
+over lanes; failed lanes are counted. Time: CPU time of one core per gait, median of repeats, scaled
+by a reference (numba's step) timed just before and after, because machines are shared. Results are
+kept method by method in a table: a run that was stopped goes on. Then charts and tables are drawn
+from it.
 """
 
 import argparse
@@ -39,7 +40,7 @@ from experiments.work_precision.methods import (
     by_peer,
     compute_landing,
 )
-from experiments.work_precision.truth import load
+from experiments.work_precision.reference_values import load
 
 TABLE, BATCH_TABLE = FIGURES / "work_precision.csv", FIGURES / "work_precision_batch.csv"
 KEY = ("group", "family", "name", "precision", "setting", "lanes")
@@ -51,18 +52,20 @@ MAX_REPEATED_SECONDS = (
 )
 
 
-def errors(group: str, result: np.ndarray, truth: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def errors(
+    group: str, result: np.ndarray, references: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     """Error of each quantity by lane; NaN where the lane failed."""
     n = len(result)
     largest = lambda x: np.max(np.abs(x), 1)
     if group == "step":
-        after = compute_landing(make_wheels(truth["rows"][:n]), result[:, :3])
-        times = np.cumsum(result[:, 3:6] - truth["step"][:n, 3:], 1)
+        after = compute_landing(make_wheels(references["rows"][:n]), result[:, :3])
+        times = np.cumsum(result[:, 3:6] - references["step"][:n, 3:], 1)
         return {
-            "post_impact": largest(after - truth["post_impact"][:n]),
+            "post_impact": largest(after - references["post_impact"][:n]),
             "event_times": largest(times),
         }
-    exact = truth["cycle"][:n]
+    exact = references["cycle"][:n]
     period = exact[:, 2:].sum(1)
     if group == "cycle":
         sorted_ = lambda matrices: -np.sort(-np.abs(np.linalg.eigvals(matrices)), 1)
@@ -74,13 +77,13 @@ def errors(group: str, result: np.ndarray, truth: dict[str, np.ndarray]) -> dict
         return {
             "cycle": largest(np.column_stack([result[:, :2] - exact[:, :2], missed])),
             "dls_fraction": np.abs(fraction),
-            "multipliers": largest(solution - sorted_(truth["matrix"][:n])),
+            "multipliers": largest(solution - sorted_(references["matrix"][:n])),
         }
-    d_exact = truth["d_cycle"][:n, 2:]
+    d_exact = references["d_cycle"][:n, 2:]
     d_period = d_exact.sum(1)
     d_fraction = (d_exact[:, 0] - (exact[:, 2] / period)[:, None] * d_period) / period[:, None]
     # A change of a parameter counts by its relative size.
-    scaled = lambda parts: parts * truth["rows"][:n]
+    scaled = lambda parts: parts * references["rows"][:n]
     miss, size = [], []
     for part, right in ((result[:, :4], d_fraction), (result[:, 4:8], d_period)):
         miss.append(np.linalg.norm(scaled(part - right), axis=1))
@@ -91,13 +94,15 @@ def errors(group: str, result: np.ndarray, truth: dict[str, np.ndarray]) -> dict
 def measure(
     method: Method,
     setting: Any,
-    truth: dict[str, np.ndarray],
+    references: dict[str, np.ndarray],
     reference: Run,
     compiling: float,
 ) -> dict:
     """One row of the table; `compiling` is what numba took before, s."""
     n = method.lanes
-    rows, starts = (np.resize(truth[name], (n, truth[name].shape[1])) for name in ("rows", "start"))
+    rows, starts = (
+        np.resize(references[name], (n, references[name].shape[1])) for name in ("rows", "start")
+    )
     before = measure_repeated(reference)
     begin = time.process_time()
     run = method.make(setting, rows, starts)
@@ -110,9 +115,9 @@ def measure(
         if method.family in charts.SCALAR and first > MAX_REPEATED_SECONDS
         else measure_repeated(run)
     )
-    run_result = run_result[: len(truth["rows"])]
-    unit = 0.5 * (before + measure_repeated(reference)) / len(truth["rows"]) * 1e6
-    solution = errors(method.group, run_result, truth)
+    run_result = run_result[: len(references["rows"])]
+    unit = 0.5 * (before + measure_repeated(reference)) / len(references["rows"]) * 1e6
+    solution = errors(method.group, run_result, references)
     failed = ~np.isfinite(next(iter(solution.values())))
     with np.errstate(invalid="ignore"):
         evaluations = np.nanmean(run_result[:, -1]) if not failed.all() else 0.0
@@ -146,8 +151,8 @@ def key(row: dict[str, Any]) -> tuple[str, ...]:
 
 def measure_all(chosen: argparse.Namespace) -> None:
     """Fill both tables, method by method."""
-    truth = load()
-    reference = by_peer("numba")(REFERENCE_TOLERANCE, truth["rows"], truth["start"])
+    references = load()
+    reference = by_peer("numba")(REFERENCE_TOLERANCE, references["rows"], references["start"])
     begin = time.process_time()
     reference()
     compiling = time.process_time() - begin
@@ -171,7 +176,7 @@ def measure_all(chosen: argparse.Namespace) -> None:
             start_without_cache()
             last = method[:4]
         for setting in settings:
-            row = measure(method, setting, truth, reference, compiling)
+            row = measure(method, setting, references, reference, compiling)
             tables[table].append(row)
             write_named_rows(table, tables[table])
             print(*row.values(), flush=True)

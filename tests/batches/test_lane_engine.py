@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 from support.batched import (
     NAMES,
     OUTCOME_CASES,
@@ -29,9 +29,13 @@ from vrw_jax.integrator.tableaus import (
 from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.trigonometry import sine_cosine
 
-STARTS = truth.stack_quantity("step", "start")
+STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
-    [truth.stack_quantity("step", "section_state"), truth.stack_quantity("step", "durations")], 1
+    [
+        reference_values.stack_quantity("step", "section_state"),
+        reference_values.stack_quantity("step", "durations"),
+    ],
+    1,
 )
 
 FEW_STEPS_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60)
@@ -41,7 +45,9 @@ FEW_STEPS_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60)
 def compute_values(vectors, states, options=None, **keywords):
     """State and durations of each lane, and its outcome."""
     options = vrw.StepOptions() if options is None else options
-    batch_result = vrw.step_batch(truth.make_wheels(vectors), states, options=options, **keywords)
+    batch_result = vrw.step_batch(
+        reference_values.make_wheels(vectors), states, options=options, **keywords
+    )
     return np.concatenate([batch_result.section_state, batch_result.durations], 1), np.asarray(
         batch_result.outcome
     )
@@ -65,9 +71,9 @@ def draw_hard_starts(n):
     ids=["default", "tight"],
 )
 def test_batched_state_and_durations_are_accurate_to_the_claimed_error(options, claimed):
-    solution, outcome = compute_values(truth.REFERENCE_PARAMETERS, STARTS, options)
+    solution, outcome = compute_values(reference_values.REFERENCE_PARAMETERS, STARTS, options)
     assert np.all(outcome == Outcome.STEPPED)
-    assert truth.compute_scaled_error(solution, VALUES) < claimed
+    assert reference_values.compute_scaled_error(solution, VALUES) < claimed
 
 
 def test_hard_starts_have_the_outcomes_of_the_diffrax_engine():
@@ -114,7 +120,7 @@ def test_reaching_the_solver_step_limit_is_an_outcome_of_a_batch():
 def hard_batch():
     """65,536 lanes, the hard ones among them, and what each gives there."""
     vectors, states = draw_hard_starts(65_536)
-    vectors[::3], states[::3] = truth.REFERENCE_PARAMETERS[0], TABLE_1_SECTION_STATE
+    vectors[::3], states[::3] = reference_values.REFERENCE_PARAMETERS[0], TABLE_1_SECTION_STATE
     return vectors, states, *compute_values(vectors, states)
 
 
@@ -145,7 +151,7 @@ def test_lanes_of_similar_cost_are_grouped():
         slope=draw(0.28, 0.34, n),
     )
     states = TABLE_1_SECTION_STATE * draw(0.95, 1.05, (n, 3))
-    tried = np.asarray(vrw.step_batch(truth.make_wheels(vectors), states).solver_steps)
+    tried = np.asarray(vrw.step_batch(reference_values.make_wheels(vectors), states).solver_steps)
     waits = lambda order: tried[order].reshape(-1, 8).max(1).mean() / tried.mean() - 1.0
     ours = waits(lane_batch.sort_by_work(list(vectors.T), states))
     assert ours < 0.5 * waits(np.arange(n))
@@ -186,17 +192,20 @@ def test_xla_blocks_agree_with_machine_code(monkeypatch):
 def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
     vectors = make_parameter_rows(slope=[0.30, 0.09], damping=[200.0, 100.0])
     states = np.asarray([TABLE_1_SECTION_STATE, [0.1027, 2.0, -0.109]])
-    batch_result = vrw.step_batch(truth.make_wheels(vectors), states, 12)
+    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), states, 12)
     assert batch_result.outcome.tolist() == [Outcome.STEPPED, Outcome.FELL_BACK]
     for i in (0, 1):
-        single = vrw.walk(truth.make_wheel(vectors[i]), states[i], 12)
+        single = vrw.walk(reference_values.make_wheel(vectors[i]), states[i], 12)
         assert int(batch_result.n_stepped[i]) == int(single.n_stepped)
-    last = vrw.walk(truth.make_wheel(vectors[0]), states[0], 12).steps.section_state[-1]
+    last = vrw.walk(reference_values.make_wheel(vectors[0]), states[0], 12).steps.section_state[-1]
     np.testing.assert_allclose(batch_result.section_state[0], last, atol=1e-8)
 
 
 def test_model_and_solver_choose_the_engine_and_the_result_names_it():
-    params, states = truth.make_wheels(make_parameter_rows()), TABLE_1_SECTION_STATE[None]
+    params, states = (
+        reference_values.make_wheels(make_parameter_rows()),
+        TABLE_1_SECTION_STATE[None],
+    )
     assert vrw.step_batch(params, states).engine == "lanes"
     assert vrw.step_batch(params, states, engine="diffrax").engine == "diffrax"
     assert (
@@ -210,7 +219,7 @@ def test_model_and_solver_choose_the_engine_and_the_result_names_it():
 @pytest.mark.parametrize("engine", ["lanes", "collocation"])
 def test_results_are_new_arrays_and_arguments_are_not_modified(engine):
     states, near = STARTS.copy(), VALUES[:, 3:].copy()
-    params = truth.make_wheels(truth.REFERENCE_PARAMETERS)
+    params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)
     for n_steps in (1, 3):
         batch_result = vrw.step_batch(params, states, n_steps, engine=engine, durations=near)
         for array in jax.tree.leaves(batch_result):
@@ -219,7 +228,8 @@ def test_results_are_new_arrays_and_arguments_are_not_modified(engine):
         np.testing.assert_array_equal(states, STARTS)
         np.testing.assert_array_equal(near, VALUES[:, 3:])
         np.testing.assert_array_equal(
-            params.damping, truth.make_wheels(truth.REFERENCE_PARAMETERS).damping
+            params.damping,
+            reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS).damping,
         )
 
 
@@ -316,8 +326,8 @@ def test_dips_within_one_solver_step_are_found(engine):
     batch_result = vrw.step_batch(params, columns[6:].T, engine=engine)
     assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.LEG_1_LIFTED_OFF)
     fine = vrw.StepOptions(solver="Tsit5", dt0=1e-4)  # whose steps are too short to hide any
-    truth = vrw.step_batch(params, columns[6:].T, options=fine)
-    np.testing.assert_allclose(batch_result.durations, truth.durations, atol=2e-7)
+    reference = vrw.step_batch(params, columns[6:].T, options=fine)
+    np.testing.assert_allclose(batch_result.durations, reference.durations, atol=2e-7)
 
 
 def test_a_guard_that_comes_close_and_turns_back_does_not_fire():
@@ -339,7 +349,7 @@ def test_a_guard_that_rises_from_zero_and_comes_back_within_the_first_step_fires
 
 def test_collocation_is_accurate_near_known_durations_and_marks_its_elements():
     near = VALUES[:, 3:] * np.random.default_rng(3).uniform(0.97, 1.03, (len(VALUES), 3))
-    params = truth.make_wheels(truth.REFERENCE_PARAMETERS)
+    params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)
     batch_result = vrw.step_batch(params, STARTS, engine="collocation", durations=near)
     assert batch_result.engine == "collocation"
     fixed = np.asarray(batch_result.is_collocated)
@@ -347,7 +357,7 @@ def test_collocation_is_accurate_near_known_durations_and_marks_its_elements():
     by_lanes = vrw.step_batch(params, STARTS)
     joined_values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
     adaptive = np.concatenate([by_lanes.section_state, by_lanes.durations], 1)
-    assert truth.compute_scaled_error(joined_values[fixed], VALUES[fixed]) < 1e-7
+    assert reference_values.compute_scaled_error(joined_values[fixed], VALUES[fixed]) < 1e-7
     np.testing.assert_array_equal(joined_values[~fixed], adaptive[~fixed])
 
 
@@ -355,7 +365,7 @@ def test_collocation_passes_uncertain_elements_to_the_event_driven_engine(hard_b
     vectors, states, solution, codes = hard_batch
     selection = slice(0, 3000)
     guessed = np.tile([0.4, 0.25, 0.06], (3000, 1))
-    params = truth.make_wheels(vectors[selection])
+    params = reference_values.make_wheels(vectors[selection])
     told_by = vrw.step_batch(params, states[selection], engine="collocation", durations=guessed)
     np.testing.assert_array_equal(told_by.outcome, codes[selection])
     joined_values = np.concatenate([told_by.section_state, told_by.durations], 1)
@@ -388,11 +398,15 @@ def test_collocation_rejects_falls_and_has_its_largest_errors_far_from_gaits():
 
 
 def test_collocation_of_a_batch_element_is_bitwise_that_of_a_single_wheel():
-    params, near = truth.make_wheels(truth.REFERENCE_PARAMETERS), VALUES[:, 3:]
+    params, near = (
+        reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS),
+        VALUES[:, 3:],
+    )
     among = vrw.step_batch(params, STARTS, engine="collocation", durations=near)
     for i in (0, 3, 9):
         batch_result = vrw.step_batch(
-            truth.make_wheels(truth.REFERENCE_PARAMETERS[i : i + 1]), STARTS[i : i + 1],
+            reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS[i : i + 1]),
+            STARTS[i : i + 1],
             engine="collocation",
             durations=near[i : i + 1],
         )  # fmt: skip
@@ -435,8 +449,10 @@ def test_for_stiff_wheels_the_solver_choice_saves_work_without_losing_accuracy()
     starts = np.tile([0.1, 1.6, -0.1], (3, 1))
     exact, _ = compute_values(vectors, starts, vrw.StepOptions.tight(), engine="lanes")
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6)
-    batch_result = vrw.step_batch(truth.make_wheels(vectors), starts, options=options)
-    named = vrw.step_batch(truth.make_wheels(vectors), starts, options=options, engine="lanes")
+    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
+    named = vrw.step_batch(
+        reference_values.make_wheels(vectors), starts, options=options, engine="lanes"
+    )
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Dopri8",
         "Tsit5",
@@ -478,7 +494,7 @@ def test_wheels_too_stiff_for_an_explicit_solver_use_an_implicit_one():
     vectors = make_parameter_rows(leg_mass=mass, hub_mass=18.0 - 8.0 * mass, damping=100.0)
     options = vrw.StepOptions(solver="Tsit5", rtol=1e-6, atol=1e-6, max_solver_steps=300)
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
-    batch_result = vrw.step_batch(truth.make_wheels(vectors), starts, options=options)
+    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Tsit5",
         lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
@@ -497,7 +513,7 @@ def test_a_stiff_wheel_with_an_unexpectedly_long_phase_uses_an_implicit_solver()
     )  # the first falls back after 0.69 s: 2,300 steps
     starts = np.tile([0.1, 1.6, -0.1], (2, 1))
     options = vrw.StepOptions(rtol=1e-6, atol=1e-6, max_solver_steps=1000)
-    batch_result = vrw.step_batch(truth.make_wheels(vectors), starts, options=options)
+    batch_result = vrw.step_batch(reference_values.make_wheels(vectors), starts, options=options)
     solvers = [batch_result.solver_names[i] for i in batch_result.solver_index]
     assert solvers == [
         lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from numpy.polynomial import Chebyshev
-from oracle import five_coordinates
+from reference_code import five_coordinates
 from scipy.optimize import brentq
 
 import vrw_jax as vrw

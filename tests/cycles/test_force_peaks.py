@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import Chebyshev
-from oracle import five_coordinates
+from reference_code import five_coordinates
 
 import vrw_jax as vrw
 from vrw_jax.measures import FORCE_PEAK_MEASURES

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
@@ -39,7 +39,7 @@ def compile_cycle_measures(options, names, transform):
     """Return a compiled function: cycles of a batch with derivatives of some measures."""
 
     def one(vector):
-        cycle = vrw.limit_cycle(truth.make_wheel(vector), options=options)
+        cycle = vrw.limit_cycle(reference_values.make_wheel(vector), options=options)
         values = collect_measures(cycle, names)
         return (values[names[0]] if transform is jax.grad else values), cycle
 
@@ -49,14 +49,16 @@ def compile_cycle_measures(options, names, transform):
 def differentiate_measures(rows, options=None, names=DIFFERENTIATED_MEASURES, transform=jax.jacfwd):
     """Return derivatives and cycles of rows of parameters, in a batch of fixed size."""
     rows = np.atleast_2d(np.asarray(rows, float))
-    full = np.concatenate([rows, np.tile(rows[-1], (len(truth.REFERENCE_CASES) - len(rows), 1))])
+    full = np.concatenate(
+        [rows, np.tile(rows[-1], (len(reference_values.REFERENCE_CASES) - len(rows), 1))]
+    )
     solution = compile_cycle_measures(options, names, transform)(jnp.asarray(full))
     return jax.tree.map(lambda x: x[: len(rows)], solution)
 
 
 @functools.cache
 def stack_reference_measures(options=None, names=DIFFERENTIATED_MEASURES):
-    return differentiate_measures(truth.REFERENCE_PARAMETERS, options, names)
+    return differentiate_measures(reference_values.REFERENCE_PARAMETERS, options, names)
 
 
 def find_reference_cycles(options=None):
@@ -64,7 +66,7 @@ def find_reference_cycles(options=None):
 
 
 def table_1(**changes):
-    row = truth.REFERENCE_PARAMETERS[0].copy()
+    row = reference_values.REFERENCE_PARAMETERS[0].copy()
     for name, value in changes.items():
         row[PARAMETER_NAMES.index(name)] = value
     return row
@@ -81,20 +83,24 @@ def test_cycles_agree_with_the_reference(options, allowed):
     assert np.all(np.asarray(solution.outcome) == Outcome.STEPPED)
     for name in VALUES:
         assert (
-            compute_relative_error(getattr(solution, name), truth.stack_quantity("cycle", name))
+            compute_relative_error(
+                getattr(solution, name), reference_values.stack_quantity("cycle", name)
+            )
             < allowed
         ), name
     for own_values, name in (("lambda_I4", "lambda_impulse_4"), ("lambda_2", "lambda2_plus")):
         indicator = getattr(solution.indicators, own_values)
         assert (
-            truth.compute_scaled_error(indicator, truth.stack_quantity("cycle", name))
+            reference_values.compute_scaled_error(
+                indicator, reference_values.stack_quantity("cycle", name)
+            )
             < 10 * allowed
         )
 
 
 @pytest.mark.parametrize(("options", "allowed"), [(None, 1e-8), (TIGHT_OPTIONS, 1e-11)])
 def test_multipliers_agree_with_the_reference(options, allowed):
-    expected = truth.stack_quantity("cycle", "multipliers")
+    expected = reference_values.stack_quantity("cycle", "multipliers")
     values_array = np.asarray(find_reference_cycles(options).multipliers)
     expected = expected[..., 0] + 1j * expected[..., 1]
     gap = np.abs(values_array[:, :, None] - expected[:, None, :])
@@ -106,7 +112,10 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
     solution, _ = stack_reference_measures(options)
     for name in DIFFERENTIATED_MEASURES:
         expected = np.stack(
-            [truth.to_floats(case["cycle"]["d_params"][name]) for case in truth.REFERENCE_CASES]
+            [
+                reference_values.to_floats(case["cycle"]["d_params"][name])
+                for case in reference_values.REFERENCE_CASES
+            ]
         )
         own_values = np.asarray(solution[name]).reshape(expected.shape)
         assert compute_relative_error(own_values, expected) < allowed, name
@@ -114,8 +123,10 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
 
 @pytest.mark.skipif(not simd.is_available(), reason="machine code is for CPUs")
 def test_gradients_of_multipliers_use_machine_code_throughout():
-    radius = lambda vector: vrw.limit_cycle(truth.make_wheel(vector)).spectral_radius
-    program = jax.jit(jax.vmap(jax.grad(radius))).lower(truth.REFERENCE_PARAMETERS).as_text()
+    radius = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector)).spectral_radius
+    program = (
+        jax.jit(jax.vmap(jax.grad(radius))).lower(reference_values.REFERENCE_PARAMETERS).as_text()
+    )
     called = set(re.findall(r"lanes_code_\w+", program))
     assert len(called) == 3  # the search, the columns, the monodromy's derivatives along them
     assert "while" not in program
@@ -128,8 +139,8 @@ def test_derivatives_of_the_spectral_radius_agree_with_the_reference():
     assert np.all(np.asarray(failed)[1:] == 0.0)
     expected = np.stack(
         [
-            truth.to_floats(case["cycle"]["d_params"]["spectral_radius"])
-            for case in truth.REFERENCE_CASES
+            reference_values.to_floats(case["cycle"]["d_params"]["spectral_radius"])
+            for case in reference_values.REFERENCE_CASES
         ]
     )
     assert compute_relative_error(solution, expected) < 1e-8
@@ -160,7 +171,7 @@ def test_second_derivatives_agree_with_differences_and_vanish_without_a_cycle():
     slope = PARAMETER_NAMES.index("slope")
 
     def fraction(vector):
-        return vrw.limit_cycle(truth.make_wheel(vector)).dls_fraction
+        return vrw.limit_cycle(reference_values.make_wheel(vector)).dls_fraction
 
     gradients = jax.jit(jax.vmap(jax.grad(fraction)))
     solution = jax.jit(jax.vmap(jax.jacfwd(jax.grad(fraction))))(rows)
@@ -174,7 +185,7 @@ def test_second_derivatives_agree_with_differences_and_vanish_without_a_cycle():
 @pytest.mark.slow
 def test_reverse_mode_agrees_with_forward_mode():
     reverse, _ = differentiate_measures(
-        truth.REFERENCE_PARAMETERS, None, ("dls_fraction",), jax.grad
+        reference_values.REFERENCE_PARAMETERS, None, ("dls_fraction",), jax.grad
     )
     np.testing.assert_allclose(
         reverse, stack_reference_measures()[0]["dls_fraction"], rtol=1e-10, atol=1e-13
@@ -182,7 +193,7 @@ def test_reverse_mode_agrees_with_forward_mode():
 
 
 def test_cycle_is_a_fixed_point_of_the_event_driven_map():
-    wheels = truth.make_wheels(truth.REFERENCE_PARAMETERS[:6])
+    wheels = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS[:6])
     state = find_reference_cycles().section_state[:6]
     options = vrw.StepOptions.tight()
     walk = jax.jit(jax.vmap(lambda p, x: vrw.return_map(p, x, options=options)))
@@ -226,7 +237,9 @@ def test_a_wheel_in_float32_stays_in_float32_beside_64_bits():
 def test_vmap_agrees_with_single_wheels():
     batch = find_reference_cycles()
     for index in (0, 3):
-        single = vrw.limit_cycle(truth.make_wheel(truth.REFERENCE_PARAMETERS[index]))
+        single = vrw.limit_cycle(
+            reference_values.make_wheel(reference_values.REFERENCE_PARAMETERS[index])
+        )
         np.testing.assert_allclose(
             single.section_state, batch.section_state[index], rtol=1e-12, atol=1e-13
         )
@@ -330,7 +343,7 @@ def test_gait_without_double_support_is_found_though_unstable():
     assert float(cycle.indicators.lambda_4[0]) < 0.0
     assert float(floquet.compute_spectral_radius(cycle.monodromy_value[0])) > 1.6
     options = vrw.StepOptions.tight()
-    back = vrw.return_map(truth.make_wheel(row), cycle.section_state[0], options=options)
+    back = vrw.return_map(reference_values.make_wheel(row), cycle.section_state[0], options=options)
     np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
 
 
@@ -553,7 +566,9 @@ def test_section_newton_agrees_with_the_collocation():
 def test_sensitivities_are_labeled_and_agree_with_the_reference(tmp_path):
     table = vrw.sensitivities(vrw.WheelParams(), measures=("dls_fraction", "period"))
     assert_netcdf_round_trip(table, tmp_path)
-    expected = truth.to_floats(truth.REFERENCE_CASES[0]["cycle"]["d_params"]["dls_fraction"])
+    expected = reference_values.to_floats(
+        reference_values.REFERENCE_CASES[0]["cycle"]["d_params"]["dls_fraction"]
+    )
     order = [list(PARAMETER_NAMES).index(str(name)) for name in table.parameter.values]
     np.testing.assert_allclose(
         table.derivative.sel(measure="dls_fraction"), expected[order], rtol=1e-8, atol=1e-10
@@ -569,21 +584,21 @@ def test_unknown_measure_is_refused_in_one_sentence():
 
 
 def test_wheels_and_parameter_vectors_convert_into_each_other():
-    wheel = wheel_from_parameters(jnp.asarray(truth.REFERENCE_PARAMETERS[1]), 8)
+    wheel = wheel_from_parameters(jnp.asarray(reference_values.REFERENCE_PARAMETERS[1]), 8)
     assert float(wheel.damping) == 100.0
 
 
 @pytest.mark.slow
 def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
     """Easy wheels, one that needs the homotopy, one without double support, one without a gait."""
-    rows = np.tile(truth.REFERENCE_PARAMETERS[0], (70, 1))  # more than a block
+    rows = np.tile(reference_values.REFERENCE_PARAMETERS[0], (70, 1))  # more than a block
     column = PARAMETER_NAMES.index
     rows[:, column("damping")] = np.linspace(120.0, 215.0, 70)
     rows[3, [column("damping"), column("slope")]] = 40.0, 0.33
     rows[5, column("slope")] = 0.05
 
     def evaluate(vectors):
-        one = lambda vector: vrw.limit_cycle(truth.make_wheel(vector))
+        one = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector))
         period = lambda vector: one(vector).period
         margin = lambda vector: one(vector).stability_margin
         cycle = jax.vmap(one)(vectors)

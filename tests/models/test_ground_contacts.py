@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import moreau_jean
+from reference_code import moreau_jean
 
 import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import (

@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import complementarity
+from reference_code import complementarity
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw

@@ -5,8 +5,8 @@ import functools
 import jax
 import numpy as np
 import pytest
-from oracle import five_coordinates
-from support import truth
+from reference_code import five_coordinates
+from support import reference_values
 from support.batched import NAMES, compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
@@ -19,80 +19,89 @@ CASE_INDICES = (
 
 
 @pytest.mark.parametrize("by_lanes", [False, True], ids=["wheel", "lanes"])
-@pytest.mark.parametrize("index", CASE_INDICES, ids=lambda i: truth.REFERENCE_CASES[i]["name"])
+@pytest.mark.parametrize(
+    "index", CASE_INDICES, ids=lambda i: reference_values.REFERENCE_CASES[i]["name"]
+)
 def test_every_margin_equals_the_reference(index, by_lanes):
-    params = {k: float(v) for k, v in truth.REFERENCE_CASES[index]["params"].items()}
+    params = {k: float(v) for k, v in reference_values.REFERENCE_CASES[index]["params"].items()}
     params["n_legs"] = int(params["n_legs"])
-    start = truth.stack_quantity("step", "start")[index]
+    start = reference_values.stack_quantity("step", "start")[index]
     solution = compute_full_steps(
-        truth.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight(), uses_lane_engine=by_lanes
+        reference_values.REFERENCE_PARAMETERS[index],
+        start,
+        vrw.StepOptions.tight(),
+        uses_lane_engine=by_lanes,
     )
     solution = jax.tree.map(lambda leaf: np.asarray(leaf[0]), solution)
     m = solution.margins
-    oracle = five_coordinates.step_margins(params, start)
-    least_fore = min(oracle["lambda2"].values())
-    # The oracle reads minima off a dense trajectory: a few 1e-7 of the largest term near a minimum.
+    reference = five_coordinates.step_margins(params, start)
+    least_fore = min(reference["lambda2"].values())
+    # The reference takes minima of samples: errors of a few 1e-7 of the largest term.
     near = {"rtol": 2e-6, "atol": 2e-6}
     np.testing.assert_allclose(m.fore_foot_force, least_fore, **near)
-    np.testing.assert_allclose(m.clearance_sls1, oracle["foot2_clearance_sls1"], **near)
-    np.testing.assert_allclose(m.clearance_sls2, oracle["foot2_clearance_sls2"], **near)
-    np.testing.assert_allclose(m.locked_stopper_force, oracle["stopper_force_legs"], **near)
-    np.testing.assert_allclose(m.rear_stopper_force, oracle["stopper_force_leg2"], **near)
-    np.testing.assert_allclose(m.contraction, oracle["shortening"], **near)
-    np.testing.assert_allclose(1.0 - m.friction_fore, oracle["friction_leg1"], **near)
+    np.testing.assert_allclose(m.clearance_sls1, reference["foot2_clearance_sls1"], **near)
+    np.testing.assert_allclose(m.clearance_sls2, reference["foot2_clearance_sls2"], **near)
+    np.testing.assert_allclose(m.locked_stopper_force, reference["stopper_force_legs"], **near)
+    np.testing.assert_allclose(m.rear_stopper_force, reference["stopper_force_leg2"], **near)
+    np.testing.assert_allclose(m.contraction, reference["shortening"], **near)
+    np.testing.assert_allclose(1.0 - m.friction_fore, reference["friction_leg1"], **near)
     # Algebra of an instant: the error of the states there.
     exact = {"rtol": 1e-9, "atol": 1e-10}
-    np.testing.assert_allclose(m.takeoff_acceleration, oracle["takeoff_acceleration"], **exact)
-    np.testing.assert_allclose(1.0 - m.friction_rear, oracle["friction_leg2_landing"], **exact)
+    np.testing.assert_allclose(m.takeoff_acceleration, reference["takeoff_acceleration"], **exact)
+    np.testing.assert_allclose(1.0 - m.friction_rear, reference["friction_leg2_landing"], **exact)
     np.testing.assert_allclose(
-        m.landing_stopper_impulse, oracle["stopper_impulse_landing"], **exact
+        m.landing_stopper_impulse, reference["stopper_impulse_landing"], **exact
     )
-    np.testing.assert_allclose(m.hit_stopper_impulse, oracle["stopper_impulse_stopper"], **exact)
-    np.testing.assert_allclose(m.hit_planted_impulse, oracle["normal_impulse_stopper"], **exact)
+    np.testing.assert_allclose(m.hit_stopper_impulse, reference["stopper_impulse_stopper"], **exact)
+    np.testing.assert_allclose(m.hit_planted_impulse, reference["normal_impulse_stopper"], **exact)
     np.testing.assert_allclose(
-        1.0 - m.landing_friction_fore, oracle["impulse_friction_leg1"], **exact
+        1.0 - m.landing_friction_fore, reference["impulse_friction_leg1"], **exact
     )
     np.testing.assert_allclose(
-        1.0 - m.landing_friction_rear, oracle["impulse_friction_leg2"], **exact
+        1.0 - m.landing_friction_rear, reference["impulse_friction_leg2"], **exact
     )
 
 
 def test_energy_losses_equal_the_reference():
-    start = truth.stack_quantity("step", "start")[0]
-    oracle = five_coordinates.step(five_coordinates.TABLE_1, start)
-    solution = compute_full_steps(truth.REFERENCE_PARAMETERS[0], start, vrw.StepOptions.tight())
+    start = reference_values.stack_quantity("step", "start")[0]
+    reference = five_coordinates.step(five_coordinates.TABLE_1, start)
+    solution = compute_full_steps(
+        reference_values.REFERENCE_PARAMETERS[0], start, vrw.StepOptions.tight()
+    )
     for ours, theirs in [
         (solution.energy.landing, "energy_lost_landing"),
         (solution.energy.stopper, "energy_lost_stopper"),
         (solution.energy.damping, "energy_lost_damping"),
     ]:
-        np.testing.assert_allclose(ours[0], oracle[theirs], rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(ours[0], reference[theirs], rtol=1e-9, atol=1e-10)
 
 
 def test_the_step_of_the_reference_code_agrees():
     for index in CASE_INDICES:
-        params = {k: float(v) for k, v in truth.REFERENCE_CASES[index]["params"].items()}
+        params = {k: float(v) for k, v in reference_values.REFERENCE_CASES[index]["params"].items()}
         params["n_legs"] = int(params["n_legs"])
-        start = truth.stack_quantity("step", "start")[index]
-        oracle = five_coordinates.step(params, start)
+        start = reference_values.stack_quantity("step", "start")[index]
+        reference = five_coordinates.step(params, start)
         solution = compute_full_steps(
-            truth.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight()
+            reference_values.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight()
         )
-        np.testing.assert_allclose(solution.section_state[0], oracle["section_state"], atol=1e-11)
-        np.testing.assert_allclose(solution.durations[0], oracle["durations"], atol=1e-11)
+        np.testing.assert_allclose(
+            solution.section_state[0], reference["section_state"], atol=1e-11
+        )
+        np.testing.assert_allclose(solution.durations[0], reference["durations"], atol=1e-11)
 
 
 def assert_agrees_with_reference(vector, start):
     """Require the same outcome, durations and next state, for every branch of Section 5.1."""
     params = dict(zip(NAMES, map(float, vector), strict=True)) | {"n_legs": 8}
-    oracle = five_coordinates.step(params, start)
+    reference = five_coordinates.step(params, start)
     solution = jax.tree.map(
         lambda leaf: leaf[0], compute_full_steps(vector, start, vrw.StepOptions.tight())
     )
-    assert oracle["outcome"] == five_coordinates.STEPPED
+    assert reference["outcome"] == five_coordinates.STEPPED
     assert int(solution.outcome) == vrw.Outcome.STEPPED
-    np.testing.assert_allclose(solution.durations, oracle["durations"], atol=1e-10)
-    np.testing.assert_allclose(solution.section_state, oracle["section_state"], atol=1e-10)
+    np.testing.assert_allclose(solution.durations, reference["durations"], atol=1e-10)
+    np.testing.assert_allclose(solution.section_state, reference["section_state"], atol=1e-10)
     return solution
 
 

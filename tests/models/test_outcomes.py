@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 from support.batched import (
     OUTCOME_CASES,
     TABLE_1_SECTION_STATE,
@@ -87,7 +87,7 @@ def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
 def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight():
     """Reference: statics, the sum of both feet's forces against gravity in the slope's frame."""
     vectors, start = OUTCOME_CASES[Outcome.CAME_TO_REST]
-    params = truth.make_wheel(vectors[0])
+    params = reference_values.make_wheel(vectors[0])
     for engine in ("lanes", "diffrax"):
         options = vrw.StepOptions(engine=engine)
         trace = vrw.ViscoelasticWheel().sample_step(params, jnp.asarray(start), options, 2)
@@ -173,9 +173,11 @@ def test_a_walk_stops_at_its_first_failure():
 
 
 def test_a_batch_element_equals_the_single_run():
-    starts = truth.stack_quantity("step", "start")
-    batch, _ = compute_states_and_work(truth.REFERENCE_PARAMETERS, starts, vrw.StepOptions())
+    starts = reference_values.stack_quantity("step", "start")
+    batch, _ = compute_states_and_work(
+        reference_values.REFERENCE_PARAMETERS, starts, vrw.StepOptions()
+    )
     for index in (0, 3, 9):
-        params = truth.make_wheel(truth.REFERENCE_PARAMETERS[index])
+        params = reference_values.make_wheel(reference_values.REFERENCE_PARAMETERS[index])
         single = vrw.return_map(params, starts[index])
         np.testing.assert_allclose(batch[index, :3], single, rtol=5e-14, atol=5e-14)

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import truth
+from support import reference_values
 from support.batched import NAMES, compute_full_steps, compute_states_and_work
 
 import vrw_jax as vrw
 from vrw_jax.wheel import Motion, dynamics, make_phases, rear_foot_height, transitions
 
-STARTS = truth.stack_quantity("step", "start")
+STARTS = reference_values.stack_quantity("step", "start")
 
 
 @pytest.fixture(scope="module")
 def sample_steps():
-    return compute_full_steps(truth.REFERENCE_PARAMETERS, STARTS)
+    return compute_full_steps(reference_values.REFERENCE_PARAMETERS, STARTS)
 
 
 def test_impacts_only_lose_energy(sample_steps):
@@ -99,13 +99,15 @@ def test_mass_length_and_time_scale_out(scale):
     factor = lambda exponents: np.prod(np.asarray(scale) ** np.asarray(exponents), axis=-1)
     values_array = np.array([factor(DIMENSIONS[name]) for name in NAMES])
     options = vrw.StepOptions.tight()
-    plain, _ = compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)
+    plain, _ = compute_states_and_work(reference_values.REFERENCE_PARAMETERS, STARTS, options)
     scaled, _ = compute_states_and_work(
-        truth.REFERENCE_PARAMETERS * values_array, STARTS * factor(START_DIMENSIONS), options
+        reference_values.REFERENCE_PARAMETERS * values_array,
+        STARTS * factor(START_DIMENSIONS),
+        options,
     )
     expected = plain * factor(np.concatenate([START_DIMENSIONS, DURATION_DIMENSIONS]))
     # Absolute tolerances are not dimensionless, so two integrations differ within the claim.
-    assert truth.compute_scaled_error(scaled, np.asarray(expected)) < 2e-12
+    assert reference_values.compute_scaled_error(scaled, np.asarray(expected)) < 2e-12
 
 
 def test_the_stopper_never_pulls_leg_2_and_the_landing_never_pulls_the_foot(sample_steps):

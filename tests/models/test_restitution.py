@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import complementarity
+from reference_code import complementarity
 
 import vrw_jax as vrw
 from vrw_jax.contact.contact_modes import ContactMode

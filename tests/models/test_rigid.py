@@ -53,14 +53,14 @@ def test_the_period_agrees_with_quadrature(slope, rate):
     squared = lambda angle: (
         start**2 + 2.0 * g_over_l * (np.cos(slope - HALF_ANGLE) - np.cos(angle + slope))
     )
-    truth_period, _ = integrate.quad(
+    reference_period, _ = integrate.quad(
         lambda angle: 1.0 / np.sqrt(squared(angle)),
         -HALF_ANGLE,
         HALF_ANGLE,
         epsabs=1e-13,
         epsrel=1e-13,
     )
-    assert abs(float(result.period) - truth_period) < 1e-12
+    assert abs(float(result.period) - reference_period) < 1e-12
 
 
 def test_carlsons_integral_agrees_with_scipy():

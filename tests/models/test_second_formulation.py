@@ -3,7 +3,7 @@ stoppers."""
 
 import numpy as np
 import pytest
-from oracle import complementarity
+from reference_code import complementarity
 
 import vrw_jax as vrw
 
@@ -33,33 +33,33 @@ def compare_codes(friction, damping, slope, x, stoppers, n_steps=1, max_events=4
     wheel = complementarity.ComplementarityWheel(
         friction, c=damping, slope=slope, one_sided=stoppers == "one-sided"
     )
-    place, durations, oracle = complementarity.paper_start(wheel, *x), 0.0, 0.0
+    place, durations, reference = complementarity.paper_start(wheel, *x), 0.0, 0.0
     for _ in range(n_steps):
         step = vrw.step(params, x, model=model, options=TIGHT_OPTIONS)
         assert int(step.outcome) == vrw.Outcome.STEPPED
         assert int(step.fewest_solutions) == 1
         other = complementarity.compute_step(wheel, place)
         x, place = step.section_state, other.end
-        durations, oracle = durations + np.asarray(step.durations), oracle + other.durations
+        durations, reference = durations + np.asarray(step.durations), reference + other.durations
     q, v = other.end.q, other.end.v
     ends = np.r_[q[2] + complementarity.ALPHA, v[2], v[:2], np.roll(q[3:], -1), np.roll(v[3:], -1)]
-    return durations, np.asarray(x[:20]), oracle, ends
+    return durations, np.asarray(x[:20]), reference, ends
 
 
 @pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEP_CASES)
 def test_a_step_agrees_with_another_event_driven_code(friction, damping, slope, x):
-    durations, state, oracle, ends = compare_codes(friction, damping, slope, x, "bilateral")
-    assert abs(durations.sum() - oracle.sum()) < 1e-12
+    durations, state, reference, ends = compare_codes(friction, damping, slope, x, "bilateral")
+    assert abs(durations.sum() - reference.sum()) < 1e-12
     # A foot that lands at 2e-4 m/s reads no more than 32 roundings of its height for 3.5e-11 s.
-    np.testing.assert_allclose(durations, oracle, atol=5e-11)
+    np.testing.assert_allclose(durations, reference, atol=5e-11)
     np.testing.assert_allclose(state, ends, atol=1e-10)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "damping", "slope", "x"), STEP_CASES[:3])
 def test_a_step_with_one_sided_stoppers_agrees_with_another_code(friction, damping, slope, x):
-    durations, state, oracle, ends = compare_codes(friction, damping, slope, x, "one-sided")
-    assert abs(durations.sum() - oracle.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
+    durations, state, reference, ends = compare_codes(friction, damping, slope, x, "one-sided")
+    assert abs(durations.sum() - reference.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
     np.testing.assert_allclose(state[:4], ends[:4], atol=10.0 * DIP_PERIOD_TOLERANCE_SECONDS)
 
 
@@ -75,10 +75,10 @@ def test_a_step_with_one_sided_stoppers_agrees_with_another_code(friction, dampi
     ],
 )
 def test_ten_steps_agree_with_another_code(friction, damping, stoppers, error):
-    durations, state, oracle, ends = compare_codes(
+    durations, state, reference, ends = compare_codes(
         friction, damping, 0.3, START, stoppers, n_steps=10
     )
-    assert abs(durations.sum() - oracle.sum()) < error
+    assert abs(durations.sum() - reference.sum()) < error
     np.testing.assert_allclose(state[:4], ends[:4], atol=error)
 
 
@@ -87,10 +87,10 @@ def test_ten_steps_agree_with_another_code(friction, damping, stoppers, error):
 def test_steps_over_a_wide_box_agree_with_another_code(friction):
     draw = np.random.default_rng(round(10 * friction)).uniform
     x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
-    durations, _, oracle, _ = compare_codes(
+    durations, _, reference, _ = compare_codes(
         friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "bilateral"
     )
-    assert abs(durations.sum() - oracle.sum()) < 1e-8
+    assert abs(durations.sum() - reference.sum()) < 1e-8
 
 
 @pytest.mark.slow
@@ -98,23 +98,25 @@ def test_steps_over_a_wide_box_agree_with_another_code(friction):
 def test_steps_over_a_wide_box_with_one_sided_stoppers_agree_with_another_code(friction):
     draw = np.random.default_rng(round(10 * friction)).uniform
     x = (draw(0.05, 0.15), draw(1.4, 2.2), draw(-0.3, 0.0))
-    durations, _, oracle, _ = compare_codes(
+    durations, _, reference, _ = compare_codes(
         friction, draw(20.0, 400.0), draw(0.2, 0.34), x, "one-sided"
     )
-    assert abs(durations.sum() - oracle.sum()) < EVENT_CHAIN_TOLERANCE_SECONDS
+    assert abs(durations.sum() - reference.sum()) < EVENT_CHAIN_TOLERANCE_SECONDS
 
 
 @pytest.mark.slow
 def test_only_the_event_limit_ends_a_chain_of_five_hundred_events():
     """At 0.2723 s and eight times more three combinations of forces are admissible: both codes take
     the one with most feet at rest."""
-    full_values, _, oracle, _ = compare_codes(1e4, 200.0, 0.3, START, "one-sided", max_events=4000)
-    assert abs(full_values.sum() - oracle.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
+    full_values, _, reference, _ = compare_codes(
+        1e4, 200.0, 0.3, START, "one-sided", max_events=4000
+    )
+    assert abs(full_values.sum() - reference.sum()) < DIP_PERIOD_TOLERANCE_SECONDS
     model = vrw.UnilateralWheel(1e4, stoppers="one-sided", infinite_friction_rule="paper")
     cut = vrw.step(
         vrw.WheelParams(damping=200.0, slope=0.3), START, model=model, options=TIGHT_OPTIONS
     )
-    assert 1e-5 < abs(cut.period - oracle.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
+    assert 1e-5 < abs(cut.period - reference.sum()) < 1e-4  # 4.2e-5 s: 264 of 558 events are made
 
 
 @pytest.mark.parametrize("x", [START, (0.1, 4.0, -0.1)])

@@ -2,33 +2,37 @@
 
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 from support.batched import compute_full_steps, compute_jacobians, compute_states_and_work
 
 import vrw_jax as vrw
 
-STARTS = truth.stack_quantity("step", "start")
+STARTS = reference_values.stack_quantity("step", "start")
 
 
 def compute_reference_steps(options):
     """Return states and durations of all cases."""
-    return compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)[0]
+    return compute_states_and_work(reference_values.REFERENCE_PARAMETERS, STARTS, options)[0]
 
 
 VALUES = np.concatenate(
-    [truth.stack_quantity("step", "section_state"), truth.stack_quantity("step", "durations")], 1
+    [
+        reference_values.stack_quantity("step", "section_state"),
+        reference_values.stack_quantity("step", "durations"),
+    ],
+    1,
 )
 BY_PARAMETER = np.concatenate(
     [
-        truth.stack_quantity("step", "d_section_state_d_params"),
-        truth.stack_quantity("step", "d_durations_d_params"),
+        reference_values.stack_quantity("step", "d_section_state_d_params"),
+        reference_values.stack_quantity("step", "d_durations_d_params"),
     ],
     1,
 )
 BY_START = np.concatenate(
     [
-        truth.stack_quantity("step", "d_section_state_d_start"),
-        truth.stack_quantity("step", "d_durations_d_start"),
+        reference_values.stack_quantity("step", "d_section_state_d_start"),
+        reference_values.stack_quantity("step", "d_durations_d_start"),
     ],
     1,
 )
@@ -41,7 +45,7 @@ BY_START = np.concatenate(
 )
 def test_state_and_durations_are_accurate_to_the_claimed_error(options, claimed):
     solution = compute_reference_steps(options)
-    assert truth.compute_scaled_error(solution, VALUES) < claimed
+    assert reference_values.compute_scaled_error(solution, VALUES) < claimed
 
 
 @pytest.mark.parametrize(
@@ -50,26 +54,32 @@ def test_state_and_durations_are_accurate_to_the_claimed_error(options, claimed)
     ids=["default", "tight"],
 )
 def test_first_derivatives_are_accurate_to_the_claimed_error(options, claimed):
-    by_parameter, by_start = compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)
-    assert truth.compute_scaled_error(by_parameter, BY_PARAMETER) < claimed
-    assert truth.compute_scaled_error(by_start, BY_START) < claimed
+    by_parameter, by_start = compute_jacobians(
+        reference_values.REFERENCE_PARAMETERS, STARTS, options
+    )
+    assert reference_values.compute_scaled_error(by_parameter, BY_PARAMETER) < claimed
+    assert reference_values.compute_scaled_error(by_start, BY_START) < claimed
 
 
 def test_derivative_error_is_at_most_ten_times_the_value_error():
     # At tolerances where rounding (1e-13 in derivatives) plays no part.
     for tolerance in (1e-8, 1e-10):
         options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
-        of_values = truth.compute_scaled_error(compute_reference_steps(options), VALUES)
-        by_parameter, by_start = compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)
+        of_values = reference_values.compute_scaled_error(compute_reference_steps(options), VALUES)
+        by_parameter, by_start = compute_jacobians(
+            reference_values.REFERENCE_PARAMETERS, STARTS, options
+        )
         of_derivatives = max(
-            truth.compute_scaled_error(by_parameter, BY_PARAMETER),
-            truth.compute_scaled_error(by_start, BY_START),
+            reference_values.compute_scaled_error(by_parameter, BY_PARAMETER),
+            reference_values.compute_scaled_error(by_start, BY_START),
         )
         assert of_derivatives < 10.0 * of_values
 
 
 def test_indicators_impact_and_step_length_are_accurate():
-    solution = compute_full_steps(truth.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions.tight())
+    solution = compute_full_steps(
+        reference_values.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions.tight()
+    )
     assert np.all(np.asarray(solution.outcome) == vrw.Outcome.STEPPED)
     for quantity, key in [
         (solution.post_impact, "post_impact"),
@@ -79,7 +89,12 @@ def test_indicators_impact_and_step_length_are_accurate():
         (solution.indicators.lambda_4, "lambda4_plus"),
     ]:
         # Algebra, not integration: round-off of forces of some 100 N.
-        assert truth.compute_scaled_error(quantity, truth.stack_quantity("step", key)) < 1e-12, key
+        assert (
+            reference_values.compute_scaled_error(
+                quantity, reference_values.stack_quantity("step", key)
+            )
+            < 1e-12
+        ), key
 
 
 @pytest.mark.parametrize("solver", ["Tsit5", "Dopri5", "Kvaerno5"])
@@ -87,7 +102,7 @@ def test_all_solvers_agree(solver):
     # Kvaerno5's implicit stages stop at their own tolerance: ten times the explicit bound.
     options = vrw.StepOptions(solver=solver, rtol=1e-9, atol=1e-9)
     solution = compute_reference_steps(options)
-    assert truth.compute_scaled_error(solution, VALUES) < 1e-7
+    assert reference_values.compute_scaled_error(solution, VALUES) < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -106,11 +121,14 @@ def test_work_falls_with_the_order_of_the_solver(solver, order):
             solver=solver, rtol=tolerance, atol=tolerance, derivative_tightening=1.0
         )
         solution, tried = map(
-            np.asarray, compute_states_and_work(truth.REFERENCE_PARAMETERS, STARTS, options)
+            np.asarray,
+            compute_states_and_work(reference_values.REFERENCE_PARAMETERS, STARTS, options),
         )
         steps.append(np.mean(tried))
         errors.append(np.sqrt(np.mean((solution - VALUES) ** 2)))
-        by_start = np.asarray(compute_jacobians(truth.REFERENCE_PARAMETERS, STARTS, options)[1])
+        by_start = np.asarray(
+            compute_jacobians(reference_values.REFERENCE_PARAMETERS, STARTS, options)[1]
+        )
         derivative_errors.append(np.sqrt(np.mean((by_start - BY_START) ** 2)))
     slope = lambda error: -np.polyfit(np.log(steps), np.log(error), 1)[0]
     assert slope(errors) > order - 1.0

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import moreau_jean
+from reference_code import moreau_jean
 from scipy.optimize import brentq
 
 import vrw_jax as vrw
@@ -156,20 +156,20 @@ def test_energy_lost_in_a_step_is_reported_by_cause(scene_traces):
 
 @pytest.mark.parametrize("friction", [0.7, 1.3])
 def test_time_stepping_converges_to_the_same_step_in_first_order(friction):
-    truth = compute_step(friction)
+    reference = compute_step(friction)
     sizes = (16e-4, 8e-4, 4e-4, 2e-4)
     wheel = moreau_jean.TimeSteppingWheel(friction)
     walks = [
         moreau_jean.compute_step(wheel, moreau_jean.paper_start(wheel, *START), h) for h in sizes
     ]
-    errors = np.array([w.time - float(truth.period) for w in walks])
+    errors = np.array([w.time - float(reference.period) for w in walks])
     np.testing.assert_allclose(errors[:-1] / errors[1:], 2.0, atol=0.15)
     once = 2.0 * errors[1:] - errors[:-1]  # extrapolated, s
     assert abs(once[-1]) < 1e-5
     assert abs(4.0 * once[-1] - once[-2]) / 3.0 < 1e-6  # and once more
     theta = 2.0 * walks[3].theta - walks[2].theta
-    assert abs(theta - float(truth.section_state[0])) < 1e-5
-    assert abs(walks[3].loaded_twice - float(truth.durations[0])) < 2e-3
+    assert abs(theta - float(reference.section_state[0])) < 1e-5
+    assert abs(walks[3].loaded_twice - float(reference.durations[0])) < 2e-3
 
 
 def make_reference_start(x):

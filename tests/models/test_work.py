@@ -3,15 +3,19 @@
 import jax
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 from support.batched import compute_states_and_work
 
 import vrw_jax as vrw
 from vrw_jax.integrator.tableaus import load_explicit_tableau, real_stability_limit
 
-STARTS = truth.stack_quantity("step", "start")
+STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
-    [truth.stack_quantity("step", "section_state"), truth.stack_quantity("step", "durations")], 1
+    [
+        reference_values.stack_quantity("step", "section_state"),
+        reference_values.stack_quantity("step", "durations"),
+    ],
+    1,
 )
 WORK_ALLOWANCE = 1.02
 """Counts are whole numbers, but a step more or less may hang on the last bit of another machine."""
@@ -21,14 +25,14 @@ ERROR_ALLOWANCE = 1.5
 
 def diffrax_steps():
     values, tried = compute_states_and_work(
-        truth.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions(engine="diffrax")
+        reference_values.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions(engine="diffrax")
     )
     return np.asarray(values), np.asarray(tried)
 
 
 def lane_engine_steps():
     batch_result = vrw.step_batch(
-        truth.make_wheels(truth.REFERENCE_PARAMETERS), STARTS, engine="lanes"
+        reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS), STARTS, engine="lanes"
     )
     return np.concatenate([batch_result.section_state, batch_result.durations], 1), np.asarray(
         batch_result.solver_steps
@@ -45,14 +49,14 @@ def test_a_step_needs_no_more_solver_steps_and_is_no_less_accurate_than_recorded
 ):
     values, tried = engine()
     assert np.mean(tried) <= WORK_ALLOWANCE * steps
-    assert truth.compute_scaled_error(values, VALUES) <= ERROR_ALLOWANCE * error
+    assert reference_values.compute_scaled_error(values, VALUES) <= ERROR_ALLOWANCE * error
 
 
 def test_a_limit_cycle_needs_no_more_iterations_and_is_no_less_accurate_than_recorded():
-    one = lambda vector: vrw.limit_cycle(truth.make_wheel(vector))
-    solution = jax.jit(jax.vmap(one))(truth.REFERENCE_PARAMETERS)
-    error = truth.compute_scaled_error(
-        solution.durations, truth.stack_quantity("cycle", "durations")
+    one = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector))
+    solution = jax.jit(jax.vmap(one))(reference_values.REFERENCE_PARAMETERS)
+    error = reference_values.compute_scaled_error(
+        solution.durations, reference_values.stack_quantity("cycle", "durations")
     )
     assert np.mean(solution.n_newton_iterations) <= WORK_ALLOWANCE * 4.375
     assert error <= ERROR_ALLOWANCE * 9.1e-12

@@ -62,9 +62,9 @@ def test_a_ball_bounces_until_its_event_times_accumulate(restitution):
     )
     n = int(result.n_events)
     powers = restitution ** np.arange(n)
-    truth = np.sqrt(2.0 / G) * (1.0 + 2.0 * restitution * (1.0 - powers) / (1.0 - restitution))
+    reference = np.sqrt(2.0 / G) * (1.0 + 2.0 * restitution * (1.0 - powers) / (1.0 - restitution))
     assert read_termination(result) == Termination.ZENO
-    np.testing.assert_allclose(result.times[:n], truth, rtol=1e-14)
+    np.testing.assert_allclose(result.times[:n], reference, rtol=1e-14)
     end = np.sqrt(2.0 / G) * (1.0 + restitution) / (1.0 - restitution)
     assert abs(float(result.time) - end) < 1e-14 * end
 
@@ -73,8 +73,8 @@ def test_derivatives_of_event_times_agree_with_the_closed_form():
     third = lambda height: simulate_hybrid(
         [make_ball_mode()], jnp.stack([height, 0.0 * height]), events=3, options=TIGHT_OPTIONS
     ).times[2]
-    truth = lambda height: jnp.sqrt(2.0 * height / G) * (1.0 + 2.0 * (0.8 + 0.64))
-    np.testing.assert_allclose(jax.jacfwd(third)(1.3), jax.grad(truth)(1.3), rtol=1e-12)
+    reference = lambda height: jnp.sqrt(2.0 * height / G) * (1.0 + 2.0 * (0.8 + 0.64))
+    np.testing.assert_allclose(jax.jacfwd(third)(1.3), jax.grad(reference)(1.3), rtol=1e-12)
 
 
 def test_modes_follow_the_target_modes_of_their_guards():
@@ -193,12 +193,12 @@ def make_attracted_field(rate):
     ],
 )
 def test_event_times_of_implicit_solvers_are_within_their_stated_errors(stiff, rate, solver):
-    modes, start, truth = stiff(rate)
+    modes, start, reference = stiff(rate)
 
     @jax.jit
     def both(tolerance):
         options = vrw.StepOptions(solver, rtol=tolerance, atol=tolerance, max_phase_time=100.0)
-        results = simulate_hybrid(modes, start, events=len(truth), options=options)
+        results = simulate_hybrid(modes, start, events=len(reference), options=options)
         return results, time_errors(modes, start, results, options)
 
     outside_values = []
@@ -207,7 +207,7 @@ def test_event_times_of_implicit_solvers_are_within_their_stated_errors(stiff, r
         n = int(
             result.n_events
         )  # one of the walks ends early: a rounding off its guard, GUARD_PAST
-        wrong = np.abs(result.times[:n] - truth[:n])
+        wrong = np.abs(result.times[:n] - reference[:n])
         assert n > 1
         assert np.all(wrong <= stated[:n]), tolerance
         outside_values.append(np.max(wrong / result.time_tolerance[:n]))
@@ -413,10 +413,10 @@ def test_multipliers_of_products_agree_with_those_of_the_product(size):
     random = np.random.default_rng(size)
     for _ in range(20):
         maps = np.eye(size) + 0.3 * random.normal(size=(4, size, size))
-        truth = np.linalg.eigvals(np.linalg.multi_dot(maps[::-1]))
+        reference = np.linalg.eigvals(np.linalg.multi_dot(maps[::-1]))
         solution = product_multipliers(maps).values
-        gap = np.abs(solution[:, None] - truth[None])
-        assert max(gap.min(0).max(), gap.min(1).max()) < 1e-9 * np.abs(truth).max()
+        gap = np.abs(solution[:, None] - reference[None])
+        assert max(gap.min(0).max(), gap.min(1).max()) < 1e-9 * np.abs(reference).max()
 
 
 def test_a_singular_factor_hides_one_multiplier_and_leaves_the_others():

@@ -84,9 +84,9 @@ def test_a_guard_that_dips_below_zero_within_one_step_fires(depth):
     dipping = lambda y: 1.0 - depth + y[1]  # below zero around t = 3 pi / 2
     end = find_phase_end((dipping, lambda y: 8.0 - y[0]))
     assert int(end.guard) == 0
-    truth = np.pi + np.arcsin(1.0 - depth)
+    reference = np.pi + np.arcsin(1.0 - depth)
     # A graze turns an error of s (1e-13) into one of its square root's conditioning.
-    assert abs(float(end.duration) - truth) < 1e-12 / np.sqrt(depth)
+    assert abs(float(end.duration) - reference) < 1e-12 / np.sqrt(depth)
 
 
 def test_a_phase_that_starts_on_a_falling_guard_ends_at_once():
@@ -137,18 +137,18 @@ def test_event_time_and_state_have_accurate_first_and_second_derivatives():
     z = jnp.asarray([0.7, 0.3])
     np.testing.assert_allclose(land(z), closed(z), rtol=1e-13)
     np.testing.assert_allclose(jax.jacfwd(land)(z), jax.jacfwd(closed)(z), rtol=1e-11)
-    second, truth = jax.jacfwd(jax.jacfwd(land))(z), jax.jacfwd(jax.jacfwd(closed))(z)
-    np.testing.assert_allclose(second, truth, rtol=1e-10, atol=1e-12)
+    second, reference = jax.jacfwd(jax.jacfwd(land))(z), jax.jacfwd(jax.jacfwd(closed))(z)
+    np.testing.assert_allclose(second, reference, rtol=1e-10, atol=1e-12)
 
 
 def test_a_margin_has_its_minimum_to_the_accuracy_of_the_integrator():
     # Lowest value of sin t + t / 10 on (0, 8): where cos t = -1/10, after pi.
     value_at = 2.0 * np.pi - np.arccos(-0.1)
-    truth = np.sin(value_at) + value_at / 10.0
+    reference = np.sin(value_at) + value_at / 10.0
     end = find_phase_end(
         (lambda y: 8.0 - y[0],), monitors=(lambda y: y[1] + y[0] / 10.0,), count_start=(True,)
     )
-    assert abs(float(end.minima[0]) - truth) < 1e-12
+    assert abs(float(end.minima[0]) - reference) < 1e-12
 
 
 def test_a_margin_that_starts_at_zero_counts_from_its_next_minimum():

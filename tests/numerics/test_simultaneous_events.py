@@ -44,8 +44,8 @@ def height_at(time, start):
 def test_balls_that_land_together_have_the_derivatives_of_one_ball(n, options):
     jacobian = jax.jit(jax.jacfwd(lambda start: heights_at(0.7, start, n, options)))
     for height in (0.9, 1.0, 1.3):
-        truth = jax.grad(height_at, 1)(0.7, height) * np.eye(n)
-        np.testing.assert_allclose(jacobian(jnp.full(n, height)), truth, rtol=1e-12, atol=1e-12)
+        reference = jax.grad(height_at, 1)(0.7, height) * np.eye(n)
+        np.testing.assert_allclose(jacobian(jnp.full(n, height)), reference, rtol=1e-12, atol=1e-12)
     apart = jacobian(jnp.array([1.0 + 1e-9 * i for i in range(n)]))
     np.testing.assert_allclose(apart, jacobian(jnp.ones(n)), atol=1e-7)
     np.testing.assert_allclose(apart[0, 0], 0.19055, atol=5e-6)
@@ -76,15 +76,15 @@ def test_a_start_on_a_falling_guard_has_the_event_time_s_derivatives(height, sol
     )
     if solver == "Dopri8":
         second = jax.jacfwd(jax.jacfwd(lambda y: thrown(y, options)))(start)
-        truth = jax.jacfwd(jax.jacfwd(thrown_in_closed_form))(on_guard)
-        np.testing.assert_allclose(second, truth, atol=1e-11)
+        reference = jax.jacfwd(jax.jacfwd(thrown_in_closed_form))(on_guard)
+        np.testing.assert_allclose(second, reference, atol=1e-11)
 
 
 def test_starts_on_and_above_a_guard_have_right_derivatives_in_one_batch():
     starts = jnp.array([[0.0, -2.0], [0.3, -2.0], [0.0, -1.0], [1e-12, -2.0]])
     first = jax.vmap(jax.jacfwd(lambda y: thrown(y, TIGHT)))(starts)
-    truth = jax.vmap(jax.jacfwd(thrown_in_closed_form))(starts)
-    np.testing.assert_allclose(first, truth, atol=1e-11)
+    reference = jax.vmap(jax.jacfwd(thrown_in_closed_form))(starts)
+    np.testing.assert_allclose(first, reference, atol=1e-11)
 
 
 def test_saltation_matrices_of_coinciding_events_are_composed_in_order():
@@ -111,15 +111,15 @@ def test_saltation_matrices_of_coinciding_events_are_composed_in_order():
         walked = simulate_hybrid(modes, start, events=2, options=TIGHT)
         return walked.state + (2.0 - walked.time) * jnp.asarray(fields[2])
 
-    truth = np.eye(3)
+    reference = np.eye(3)
     for i in range(2):
         jump = np.outer(fields[i + 1] - resets[i] @ fields[i], normals[i])
-        truth = (resets[i] + jump / (normals[i] @ fields[i])) @ truth
+        reference = (resets[i] + jump / (normals[i] @ fields[i])) @ reference
     for before in (0.0, 0.5):  # s before both events: at time zero both
         start = jnp.asarray(-before * fields[0])
         walked = simulate_hybrid(modes, start, events=2, options=TIGHT)
         np.testing.assert_allclose(walked.times, before, atol=1e-15)
-        np.testing.assert_allclose(jax.jacfwd(late)(start), truth, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(jax.jacfwd(late)(start), reference, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("n", [3, 5, 12])

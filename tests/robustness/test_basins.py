@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import five_coordinates
-from oracle import five_coordinates_equations as equations
-from oracle.constrained_wheel import Wheel, run_phase
+from reference_code import five_coordinates
+from reference_code import five_coordinates_equations as equations
+from reference_code.constrained_wheel import Wheel, run_phase
 
 import vrw_jax as vrw
 from vrw_jax.robustness.basin_share import compute_share_error

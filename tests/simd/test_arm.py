@@ -41,10 +41,10 @@ def test_code_for_arm64_agrees_with_jax(arm_machine, function):
     pytest.importorskip("unicorn")
     a, b = np.random.default_rng(0).uniform(0.5, 2.0, (2, 6))
     lanes = [np.zeros(1021)] * 2
-    truth = [np.asarray(x) for x in function(a, b)]
-    rows = [np.zeros_like(x) for x in truth]
+    reference = [np.asarray(x) for x in function(a, b)]
+    rows = [np.zeros_like(x) for x in reference]
     run_compiled_lanes(compile_for_arm(function, *lanes), [a, b], rows, LANES_PER_REGISTER)
-    for got, right in zip(rows, truth, strict=True):
+    for got, right in zip(rows, reference, strict=True):
         np.testing.assert_allclose(got, right, rtol=1e-15)
 
 

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import vrw_jax as vrw
-from support import truth
+from support import reference_values
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome
 
 BATCH_SIZE = 16
-TABLE_1_VALUES = truth.REFERENCE_PARAMETERS[0]
-TABLE_1_SECTION_STATE = truth.stack_quantity("cycle", "section_state")[0]
+TABLE_1_VALUES = reference_values.REFERENCE_PARAMETERS[0]
+TABLE_1_SECTION_STATE = reference_values.stack_quantity("cycle", "section_state")[0]
 NAMES = PARAMETER_NAMES
 TIME_LIMIT_CASES = (
     (0.3, Outcome.NO_TOUCHDOWN_IN_TIME),
@@ -65,7 +65,9 @@ def pad_to_batch(rows, width):
 @eqx.filter_jit
 def _compute_full_steps(vectors, starts, options, model, uses_lane_engine):
     options = options.with_engine("lanes" if uses_lane_engine else "diffrax")
-    step_one = lambda vector, start: model.take_step(truth.make_wheel(vector), start, options)
+    step_one = lambda vector, start: model.take_step(
+        reference_values.make_wheel(vector), start, options
+    )
     return jax.vmap(step_one)(vectors, starts)
 
 
@@ -84,7 +86,7 @@ def compute_full_steps(vectors, starts, options=None, model=None, uses_lane_engi
 
 def compute_state_and_work(vector, start, options):
     """Return state and durations of a step without margins, and the number of solver steps."""
-    result = vrw.ViscoelasticWheel().advance(truth.make_wheel(vector), start, options)
+    result = vrw.ViscoelasticWheel().advance(reference_values.make_wheel(vector), start, options)
     return jnp.concatenate([result.section_state, result.durations]), result.solver_steps
 
 

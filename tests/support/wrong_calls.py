@@ -54,7 +54,7 @@ def register_wrong_calls() -> None:
         "digits": ("150", "TypeError"),
         "nothing": (None, "TypeError"),
         "complex": (1.0 + 2.0j, "TypeError"),
-        "truth": (True, "TypeError"),
+        "reference": (True, "TypeError"),
         "table": ({}, "TypeError"),
         "object": (object(), "TypeError"),
     }
@@ -168,7 +168,7 @@ def register_wrong_calls() -> None:
         "uneven as a number", lambda: vrw.UnilateralWheel(uneven=math.inf), "TypeError", "uneven"
     )
     for label, value in {
-        "a number": 3, "a dtype": np.dtype(float), "a truth": True, "an array": np.eye(2)
+        "a number": 3, "a dtype": np.dtype(float), "a reference": True, "an array": np.eye(2)
     }.items():  # fmt: skip
         add_wrong_call(
             f"derivatives as {label}",
@@ -438,7 +438,7 @@ def register_wrong_calls() -> None:
         ("which between places", {"which": 0.5}, "ValueError", "which is 0.5"),
         ("which a set", {"which": {0, 1}}, "TypeError", "which is {0, 1}"),
         ("which an array", {"which": np.array([0, 1])}, "TypeError", "which is an array"),
-        ("which a truth", {"which": True}, "TypeError", "which is True"),
+        ("which a reference", {"which": True}, "TypeError", "which is True"),
     )  # fmt: skip
     for label, given, kind, words in wrong:
         add_wrong_call(
@@ -856,7 +856,7 @@ def register_wrong_calls() -> None:
     # Designs and scans
     columns = {
         "text": ("fast", "TypeError"), "texts": (["1", "2"], "TypeError"),
-        "complex": ([1.0, 2j], "TypeError"), "truths": ([True, False], "TypeError"),
+        "complex": ([1.0, 2j], "TypeError"), "references": ([True, False], "TypeError"),
         "nothing": (None, "TypeError"), "no values": ([], "ValueError"),
         "a table": (np.ones((2, 2)), "ValueError"),
     }  # fmt: skip

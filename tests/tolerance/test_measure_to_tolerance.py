@@ -16,7 +16,7 @@ FRICTIONS = np.geomspace(8.0, 80.0, 24)
 
 @pytest.fixture(scope="module")
 def exact_measures():
-    """What the iteration with unilateral contact converges to, as the truth of looser answers."""
+    """Measures at the tolerance 1e-10, the reference for larger tolerances."""
     return vrw.measure_to_tolerance(
         ["speed", "dls_fraction", "period"], WHEELS_NEAR_TABLE_1, 1e-10, friction=FRICTIONS
     )

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import truth
+from support import reference_values
 
 import vrw_jax as vrw
 from vrw_jax.models.viscoelastic import make_diffrax_phase
@@ -12,7 +12,7 @@ from vrw_jax.numerics.autodiff import enable_all_ad_modes
 from vrw_jax.wheel import make_phases, transitions
 
 PARAMS = vrw.WheelParams()
-START = jnp.asarray(truth.stack_quantity("step", "start")[0])
+START = jnp.asarray(reference_values.stack_quantity("step", "start")[0])
 TIGHT_OPTIONS = vrw.StepOptions.tight()
 
 

@@ -16,7 +16,7 @@ from vrw_jax.wheel.geometry import Motion
 
 N_SAMPLES = 1001
 STEADY_STATE = jnp.array([0.102726965088900357, 1.61345343427543820, -0.109037270])
-"""Near the gait of Table 1: `tests/oracle/truth.json`, first case, rounded."""
+"""Near the gait of Table 1: `tests/reference_code/reference_values.json`, first case, rounded."""
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracle import complementarity, uneven_ground
-from oracle.five_coordinates import TABLE_1
+from reference_code import complementarity, uneven_ground
+from reference_code.five_coordinates import TABLE_1
 
 import vrw_jax as vrw
 from vrw_jax.batches.landing_steps import step_batch_after_landing
@@ -41,19 +41,19 @@ def test_ten_steps_of_the_papers_wheel_are_those_in_an_absolute_frame():
 
 def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
     x, other = START, uneven_ground.walk(OTHER, START, LINES[:4])
-    for k, truth in enumerate(other):
+    for k, reference in enumerate(other):
         params = vrw.WheelParams(**WHEEL, slope=jnp.asarray(LINES[k : k + 2]))
         step = vrw.step(params, x, options=TIGHT)
         np.testing.assert_allclose(vrw.return_map(params, x, options=TIGHT), step.section_state)
-        np.testing.assert_allclose(step.section_state, truth.section_state, atol=1e-12)
-        np.testing.assert_allclose(step.post_impact, truth.post_impact, atol=1e-12)
-        lost = truth.lost_landing, truth.lost_stopper, truth.lost_damping
+        np.testing.assert_allclose(step.section_state, reference.section_state, atol=1e-12)
+        np.testing.assert_allclose(step.post_impact, reference.post_impact, atol=1e-12)
+        lost = reference.lost_landing, reference.lost_stopper, reference.lost_damping
         energy = step.energy
         np.testing.assert_allclose(
             [energy.landing, energy.stopper, energy.damping], lost, atol=1e-11
         )
-        assert abs(truth.energy_residual) < 1e-11
-        assert abs(float(step.margins.clearance_sls1) - truth.clearance) < 1e-10
+        assert abs(reference.energy_residual) < 1e-11
+        assert abs(float(step.margins.clearance_sls1) - reference.clearance) < 1e-10
         x = step.section_state
 
 
@@ -125,9 +125,9 @@ def test_a_batch_walks_over_its_lines_as_wheels_do_one_by_one():
             args = tuple(map(jnp.asarray, (damping[i], given[i], starts[i])))
             np.testing.assert_allclose(found.section_state[i], one(*args), atol=1e-10)
             by = jax.jacfwd(one, (0, 1, 2))(*args)
-            for name, truth in zip(("damping", "slope", "section_state"), by, strict=True):
+            for name, reference in zip(("damping", "slope", "section_state"), by, strict=True):
                 own = found.derivatives[name].section_state[i]
-                np.testing.assert_allclose(own, truth, atol=1e-11)
+                np.testing.assert_allclose(own, reference, atol=1e-11)
 
 
 def test_a_walk_of_places_keeps_its_footholds_and_loses_what_dampers_and_impacts_take():
@@ -136,15 +136,15 @@ def test_a_walk_of_places_keeps_its_footholds_and_loses_what_dampers_and_impacts
     sin, cos = np.sin(LINES[0]), np.cos(LINES[0])
     assert walk.attrs["slopes"] == list(LINES[:4])
     energies = [walk.total_energy.values[walk.step.values == k] for k in range(3)]
-    for k, truth in enumerate(other):
+    for k, reference in enumerate(other):
         x, z = (walk[name].values[walk.step.values == k] for name in ("foot_1_x", "foot_1_z"))
         assert max(np.ptp(x), np.ptp(z)) == 0.0
         place = x[0] * cos + z[0] * sin, z[0] * cos - x[0] * sin
-        np.testing.assert_allclose(place, truth.foothold - other[0].foothold, atol=1e-12)
-        lost = truth.lost_damping + truth.lost_stopper
+        np.testing.assert_allclose(place, reference.foothold - other[0].foothold, atol=1e-12)
+        lost = reference.lost_damping + reference.lost_stopper
         assert abs(energies[k][0] - energies[k][-1] - lost) < 1e-10
         if k:
-            assert abs(energies[k - 1][-1] - energies[k][0] - truth.lost_landing) < 1e-10
+            assert abs(energies[k - 1][-1] - energies[k][0] - reference.lost_landing) < 1e-10
 
 
 def test_rigid_wheels_step_from_line_to_line_by_the_closed_formula():
@@ -363,8 +363,10 @@ def test_a_batch_on_uneven_ground_equals_single_wheels(more):
         given = tuple(map(jnp.asarray, given))
         np.testing.assert_allclose(batch_result.durations[i], one(*given).durations[-1], atol=1e-11)
         by = jax.jacfwd(lambda *given: one(*given).section_state[-1], (0, 1, 2))(*given)
-        for name, truth in zip(asked, by, strict=True):
-            np.testing.assert_allclose(moved.derivatives[name].section_state[i], truth, atol=1e-9)
+        for name, reference in zip(asked, by, strict=True):
+            np.testing.assert_allclose(
+                moved.derivatives[name].section_state[i], reference, atol=1e-9
+            )
     engines = [
         vrw.step_batch(params, START_STATES, 3, model=ground(friction=grounds), engine="diffrax")
     ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.polynomial import Chebyshev
-from oracle import complementarity
+from reference_code import complementarity
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw

@@ -1,1 +1,1 @@
-"""Published problems on which methods are known to break, each a module with its truth."""
+"""Published problems on which methods are known to break, each a module with its reference."""

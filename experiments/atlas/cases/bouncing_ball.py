@@ -32,27 +32,27 @@ def rows() -> Iterator[Row]:
     for method in METHODS:
         walk_result = method(BALL, (1.0, 0.0), EVENTS, 10.0)
         early = walk_result._replace(says="", admits=False)
-        truth = float(times(20)[-1])
-        yield make_row(early, "time of bounce 20", last_time(walk_result, 20), truth, event=20)
+        reference = float(times(20)[-1])
+        yield make_row(early, "time of bounce 20", last_time(walk_result, 20), reference, event=20)
         end = float(walk_result.times[-1]) if len(walk_result.times) else math.nan
         result = walk_result._replace(
             says=walk_result.says or f"goes on: {len(walk_result.times)} bounces"
         )
         yield make_row(result, "time of the last bounce", end, ACCUMULATION_TIME)
-    truths = {
+    references = {
         "time of bounce 20": float(times(20)[-1]),
         "time of the last bounce": ACCUMULATION_TIME,
     }
-    yield from make_rows("siconos", "bouncing_ball", truths)
+    yield from make_rows("siconos", "bouncing_ball", references)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    truth = times(EVENTS)
+    reference = times(EVENTS)
     for method, marker in zip(METHODS, "o^sD", strict=True):
         walk_result = method(BALL, (1.0, 0.0), EVENTS, 10.0)
         n = len(walk_result.times)
-        error = np.abs(walk_result.times - truth[:n]) + 1e-17
+        error = np.abs(walk_result.times - reference[:n]) + 1e-17
         axes.semilogy(np.arange(1, n + 1), error, marker, ms=3, label=f"{walk_result.method}: {n}")
     axes.set_xlabel("bounce")
     axes.set_ylabel("error of its time [s]")

@@ -134,13 +134,13 @@ def torus_points() -> Iterator[Row]:
     guess = cycle_at(guess, jnp.array([AT_K7, PAGES_K8]), LEVEL).x
     exponent = lambda k8: math.log(largest(cycle_at(guess, jnp.array([AT_K7, k8]), LEVEL)))
     k8 = brentq(lambda k8: exponent(k8) - STABLE, PAGES_K8 - 1e-4, PAGES_K8 + 1e-4, xtol=1e-12)
-    for name, solution, truth, digits, took in (
+    for name, solution, reference, digits, took in (
         ("modulus at the first point, as published", largest(first), 1.0, 6, seconds),
         ("A at the first point, as published", x, MANUAL_FIRST_POINT[0], 6, seconds),
         ("k8 of exponent 1e-3, as published", k8, PAGES_K8, 8, time.process_time() - began),
     ):
         yield Row(
-            name, "ours", solution, truth, compute_error(solution, truth), "",
+            name, "ours", solution, reference, compute_error(solution, reference), "",
             not bool(first.converged),
             int(first.n_iterations), took, options, version("vrw-jax"), digits=digits,
         )  # fmt: skip
@@ -169,22 +169,25 @@ def rows() -> Iterator[Row]:
     (solution, divergence), seconds = time_second_call(whole)
     trivial = float(solution.values[np.nanargmin(np.abs(solution.values - 1.0))].real)
     sums = float(np.sum(solution.logarithms))
-    for name, value, truth in (
+    for name, value, reference in (
         ("trivial multiplier", trivial, 1.0),
         ("logarithm of their product", sums, divergence),
     ):
         yield Row(
-            name, "ours", value, truth, compute_error(value, truth, relative=True), "", False,
+            name, "ours", value, reference, compute_error(value, reference, relative=True), "",
+            False,
             SEGMENTS,
             seconds, f"Dopri8 1e-13, {SEGMENTS} segments", version("vrw-jax"),
         )  # fmt: skip
 
     yield from torus_points()
     (point, seconds), (other, _) = find_cycle_on_level(LEVEL), find_cycle_on_level(OTHER_LEVEL)
-    for name, value, truth in zip(("k7", "k8"), point.parameters, other.parameters, strict=True):
+    for name, value, reference in zip(
+        ("k7", "k8"), point.parameters, other.parameters, strict=True
+    ):
         yield Row(
-            f"{name} of the Chenciner point, by another section", "ours", value, truth,
-            compute_error(value, truth), "", False, 1, seconds,
+            f"{name} of the Chenciner point, by another section", "ours", value, reference,
+            compute_error(value, reference), "", False, 1, seconds,
             "Dopri8 1e-13, three derivatives, compiling counted", version("vrw-jax"),
         )  # fmt: skip
 

@@ -99,7 +99,7 @@ def part(mode: int) -> Part:
 SYSTEM = tuple(part(mode) for mode in range(len(ENDS)))
 
 
-def truth() -> tuple[np.ndarray, float]:
+def reference() -> tuple[np.ndarray, float]:
     """Times of the events, and the rate of the first wheel at the last."""
     with mpmath.workdps(30):
         fast, slow = mpmath.mpf(float(FAST_FREQUENCY)), mpmath.mpf(float(SLOW_FREQUENCY))
@@ -130,7 +130,7 @@ def truth() -> tuple[np.ndarray, float]:
 
 
 def rows() -> Iterator[Row]:
-    times, rate = truth()
+    times, rate = reference()
     for method in METHODS:
         walk_result = method(SYSTEM, START, len(ENDS), 2.0)
         for event in (3, 7, 8):

@@ -2,7 +2,7 @@
 
 Two legs of 1 m with 5 kg at their middle, 10 kg at the hip. Published just after impact: stance
 0.2187, swing -0.3234 rad, rates -1.0918 and -0.3772 rad/s. The equations are derived in docstrings
-below from energies and angular momenta; the truth beyond four digits is found in 40 digits by
+below from energies and angular momenta; the reference beyond four digits is found in 40 digits by
 many_digits.py.
 """
 
@@ -101,8 +101,8 @@ def rows() -> Iterator[Row]:
         yield make_row(
             gait.simulation, "spectral radius", float(np.abs(gait.multipliers[0])), radius
         )
-    truths = {"stance angle": EXACT_GAIT.x[0], "period": EXACT_GAIT.period}
-    yield from make_rows("drake", "compass_gait", truths)
+    references = {"stance angle": EXACT_GAIT.x[0], "period": EXACT_GAIT.period}
+    yield from make_rows("drake", "compass_gait", references)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

@@ -26,7 +26,7 @@ from vrw_jax.collocation import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX
 from vrw_jax.hybrid import product_multipliers, segment_maps
 
 Q = 0.97
-TRUTH = math.exp(-2.0 * math.pi)
+REFERENCE = math.exp(-2.0 * math.pi)
 PERIOD = 2.0 * math.pi
 STEEP = 2.0 * (1.0 + Q) / (1.0 - Q) - 1.0
 """Largest rate of contraction: so much an error of the phase moves the multiplier, relatively."""
@@ -76,14 +76,15 @@ def rows() -> Iterator[Row]:
         )
         name = f"ours, {n} segment{'s' * (n > 1)}"
         yield Row(
-            "multiplier", name, solution, TRUTH, compute_error(solution, TRUTH, relative=True), "",
+            "multiplier", name, solution, REFERENCE, compute_error(solution, REFERENCE,
+            relative=True), "",
             not known_values, n, seconds, "Dopri8 1e-13", version("vrw-jax"), STEEP,
         )  # fmt: skip
     for n in (10, 40, 400):
         solution, seconds = time_second_call(lambda n=n: compute_collocation_multiplier(n))
         yield Row(
-            "multiplier", f"collocation, {n} segments", solution, TRUTH,
-            compute_error(solution, TRUTH, relative=True), "", False, n, seconds, "4 Gauss "
+            "multiplier", f"collocation, {n} segments", solution, REFERENCE,
+            compute_error(solution, REFERENCE, relative=True), "", False, n, seconds, "4 Gauss "
                 "nodes, equal",
             version("vrw-jax"), STEEP,
         )  # fmt: skip
@@ -99,7 +100,8 @@ def rows() -> Iterator[Row]:
     )
     solution = float(result.y[0, -1])
     yield Row(
-        "multiplier", "SciPy", solution, TRUTH, compute_error(solution, TRUTH, relative=True), "",
+        "multiplier", "SciPy", solution, REFERENCE, compute_error(solution, REFERENCE,
+        relative=True), "",
         False, result.nfev,
         seconds, "DOP853 1e-13", version("scipy"), STEEP,
     )  # fmt: skip
@@ -113,7 +115,8 @@ def rows() -> Iterator[Row]:
     solved, seconds = time_second_call(lambda: jax.block_until_ready(solve(jnp.array([1.0, 0.0]))))
     answer, work = float(solved.ys[-1, 0]), int(solved.stats["num_steps"])
     yield Row(
-        "multiplier", "diffrax", answer, TRUTH, compute_error(answer, TRUTH, relative=True), "",
+        "multiplier", "diffrax", answer, REFERENCE, compute_error(answer, REFERENCE,
+        relative=True), "",
         False, work,
         seconds, "Dopri8 1e-13", version("diffrax"), STEEP,
     )  # fmt: skip
@@ -129,7 +132,8 @@ def rows() -> Iterator[Row]:
 
     (solution, work), seconds = time_second_call(by_taylor)
     yield Row(
-        "multiplier", "heyoka", solution, TRUTH, compute_error(solution, TRUTH, relative=True),
+        "multiplier", "heyoka", solution, REFERENCE, compute_error(solution, REFERENCE,
+        relative=True),
         "", False, work,
         seconds, "Taylor 2.2e-16", version("heyoka"), STEEP,
     )  # fmt: skip
@@ -140,7 +144,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     counts = np.unique(np.round(np.geomspace(4, 1000, 60)).astype(int))
     solution = np.abs([compute_collocation_multiplier(int(n)) for n in counts])
     axes.loglog(counts, solution, ".-", label="collocation, equal segments")
-    axes.axhline(TRUTH, color="k", lw=0.8, label="truth, exp(−2π)")
+    axes.axhline(REFERENCE, color="k", lw=0.8, label="reference, exp(−2π)")
     axes.axhline(1.0, color="0.6", ls=":", label="border of stability")
     mine = [compute_library_multiplier(n)[0] for n in (1, 10, 100)]
     axes.loglog((1, 10, 100), mine, "s", mfc="w", label="ours")

@@ -95,7 +95,7 @@ def compute_impact_derivative(w: float, depth: float) -> ReturnMap:
 def derivative() -> Iterator[Row]:
     """Of the time of touching by the depth, where it grows as 1/sqrt(depth)."""
     c = 1.0 + GRAZING_DEPTH
-    truth = -1.0 / (W * c * math.sqrt(c * c - 1.0))
+    reference = -1.0 / (W * c * math.sqrt(c * c - 1.0))
     parts, options = modes(make_stopped_oscillator(W)), vrw.StepOptions.tight()
     start = lambda c: jnp.stack([-c, 0.0 * c, 0.0 * c, c])
     slope = jax.jit(
@@ -104,7 +104,8 @@ def derivative() -> Iterator[Row]:
     solution, seconds = time_second_call(lambda: float(slope(c)))
     yield Row(
         "derivative of that "
-            "time", "ours", solution, truth, compute_error(solution, truth, relative=True), "",
+            "time", "ours", solution, reference, compute_error(solution, reference,
+            relative=True), "",
         False, 1, seconds, "Dopri8 1e-13", version("vrw-jax"), 0.5 / GRAZING_DEPTH,
     )  # fmt: skip
     h = 1e-8
@@ -119,7 +120,7 @@ def derivative() -> Iterator[Row]:
             walk_result,
             "derivative of that time",
             solution,
-            truth,
+            reference,
             relative=True,
             condition=0.5 / GRAZING_DEPTH,
         )
@@ -165,10 +166,10 @@ def rows() -> Iterator[Row]:
             gait.simulation, "product of multipliers", gait.product, RESTITUTION_COEFFICIENT**2
         )
     graze = compute_impact_derivative(W, 1e-9)._replace(guess=(math.pi / W, -1e-4))
-    truth = compute_repeating_motion(W, 1e-9)[1]
+    reference = compute_repeating_motion(W, 1e-9)[1]
     for gait in (find_by_newton(graze), find_by_differences(METHODS[3], graze)):
         solution = float(gait.x[1])
-        yield make_row(gait.simulation, "rate, Newton from the graze", solution, truth)
+        yield make_row(gait.simulation, "rate, Newton from the graze", solution, reference)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

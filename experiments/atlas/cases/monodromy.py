@@ -92,24 +92,26 @@ PEERS: tuple[tuple[str, Callable, str, str], ...] = (
 def rows() -> Iterator[Row]:
     for name, n in (("ours", SEGMENTS), ("ours, one segment", 1)):
         (result, _), seconds = time_second_call(lambda n=n: compute_by_segments(n))
-        for i, truth in enumerate((1.0, SMALL_MULTIPLIER)):
+        for i, reference in enumerate((1.0, SMALL_MULTIPLIER)):
             solution, known_values = float(result.values[i].real), bool(result.is_known[i])
             says = "" if known_values else f"not known: uncertainty {result.relative_error[i]:.0e}"
             yield Row(
                 f"multiplier "
-                    f"{truth:.1e}", name, solution, truth, compute_error(solution, truth,
+                    f"{reference:.1e}", name, solution, reference, compute_error(solution,
+                    reference,
                     relative=True),
                 says, not known_values, n, seconds, f"Dopri8 1e-13, {n} "
                     f"segments", version("vrw-jax"),
             )  # fmt: skip
     for name, call, options, package in PEERS:
         (matrix, work), seconds = time_second_call(call)
-        for solution, truth in zip(
+        for solution, reference in zip(
             multiply_segments(matrix).real, (1.0, SMALL_MULTIPLIER), strict=True
         ):
-            error = compute_error(float(solution), truth, relative=True)
+            error = compute_error(float(solution), reference, relative=True)
             yield Row(
-                f"multiplier {truth:.1e}", name, float(solution), truth, error, "", False, work,
+                f"multiplier {reference:.1e}", name, float(solution), reference, error, "", False,
+                work,
                 seconds, options, version(package),
             )  # fmt: skip
 

@@ -40,7 +40,7 @@ SYSTEM = (
 START = (START_ANGLE, 0.0)
 
 
-def truth(events: int) -> np.ndarray:
+def reference(events: int) -> np.ndarray:
     """Times of touching and leaving the pin."""
     with mpmath.workdps(40):
         half = lambda high, angle: mpmath.sin(mpmath.mpf(angle) / 2) / mpmath.sin(high / 2)
@@ -63,19 +63,19 @@ def truth(events: int) -> np.ndarray:
 
 
 def rows() -> Iterator[Row]:
-    times = truth(EVENTS)
+    times = reference(EVENTS)
     for method in METHODS:
         walk_result = method(SYSTEM, START, EVENTS, 10.0)
         for n in (1, 2, EVENTS):
-            truth_n = float(times[n - 1])
+            reference_n = float(times[n - 1])
             yield make_row(
-                walk_result, f"time of event {n}", last_time(walk_result, n), truth_n, event=n
+                walk_result, f"time of event {n}", last_time(walk_result, n), reference_n, event=n
             )
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    times = truth(EVENTS)
+    times = reference(EVENTS)
     for method, marker in zip(METHODS, "o^sD", strict=True):
         walk_result = method(SYSTEM, START, EVENTS, 10.0)
         n = len(walk_result.times)

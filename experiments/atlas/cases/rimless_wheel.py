@@ -52,8 +52,8 @@ def rows() -> Iterator[Row]:
         yield make_row(gait.simulation, "rate after impact", float(gait.x[0]), RATE)
         yield make_row(gait.simulation, "period", gait.duration, period())
         yield make_row(gait.simulation, "multiplier", float(gait.jacobian[0, 0]), RATE_RATIO**2)
-    truths = {"rate after impact": RATE, "period": period(), "multiplier": RATE_RATIO**2}
-    yield from make_rows("drake", "rimless_wheel", truths)
+    references = {"rate after impact": RATE, "period": period(), "multiplier": RATE_RATIO**2}
+    yield from make_rows("drake", "rimless_wheel", references)
 
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:

@@ -3,8 +3,8 @@
 theta'' = sin(theta - slope); phi'' = theta'' + theta'^2 sin phi - cos(theta - slope) sin phi. The
 foot's height passes zero at mid-stance, where the model ignores it, and at heelstrike, where theta
 changes its sign and rates follow from impulse laws. Published: both gaits at 0.009 to 15 digits
-(Garcia, Chatterjee, Ruina, Coleman 1998; eigenvalues again in Bhounsule 2014). The truth is found
-in 40 digits by many_digits.py: of the published gait 13 digits hold, of its eigenvalues 6.
+(Garcia, Chatterjee, Ruina, Coleman 1998; eigenvalues again in Bhounsule 2014). `many_digits.py`
+computes the reference in 40 digits: 13 digits of the published gait and 6 of its eigenvalues hold.
 """
 
 import math
@@ -61,10 +61,13 @@ EXACT_GAIT = ExactGait(
 
 
 def rows() -> Iterator[Row]:
-    truth = EXACT_GAIT.multipliers[0]
+    reference = EXACT_GAIT.multipliers[0]
     for gait in gaits(WALKER):
         walk_result, first = gait.simulation, gait.multipliers[0]
-        parts = (("real", first.real, truth.real), ("imaginary", abs(first.imag), truth.imag))
+        parts = (
+            ("real", first.real, reference.real),
+            ("imaginary", abs(first.imag), reference.imag),
+        )
         for name, solution, own_values, result in zip(
             ("stance angle", "its rate"), gait.x, EXACT_GAIT.x, LONG_PERIOD_GAIT, strict=True
         ):

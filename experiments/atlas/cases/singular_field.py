@@ -29,11 +29,11 @@ QUESTIONS = (("pole", root(1e-4), 1.0 - 1e-8), ("empty tank", tank(1e-4), 1.0 - 
 
 
 def rows() -> Iterator[Row]:
-    for name, system, truth in QUESTIONS:
+    for name, system, reference in QUESTIONS:
         for method in METHODS:
             walk_result = method(system, (1.0,), 1, 1.5)
             yield make_row(
-                walk_result, f"event before the {name}", last_time(walk_result, 1), truth
+                walk_result, f"event before the {name}", last_time(walk_result, 1), reference
             )
 
 

@@ -4,8 +4,8 @@ Flores, Leine and Glocker's mechanism: the crank starts along the guide with 150
 -75, the slider parallel to its guide with 1 mm to either face. Both upper corners hit at the same
 instant; friction makes their impulses differ, and the slider does not turn. Newton's law with
 restitution 0.4 makes infinitely many such impacts; then both corners slide, let go together, and
-both lower ones hit. Truth: experiments/atlas/absolute.py, other coordinates and 40 digits. Siconos'
-example stores steps of 0.1 ms: both meet above in the 28th and below in the 259th.
+both lower ones hit. Reference: experiments/atlas/absolute.py, other coordinates and 40 digits.
+Siconos' example stores steps of 0.1 ms: both meet above in the 28th and below in the 259th.
 """
 
 import json
@@ -224,7 +224,7 @@ CLOSED_GAP_MODE = (
     ),
 )
 BOUNCES, LIMIT = 100, 0.05
-TRUTH = {
+REFERENCE = {
     "first impact": 0.002692502752021212140189,
     "crank's rate after it": 108.724580001767385642,
     "impulse behind": 0.0557403230737523403097,
@@ -255,8 +255,8 @@ def first_impulses() -> Iterator[Row]:
     says = "" if result.status == LCPStatus.UNIQUE_SOLUTION else LCPStatus(int(result.status)).name
     for name, solution in zip(("impulse behind", "impulse ahead"), result.force, strict=True):
         yield Row(
-            name, "ours", float(solution), TRUTH[name], compute_error(float(solution),
-            TRUTH[name]), says,
+            name, "ours", float(solution), REFERENCE[name], compute_error(float(solution),
+            REFERENCE[name]), says,
             bool(says), len(result.is_solution), seconds, "complementary", version("vrw-jax"),
         )  # fmt: skip
 
@@ -271,8 +271,10 @@ def siconos() -> Iterator[Row]:
         )
     }  # fmt: skip
     numbers |= {"BEGINS": RATES[0], "ROD_BEGINS": RATES[1], "RESTITUTION": RESTITUTION_COEFFICIENT}
-    truths = {name: truth for name, truth in TRUTH.items() if name != "crank's rate after it"}
-    yield from make_rows("siconos", "slider_crank", truths, "--crank", json.dumps(numbers))
+    references = {
+        name: reference for name, reference in REFERENCE.items() if name != "crank's rate after it"
+    }
+    yield from make_rows("siconos", "slider_crank", references, "--crank", json.dumps(numbers))
 
 
 def rows() -> Iterator[Row]:
@@ -280,15 +282,15 @@ def rows() -> Iterator[Row]:
         walk_result = method(SIMULTANEOUS_IMPACTS, make_start_state(), BOUNCES, LIMIT)
         early = walk_result._replace(says="", admits=False)
         for name, event in (("first impact", 1), ("second impact", 2)):
-            yield make_row(early, name, last_time(walk_result, event), TRUTH[name], event=event)
+            yield make_row(early, name, last_time(walk_result, event), REFERENCE[name], event=event)
         once = method(SIMULTANEOUS_IMPACTS, make_start_state(), 1, LIMIT)
         name = "crank's rate after it"
-        yield make_row(once, name, float(once.end[3]), TRUTH[name])
+        yield make_row(once, name, float(once.end[3]), REFERENCE[name])
         end = float(walk_result.times[-1]) if len(walk_result.times) else math.nan
-        yield make_row(walk_result, "end of the bounces", end, TRUTH["end of the bounces"])
+        yield make_row(walk_result, "end of the bounces", end, REFERENCE["end of the bounces"])
         left_part = method(CLOSED_GAP_MODE, make_impact(0.0)(walk_result.end, math), 2, LIMIT)
         for event, name in enumerate(("letting go", "touch of the other face"), 1):
-            yield make_row(left_part, name, end + last_time(left_part, event), TRUTH[name])
+            yield make_row(left_part, name, end + last_time(left_part, event), REFERENCE[name])
             if method is run_library and name in SICONOS_EVENT_TIMES:
                 solution = end + last_time(left_part, event)
                 yield make_row(
@@ -299,12 +301,12 @@ def rows() -> Iterator[Row]:
                     digits=3,
                 )
         separated_values = method(SUCCESSIVE_IMPACTS, make_start_state(), 20, LIMIT)
-        later_value = [t for t in separated_values.times if t > TRUTH["first impact"] + 1e-6]
+        later_value = [t for t in separated_values.times if t > REFERENCE["first impact"] + 1e-6]
         separated_values = separated_values._replace(
             method=f"{separated_values.method}, corner by corner"
         )
         second = float(later_value[0]) if later_value else math.nan
-        yield make_row(separated_values, "second impact", second, TRUTH["second impact"])
+        yield make_row(separated_values, "second impact", second, REFERENCE["second impact"])
         if method is run_library:
             name = "first impact"
             yield make_row(

@@ -43,7 +43,7 @@ def part(index: int) -> Part:
 SYSTEM = (part(0), part(1))
 
 
-def truth() -> np.ndarray:
+def reference() -> np.ndarray:
     """Switching times."""
     with mpmath.workdps(40):
         fast, slow = mpmath.mpf(FAST_RATE), mpmath.mpf(SLOW_RATE)
@@ -78,7 +78,7 @@ def walks() -> Iterator[MethodRun]:
 
 
 def rows() -> Iterator[Row]:
-    times = truth()
+    times = reference()
     for walk_result in walks():
         for n in (1, EVENTS):
             solution = last_time(walk_result, n)
@@ -89,7 +89,7 @@ def rows() -> Iterator[Row]:
 
 def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes = figure.subplots()
-    times, begin, states = truth(), 0.0, START[1]
+    times, begin, states = reference(), 0.0, START[1]
     for (c2, c4, _), end in zip(itertools.cycle(LEVELS), times, strict=False):
         t = np.linspace(begin, end, 100)
         y2 = c4 + (states - c4) * np.exp(-SLOW_RATE * (t - begin))

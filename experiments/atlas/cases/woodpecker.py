@@ -7,7 +7,7 @@ breaks loose, lets go, hits above and leaves at once, the beak hits, the sleeve 
 slides up, lets go, hits below and leaves at once, hits below and slides. Where it leaves at once,
 a mode begins on its own guard with rate zero. An impact slides in one direction as Moreau's law
 says; time stepping by that law, written apart and not kept here, gave the same order of events.
-The truth beyond the published digits is found in 40 digits by many_digits.py.
+The reference beyond the published digits is found in 40 digits by many_digits.py.
 """
 
 from collections.abc import Iterator

@@ -5,7 +5,7 @@ n - 2 locked legs. Their positions are written down in the coordinates q = (x, z
 of Section 3.2; everything else (mass matrix, h, the contact Jacobian of eq. (11), its rate) is
 obtained by differentiation, so that no formula of the paper, misprinted or not, enters.
 
-Run ``python tests/oracle/derive_five_coordinates.py`` to rewrite
+Run ``python tests/reference_code/derive_five_coordinates.py`` to rewrite
 ``five_coordinates_equations.py`` beside this file; ``--check`` only says whether it is current.
 """
 

@@ -1,4 +1,7 @@
-"""Reference values of tests/oracle/truth.json as arrays; `oracle.make_truth` generates the file."""
+"""Arrays of the values in `tests/reference_code/reference_values.json`.
+
+`reference_code.make_reference_values` generates that file.
+"""
 
 import json
 from pathlib import Path
@@ -10,7 +13,7 @@ import numpy as np
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 REFERENCE_CASES: list[dict[str, Any]] = json.loads(
-    (Path(__file__).parents[1] / "oracle" / "truth.json").read_text()
+    (Path(__file__).parents[1] / "reference_code" / "reference_values.json").read_text()
 )["cases"]
 
 

@@ -1,12 +1,12 @@
 """Compute references of 256 steps and 256 limit cycles to 20 digits.
 
-    python -m experiments.work_precision.truth [--at-most 256]
+    python -m experiments.work_precision.reference_values [--at-most 256]
 
 Wheels and starts are those of `engine_benchmark`. For each start there is one step, and for each
 wheel the limit cycle, its monodromy matrix and its derivatives with respect to four parameters.
-They come from `HubForm` of `tests/oracle` with 30 digits. Derivatives are central differences with
-relative steps of 1e-10. `MultiplierForm`, which shares no equation with it, computes every 16th
-lane again. The file stores finished lanes, and a stopped run continues.
+`HubForm` of `tests/reference_code` computes them with 30 digits. Derivatives are central
+differences with relative steps of 1e-10. `MultiplierForm`, which shares no equation with it,
+computes every 16th lane again. The file stores finished lanes, and a stopped run continues.
 """
 
 from pathlib import Path
@@ -21,12 +21,12 @@ from experiments.shared.command import make_parser, parse_and_start_jax, require
 from experiments.shared.wheels import PARAMETER_BOX, draw_wheels_near_gaits, make_wheels
 
 require_extra("heyoka")
-from tests.oracle import multiprecision  # noqa: E402  the oracle needs heyoka
-from tests.oracle.differences import solve_two, subtract_identity  # noqa: E402
-from tests.oracle.hub_form import HubForm  # noqa: E402
-from tests.oracle.multiplier_form import MultiplierForm  # noqa: E402
+from tests.reference_code import multiprecision  # noqa: E402  the reference needs heyoka
+from tests.reference_code.differences import solve_two, subtract_identity  # noqa: E402
+from tests.reference_code.hub_form import HubForm  # noqa: E402
+from tests.reference_code.multiplier_form import MultiplierForm  # noqa: E402
 
-TARGET = Path(__file__).with_name("truth.npz")
+TARGET = Path(__file__).with_name("reference_values.npz")
 LANES, CHECKED_EVERY = 256, 16
 BITS, DIGITS = 100, 29
 SIZE = mp.mpf("1e-10")
@@ -148,7 +148,7 @@ def one_lane(models, row, start, guess_step, guess_cycle, check):
 
 
 def load() -> dict[str, np.ndarray]:
-    """The truth by name; see SHAPES."""
+    """The reference by name; see SHAPES."""
     with np.load(TARGET) as file:
         return dict(file)
 

@@ -1,4 +1,4 @@
-"""Make ``truth.json``: steps, limit cycles and their derivatives to 22 digits and more.
+"""Make ``reference.json``: steps, limit cycles and their derivatives to 22 digits and more.
 
 Values and derivatives come from ``HubForm``; derivatives are central differences at
 ``DIGITS`` digits with relative steps of 1e-14, second ones included, so that their truncation is
@@ -8,8 +8,8 @@ starts and parameters move at once (of the step's section state and durations, a
 durations and spectral radius), with differences of another size. The largest disagreements are
 stored with each case; the script refuses to write a case in which fewer than 22 digits agree.
 
-Run ``python -m oracle.make_truth`` in ``tests/`` (some 20 minutes on one core). ``--only NAME``
-recomputes single cases and keeps the others.
+Run ``python -m reference_code.make_reference_values`` in ``tests/`` (some 20 minutes on one core).
+``--only NAME`` recomputes single cases and keeps the others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from .multiprecision import (
     step_length,
 )
 
-TARGET_PATH = Path(__file__).with_name("truth.json")
+TARGET_PATH = Path(__file__).with_name("reference_values.json")
 STORED_DIGITS = 27  # significant digits written
 AGREEMENT_TOLERANCE = mp.mpf("1e-22")
 STENCIL_STEP = mp.mpf("1e-14")
@@ -85,7 +85,7 @@ CASES: dict[str, tuple[str, ...]] = {
 
 
 def make_wheel(name: str) -> dict[str, float]:
-    """Parameters of a case as doubles; their shortest decimals are the exact truth's input."""
+    """Parameters of a case as doubles; their shortest decimals are the exact reference's input."""
     values = dict(zip(VARIED_PARAMETERS, map(float, CASES[name]), strict=True))
     return {**double.TABLE_1, **values}
 
@@ -144,7 +144,7 @@ def evaluate_around(model: Formulation, about: Sequence[float], n_legs: Number) 
 def step_case(
     models: tuple[Formulation, Formulation], params: Params, x: list[str]
 ) -> tuple[dict[str, Any], dict[str, Number]]:
-    """Truth of one step from a start, and the disagreements of the second formulation."""
+    """Reference of one step from a start, and the disagreements of the second formulation."""
     hub, five = models
     p = parameters(params)
     start = [mp.mpf(v) for v in x]
@@ -164,7 +164,7 @@ def step_case(
     sizes = [STENCIL_STEP] * 3 + [STENCIL_STEP * v for v in p[:9]]
     stencil = Stencil(flat(hub), point, sizes)
     gradient = [stencil.first(i) for i in range(12)]
-    truth = step(hub, start, p, about)
+    reference = step(hub, start, p, about)
     other = step(five, start, p, about)
     move = [*START_DIRECTION, *(w * v for w, v in zip(DIRECTION, p[:9], strict=True))]
     ends = [
@@ -175,7 +175,7 @@ def step_case(
     expected = [mp.fsum(gradient[i][k] * move[i] for i in range(12)) for k in range(6)]
     names = ("section_state", "post_impact", "durations", "indicators")
     disagreements = {
-        "step_values": max(compute_gap(getattr(other, n), getattr(truth, n)) for n in names),
+        "step_values": max(compute_gap(getattr(other, n), getattr(reference, n)) for n in names),
         "step_derivatives": max(
             abs(a - b) / max(abs(gradient[i][k] * move[i]) for i in range(12))
             for k, (a, b) in enumerate(zip(slope, expected, strict=True))
@@ -184,11 +184,11 @@ def step_case(
     rows = [[gradient[i][k] for i in range(12)] for k in range(6)]
     return {
         "start": x,
-        "section_state": truth.section_state,
-        "post_impact": truth.post_impact,
-        "durations": truth.durations,
-        "step_length": truth.step_length,
-        **indicator_names(truth.indicators),
+        "section_state": reference.section_state,
+        "post_impact": reference.post_impact,
+        "durations": reference.durations,
+        "step_length": reference.step_length,
+        **indicator_names(reference.indicators),
         "d_section_state_d_start": [row[:3] for row in rows[:3]],
         "d_section_state_d_params": [row[3:] for row in rows[:3]],
         "d_durations_d_start": [row[:3] for row in rows[3:]],
@@ -204,7 +204,7 @@ def indicator_names(values: Vector) -> dict[str, Number]:
 def cycle_case(
     models: tuple[Formulation, Formulation], params: Params, guess: np.ndarray, about: Any
 ) -> tuple[dict[str, Any], dict[str, Number]]:
-    """Truth of the limit cycle, and the disagreements of the second formulation."""
+    """Reference of the limit cycle, and the disagreements of the second formulation."""
     hub, five = models
     p = parameters(params)
     about = [float(d) for d in about]
@@ -403,7 +403,7 @@ def provenance(cases: Sequence[Mapping[str, Any]], seconds: float) -> dict[str, 
     keys = cases[0]["disagreement"]
     worst = {key: max((c["disagreement"][key] for c in cases), key=mp.mpf) for key in keys}
     return {
-        "generator": "tests/oracle/make_truth.py",
+        "generator": "tests/reference_code/make_reference_values.py",
         "units": "SI: m, s, rad, N, N s",
         "parameter_order": list(NAMES),
         "numbers": f"{STORED_DIGITS} significant digits; parameters and starts are exact decimals",
