@@ -7,11 +7,7 @@ from vrw_jax.cycles import (
     phase_sequence,
     unilateral_finder,
 )
-from vrw_jax.cycles.attracting_gaits import (
-    compute_walk_starts,
-    find_attracting_gaits,
-    find_slow_gaits,
-)
+from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slow_gaits
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
@@ -46,6 +42,7 @@ from vrw_jax.cycles.gait_search import (
     parse_gait_choice,
     retry_from_walks,
 )
+from vrw_jax.cycles.gait_walks import compute_walk_starts
 from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_to_mesh
 from vrw_jax.cycles.margin_defaults import default_margins, gait_takeoff_acceleration
 from vrw_jax.cycles.options import CycleOptions

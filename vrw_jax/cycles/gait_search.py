@@ -8,7 +8,7 @@ fallbacks depend on concrete values, so under a `jit` or `vmap` of the caller on
 
 import functools
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args, overload
+from typing import Any, Literal, get_args, overload
 
 import equinox as eqx
 import jax
@@ -17,18 +17,18 @@ import numpy as np
 from jax import lax
 
 from vrw_jax.batches import SolverIndex, select_solver, step_batch
-from vrw_jax.cycles.attracting_gaits import (
-    ATTRACTING_GAIT_OPTIONS,
-    compute_fallback_starts,
-    compute_walk_starts,
-    find_attracting_gaits,
-    find_slowest_indices,
-    stack_section_units,
-)
+from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_indices
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
 from vrw_jax.cycles.finder import AbstractGaitFinder
 from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.gait_walks import (
+    GAIT_WALK_OPTIONS,
+    compute_fallback_starts,
+    compute_walk_starts,
+    measure_period_defect,
+    walk_to_gaits,
+)
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
@@ -57,9 +57,7 @@ RETRY_OUTCOMES = (
 
 @dataclass(frozen=True)
 class FallbackOptions:
-    """Options of the fallbacks of the search for gaits of the paper's model: walks and finer
-    meshes.
-    """
+    """Options of finer meshes, which are fallbacks of the search for gaits of the paper's model."""
 
     refine_above: float = 1e-7
     """Estimate of the mesh error above which a finer mesh is used.
@@ -68,10 +66,6 @@ class FallbackOptions:
     """
     max_refinements: int = 3
     """Largest number of times that the number of mesh intervals is doubled."""
-    n_walk_steps: int = 80
-    """Number of steps of a walk toward a gait."""
-    max_walk_defect: float = ATTRACTING_GAIT_OPTIONS.start_defect
-    """Largest period defect of a walk from which a search starts, rad, rad/s, m/s."""
 
 
 FALLBACK_OPTIONS = FallbackOptions()
@@ -141,7 +135,7 @@ def limit_cycle(
     For any other model, the fixed point of its return map is computed, with the `StepOptions` of
     its step. The result is a `ReturnMapCycle` with the errors of the step. With unilateral contact
     several gaits may attract. Without a `guess`, walks from a stated set of starts distinguish them
-    (`cycles.attracting_gaits`). `which` selects the "slowest", the "fastest" or an index in their
+    (`cycles.gait_walks`). `which` selects the "slowest", the "fastest" or an index in their
     list, slowest first. `limit_cycles` returns all. Model "auto" selects the lowest model whose
     margins the gait meets on its ground. A `LimitCycle` then belongs to the paper's model, a
     `ReturnMapCycle` to unilateral contact.
@@ -377,81 +371,44 @@ def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
     return jax.tree.map(replace_leaf_rows, tree, values)
 
 
-def _walk_and_measure_defect(
-    finder: CollocationFinder, params: WheelParams, start_states: np.ndarray, n_steps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states after walks of `n_steps`, and the defect of one more period of each.
-
-    The defect is infinite if a walk ended early.
-    """
-    walk_result = step_batch(params, start_states, n_steps, model=finder.model)
-    states = np.array(walk_result.section_state)
-    is_walking = np.asarray(walk_result.outcome) == Outcome.STEPPED
-    period_defect = np.full(len(states), np.inf)
-    if is_walking.any():
-        period_defect[is_walking] = _measure_period_defect(
-            finder, _take_rows_on_device(params, is_walking), states[is_walking]
-        )
-    return states, period_defect
-
-
-def _measure_period_defect(
-    finder: CollocationFinder, params: WheelParams, states: np.ndarray
-) -> np.ndarray:
-    """Return the largest change of each state over one period, infinite if a step fails.
-
-    Changes are relative to the wheel's units of angle, angular velocity and velocity.
-    """
-    period = step_batch(params, states, finder.period_n, model=finder.model)
-    units = stack_section_units(finder.model, _stack_known_parameters(params).T, params.n_legs)
-    distance = np.abs((np.asarray(period.section_state) - states) / units).max(-1)
-    return np.where(np.asarray(period.outcome) == Outcome.STEPPED, distance, np.inf)
-
-
-class _WalkResults(NamedTuple):
-    """Result of walks toward the gaits of a batch of wheels."""
-
-    is_usable: np.ndarray  # whether a walk continues, and repeats to `max_walk_defect`
-    # (wheels, 3): section state of the walk with the smallest period defect
-    section_states: np.ndarray
-
-
 def _walk_from_all_starts(
     finder: CollocationFinder,
     params: WheelParams,
     needs_walk: np.ndarray,
     guess_states: np.ndarray | None,
-    options: FallbackOptions,
-) -> _WalkResults:
-    """Return the walks with the smallest period defects, from all starts of the wheels that need a
-    walk.
+) -> np.ndarray:
+    """Return the ends of the walks with the smallest period defects, from all starts of the wheels
+    that need a walk.
 
-    A guess that nearly repeats replaces the walks of its wheel. Wheels too stiff for explicit
-    solvers do not walk, because the walks of one such wheel would take minutes with an implicit
-    solver.
+    The ends are section states, (wheels, 3), NaN if no walk of the wheel nearly repeats. A guess
+    that nearly repeats replaces the walks of its wheel. Wheels too stiff for explicit solvers do
+    not walk, because the walks of one such wheel would take minutes with an implicit solver.
     """
-    solver_index = select_solver(_stack_known_parameters(params), StepOptions())
-    needs_walk = needs_walk & (solver_index != SolverIndex.IMPLICIT)
-    n_wheels = len(needs_walk)
-    smallest_defect, section_states = np.full(n_wheels, np.inf), np.zeros((n_wheels, 3))
-    if guess_states is not None and needs_walk.any():
-        smallest_defect[needs_walk] = _measure_period_defect(
-            finder, _take_rows_on_device(params, needs_walk), guess_states[needs_walk]
+    parameter_rows = _stack_known_parameters(params)
+    is_explicit = select_solver(parameter_rows, StepOptions()) != SolverIndex.IMPLICIT
+    wheel_indices = np.flatnonzero(needs_walk & is_explicit)
+    values, end_states = parameter_rows.T, np.full((len(needs_walk), 3), np.nan)
+    smallest_defect = np.full(len(needs_walk), GAIT_WALK_OPTIONS.start_defect)
+    if guess_states is not None:
+        states = guess_states[wheel_indices]
+        is_usable = (
+            measure_period_defect(finder, values[wheel_indices], states)
+            < GAIT_WALK_OPTIONS.start_defect
         )
-        section_states = guess_states.copy()
-    wheel_indices = np.flatnonzero(needs_walk & (smallest_defect >= options.max_walk_defect))
+        end_states[wheel_indices[is_usable]] = states[is_usable]
+        wheel_indices = wheel_indices[~is_usable]
     for compute_starts in (compute_walk_starts, compute_fallback_starts):
-        selected_params = _take_rows_on_device(params, wheel_indices)
-        for start in compute_starts(selected_params) if len(wheel_indices) else ():
-            states, period_defect = _walk_and_measure_defect(
-                finder, selected_params, start, options.n_walk_steps
-            )
-            is_better = period_defect < smallest_defect[wheel_indices]
-            better_indices = wheel_indices[is_better]
-            smallest_defect[better_indices] = period_defect[is_better]
-            section_states[better_indices] = states[is_better]
-        wheel_indices = np.flatnonzero(needs_walk & (smallest_defect >= options.max_walk_defect))
-    return _WalkResults(smallest_defect < options.max_walk_defect, section_states)
+        if not len(wheel_indices):
+            break
+        walk_ends = walk_to_gaits(finder, values[wheel_indices], compute_starts)
+        for wheel, state, period_defect in zip(
+            wheel_indices[walk_ends.wheel_index], *walk_ends[1:], strict=True
+        ):
+            if period_defect < smallest_defect[wheel]:
+                smallest_defect[wheel], end_states[wheel] = period_defect, state
+        is_unsettled = smallest_defect[wheel_indices] >= GAIT_WALK_OPTIONS.settled_defect
+        wheel_indices = wheel_indices[is_unsettled]
+    return end_states
 
 
 def _initial_guesses(
@@ -459,7 +416,7 @@ def _initial_guesses(
     params: WheelParams,
     collocation_state: CollocationState,
     has_state: np.ndarray,
-    walk_results: _WalkResults,
+    walk_end_states: np.ndarray,
 ) -> CollocationState:
     """Return the starts of searches: the known states, else states from walks, else predictions
     of the surface.
@@ -469,7 +426,7 @@ def _initial_guesses(
         batch_sizes.GAIT_BATCH_SIZES,
         params,
     )
-    walk_indices = np.flatnonzero(walk_results.is_usable & ~has_state)
+    walk_indices = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_state)
     if len(walk_indices):
         guess_from_state = jax.vmap(finder.guess_from_state)
         guesses = _replace_rows(
@@ -479,7 +436,7 @@ def _initial_guesses(
                 guess_from_state,
                 batch_sizes.GAIT_BATCH_SIZES,
                 _take_rows_on_device(params, walk_indices),
-                walk_results.section_states[walk_indices],
+                walk_end_states[walk_indices],
             ),
         )
     return _replace_rows(guesses, has_state, _take_rows_on_device(collocation_state, has_state))
@@ -506,7 +463,7 @@ def _fallback_starts(
     is_unresolved = is_missing | has_large_mesh_error
     if not is_unresolved.any():
         return None
-    walk_results = _walk_from_all_starts(finder, params, is_missing, guess_states, options)
+    walk_end_states = _walk_from_all_starts(finder, params, is_missing, guess_states)
     # The best start of each wheel so far was found by a search, on the mesh of `finder`.
     collocation_state, has_state = cycle.collocation_state, has_large_mesh_error.copy()
     is_coarse = outcome == Outcome.MESH_TOO_COARSE
@@ -522,7 +479,7 @@ def _fallback_starts(
             )
         # The search without walks has used this mesh already. One finer mesh is always tried.
         is_promising = (
-            walk_results.is_usable
+            np.isfinite(walk_end_states[:, 0])
             | has_state
             | (is_coarse & (refinement_index > 0))
             | (refinement_index == 1)
@@ -531,13 +488,12 @@ def _fallback_starts(
         if not len(wheel_indices):
             continue
         subset_params = _take_rows_on_device(params, wheel_indices)
-        subset_walks = _WalkResults(*(walk_array[wheel_indices] for walk_array in walk_results))
         guesses = _initial_guesses(
             finder,
             subset_params,
             _take_rows_on_device(collocation_state, wheel_indices),
             has_state[wheel_indices],
-            subset_walks,
+            walk_end_states[wheel_indices],
         )
         retried_cycle = map_in_batches(
             finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, guesses

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from vrw_jax.contact import UnilateralWheel, step_batch_with_jacobian
 from vrw_jax.continuation import FixedPointResult
-from vrw_jax.cycles.attracting_gaits import find_slow_gaits, stack_section_units
+from vrw_jax.cycles.attracting_gaits import find_slow_gaits
 from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.finder import (
     Gait,
@@ -27,6 +27,7 @@ from vrw_jax.cycles.finder import (
     measure_from_gait,
     move_derivative_axis_first,
 )
+from vrw_jax.cycles.gait_walks import stack_section_units
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import (
     AbstractReturnMapFinder,
@@ -125,10 +126,11 @@ class UnilateralFinder(AbstractReturnMapFinder):
             _make_cycle, values, states, with_parameter_derivatives=False
         )
 
-    def precompile_newton(self, values: np.ndarray, states: np.ndarray) -> None:
+    def precompile_newton(self, values: np.ndarray) -> None:
         """Compile the programs of Newton's method while another thread walks toward its start."""
+        n_section = self.model.section_size(WheelParams(n_legs=self.n_legs))
         period_map = PeriodMap(self.model, self.n_legs, self.period_n, values)
-        period_map.evaluate_period(self.step_options, states, False)
+        period_map.evaluate_period(self.step_options, np.zeros((len(values), n_section)), False)
 
     def initial_guess(self, values: Values) -> Array:
         return _remove_batch_axis(self.initial_guesses(_add_batch_axis(values)))
