@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 from website.links import find_broken_links
@@ -70,8 +71,14 @@ def translate_link(source: Path, link: str) -> str:
 
 
 def configuration() -> Path:
-    """Write the configuration, with the address of the sources if VRW_SOURCE_URL gives one."""
+    """Write the configuration of the site and return its path.
+
+    The footer of each page states the versions of the libraries that the pages describe. If
+    VRW_SOURCE_URL is set, the pages link to the sources at this address.
+    """
     text, url = (ROOT / "zensical.toml").read_text(), os.environ.get("VRW_SOURCE_URL")
+    versions = ", ".join(f"{name} {version(name)}" for name in ("vrw-jax", "jax", "diffrax"))
+    text = text.replace("[project]", f'[project]\ncopyright = "Built with {versions}."', 1)
     if url:
         text = text.replace(
             "[project]", f'[project]\nrepo_url = "{url}"\nedit_uri = "blob/HEAD/docs/"'
