@@ -32,13 +32,18 @@ SCENES = [
     *((f"lost gait, c = {c:g}", NO_SLIP, c, None) for c in (220.0, 225.0, 250.0, 280.0, 300.0)),
     ("early touchdown, c = 200", NO_SLIP, 200.0, FAST_START),
     *(
-        (f"real ground, c = {c:g}", FINITE_FRICTION, c, None)
+        (f"friction 0.7, c = {c:g}", FINITE_FRICTION, c, None)
         for c in (4.0, 50.0, 100.0, 200.0, 250.0, 300.0)
     ),
 ]
 """Label, friction, damping and start. A start of None means the paper's gait at the nearest
 damping."""
-SHOWN_SCENES = ("bouncing, c = 4", "scuffing, c = 50", "lost gait, c = 225", "real ground, c = 250")
+SHOWN_SCENES = (
+    "bouncing, c = 4",
+    "scuffing, c = 50",
+    "lost gait, c = 225",
+    "friction 0.7, c = 250",
+)
 N_STEPS, N_SAMPLES = 60, 40
 OPTIONS = {"solver": "Tsit5", "rtol": 1e-9, "atol": 1e-9}
 MODES = ("air", "rest", "down", "up")

@@ -60,7 +60,7 @@ def digest_steps() -> Iterator[tuple[str, NumberTable]]:
     ground = vrw.UnilateralWheel(friction=2.0)
     few_items = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
     yield (
-        "steps on real ground",
+        "steps with unilateral contact",
         collect_numbers(vrw.step_batch(few_items, states[:64], 3, model=ground)),
     )
 
@@ -75,7 +75,7 @@ def digest_single_wheel() -> Iterator[tuple[str, NumberTable]]:
     walk = vrw.simulate(table_1, x, n_steps=2)
     yield "trajectory", {str(name): np.asarray(walk[name]) for name in walk.data_vars}
     ground = vrw.UnilateralWheel(friction=1.5)
-    yield "walk on real ground", collect_numbers(vrw.walk(table_1, x, 5, model=ground))
+    yield "walk with unilateral contact", collect_numbers(vrw.walk(table_1, x, 5, model=ground))
 
 
 def digest_cycles() -> Iterator[tuple[str, NumberTable]]:

@@ -35,7 +35,7 @@ RUNNING = {
     "one limit cycle": lambda: vrw.limit_cycle(vrw.WheelParams()),
     "1,024 limit cycles": lambda: many_cycles(draw_parameters(1024)),
     "a gradient": lambda: gradient(vrw.WheelParams()),
-    "256 steps on real ground": lambda: vrw.step_batch(
+    "256 steps with unilateral contact": lambda: vrw.step_batch(
         make_wheels(draw_parameters(256)), np.tile(START, (256, 1)), model=vrw.UnilateralWheel()
     ),
 }

@@ -278,7 +278,9 @@ def draw() -> None:
             ms=3,
                       color=colour, label=name)  # fmt: skip
         cost.axhline(1.0, color=plots.DARK_GRAY, lw=0.6)
-        cost.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="steps on real ground")
+        cost.set(
+            xscale="log", yscale="log", xlabel="tolerance", ylabel="steps with unilateral contact"
+        )
         cost.invert_xaxis()
         cost.legend(fontsize=6, loc="lower right", bbox_to_anchor=(1.0, 0.06))
         points = read_table(MAP)

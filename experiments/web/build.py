@@ -64,7 +64,7 @@ SLIDERS = {
 RUNGS = {
     "viscoelastic": "springs",
     "rigid": "rigid legs",
-    "unilateral": "real ground",
+    "unilateral": "unilateral contact",
 }
 """What is modelled, by the rungs' names."""
 SHARED_MODULE_NAME = "shared"

@@ -140,11 +140,11 @@ GROUND_TOLD = (
     "theta_post_impact", "dtheta_post_impact", "slip",
     "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction", *STOPPER_MARGIN_MEASURES,
 )  # fmt: skip
-"""What of a step on real ground is told after its section state, by the measures' names."""
+"""Measures of a step with unilateral contact that follow its section state, by name."""
 
 
 def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, Program]:
-    """A walk on real ground from event to event, and the motion between two.
+    """A walk with unilateral contact from event to event, and the motion between two.
 
     Where it stands is a column of numbers, flags and codes among them.
     """

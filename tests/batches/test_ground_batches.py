@@ -1,4 +1,4 @@
-"""Batches on real ground: what their ends move with."""
+"""Batches with unilateral contact: derivatives of their ends."""
 
 import numpy as np
 import pytest

@@ -109,6 +109,6 @@ def test_unilateral_starts_reach_the_slow_or_the_fast_gait():
         np.testing.assert_allclose(orbit, gaits.section_state[gait], atol=1e-5)
     shares = solution.orbit_dls_fraction.values[solution.attractor.values[1:]]
     np.testing.assert_allclose(shares, gaits.dls_fraction, atol=1e-6)
-    # "auto" is real ground: its starts may lie anywhere.
+    # "auto" uses unilateral contact, whose starts may lie anywhere.
     second_result = vrw.basin(params, grid, model=vrw.LadderWheel(friction=0.7), options=OPTIONS)
     np.testing.assert_array_equal(second_result.attractor, solution.attractor)

@@ -120,7 +120,7 @@ def test_rigid_legs_move_as_in_the_library(page, held):
     result = page.evaluate("vrw.state.result")
     if not held:
         assert result["gait"] is None
-        assert "lost" in page.inner_text("#verdict")
+        assert "ended" in page.inner_text("#verdict")
         return
     x, multipliers = read_gait(page)
     cycle = vrw.limit_cycle(params, model=model)
@@ -140,7 +140,7 @@ def test_a_unilateral_gait_its_multipliers_and_motion_equal_the_librarys(page):
     """Feet slide there; multipliers are differences, right to five digits."""
     params, model = vrw.WheelParams(damping=150.0), vrw.UnilateralWheel(friction=0.5)
     page.evaluate("vrw.update({ rung: 'unilateral', damping: 150, friction: 0.5 })")
-    assert "real ground" in page.inner_text("#verdict")
+    assert "unilateral contact" in page.inner_text("#verdict")
     assert "UnilateralWheel(friction=0.5)" in page.inner_text("#python")
     assert not page.is_visible("#ground-card")
     x, multipliers = read_gait(page)
@@ -163,7 +163,7 @@ def test_a_unilateral_gait_its_multipliers_and_motion_equal_the_librarys(page):
     assert any("slid" in band["texts"][0] for band in step["bands"])
     page.wait_for_function("vrw.state.basin.cells.size > 16 && vrw.state.map.cells.size > 16")
     assert "to the gait" in page.inner_text("#basin-legend")
-    page.select_option("#map-x", "friction")  # what real ground alone has an axis for
+    page.select_option("#map-x", "friction")  # only unilateral contact has this axis
     page.wait_for_function("vrw.state.map.x === 'friction' && vrw.state.map.cells.size > 16")
     page.evaluate("vrw.update({ rung: 'viscoelastic' })")
     assert page.evaluate("vrw.state.map.x") != "friction"
@@ -174,7 +174,7 @@ def test_a_walk_that_slides_to_a_halt_is_shown_until_it_stops(page):
     page.evaluate("vrw.update({ rung: 'unilateral', friction: 0.05 })")
     result = page.evaluate("vrw.state.result")
     assert result["gait"] is None
-    assert "lost" in page.inner_text("#verdict")
+    assert "ended" in page.inner_text("#verdict")
     assert len(result["steps"][-1]["times"]) > 24
 
 
@@ -187,7 +187,7 @@ def test_insufficient_friction_is_reported(page):
         page.evaluate("mu => vrw.update({ friction: mu })", mu) or page.inner_text("#verdict")
     )
     assert f"The fore foot needs a friction of {needed}" in evaluate(1.0)
-    assert "where it is 1.2 the rear foot would slide" in evaluate(1.2)
+    assert "with 1.2, the rear foot would slide" in evaluate(1.2)
     assert page.get_attribute("#verdict", "class") == "good"
     assert "both feet would slide" in evaluate(0.3)
     assert page.get_attribute("#verdict", "class") == "warn"

@@ -16,19 +16,19 @@ const PRESETS = {
   "Table 1": {},
   "two peaks": { damping: 100, slope: 0.075, stiffness: 2500, natural_length: 1 },
   "foot scuffs": { damping: 40 },
-  "hardly stable": { damping: 242, slope: 0.25, stiffness: 955, natural_length: 1.07, hub_mass: 22.1 },
+  "nearly unstable": { damping: 242, slope: 0.25, stiffness: 955, natural_length: 1.07, hub_mass: 22.1 },
   "unstable": { damping: 228, slope: 0.288, stiffness: 642, natural_length: 1.03, hub_mass: 11.1 },
-  "touches early": { damping: 300 },
-  "leaps off": { stiffness: 1000 },
+  "early touchdown": { damping: 300 },
+  "foot lifts off": { stiffness: 1000 },
   "falls back": { slope: 0.1 },
-  "would slide": { friction: 0.3 },
+  "low friction": { friction: 0.3 },
   "rigid legs": { rung: "rigid", slope: 0.2 },
-  "real ground": { rung: "unilateral" },
+  "unilateral contact": { rung: "unilateral" },
   "on ice": { rung: "unilateral", friction: 0.2 },
 };
 const OUTCOME_COLORS = { 1: "#e69f00", 2: "#009e73", 3: "#56b4e9", 4: "#d55e00", 5: "#cc79a7", 6: "#999933", 7: "#882255",
   8: "#000000", 9: "#bbbbbb" };
-const LAST = 64, FEWER = 32, LOST_STEPS = 60; // nodes of a picture's side, and on real ground
+const LAST = 64, FEWER = 32, LOST_STEPS = 60; // nodes of a picture's side, and with unilateral contact
 
 const defaults = () => {
   const values = { friction: 1, n_legs: 8, rung: "viscoelastic" };
@@ -86,7 +86,7 @@ function walkedFrom(engine, values, start, most) {
   return { gait: null, outcome, taken: states.length - 1, steps: shown.map((step) => stepOf(engine, step)), measures };
 }
 
-// The same on real ground: from the gait of the wheel before, from that of feet that stay, from Table 1's.
+// The same with unilateral contact: from the gait of the wheel before, from that of feet that stay, from Table 1's.
 function computedOnGround(engine, values, guess) {
   const ground = new Ground(engine, columnOf(values), values.friction), springs = engine.as("viscoelastic");
   const stay = () => ground.begun(springs.gait(ground.wheel, [facts.start])?.x || facts.start);
@@ -230,23 +230,23 @@ function tellVerdict() {
     box.className = kind;
     box.innerHTML = `<b>${title}</b> <span>${text}</span>`;
   };
-  if (!allowed(values)) return say("bad", "No such wheel", "A leg's mass sits between foot and hub: a must be below L₀.");
+  if (!allowed(values)) return say("bad", "Impossible wheel", "The mass of a leg lies between foot and hub, so a must be less than L₀.");
   if (isReal(values)) return tellVerdictOnGround(say);
   if (gait) {
     const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
-    const premises = broken ? ` <a href="#margins-title">${broken} of 13 premises don't hold.</a>` : " All 13 premises hold.";
-    const both = values.rung === "rigid" ? "." : `, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it.`;
+    const premises = broken ? ` <a href="#margins-title">${broken} of 13 margins are negative.</a>` : " All 13 margins are positive.";
+    const both = values.rung === "rigid" ? "." : `, and double support lasts ${(100 * measures.dls_fraction).toFixed(1)} % of the step.`;
     const needs = frictionNeeded(result, values), slides = needs.map((need) => need > values.friction);
     const which = slides[0] ? (slides[1] ? "both feet would" : "the fore foot would") : "the rear foot would";
-    const enough = slides.some((foot) => foot) ? `where it is ${number(values.friction)} ${which} slide` : `${number(values.friction)} is enough`;
-    const ground = ` The fore foot needs a friction of ${number(needs[0])}${needs[1] ? `, the rear foot of ${number(needs[1])}` : ""}: ${enough}.`;
-    const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step${both}${ground}`;
-    if (outcome !== STEPPED) return say("bad", "Lost", facts.outcomes[outcome].meaning);
-    if (!isStable(gait)) return say("warn", "An unstable gait", `${how} It repeats itself, but a touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${premises}`);
-    if (measures.friction_fore < 0) return say("warn", "A stable gait, if the fore foot held", `${how}${premises}`);
+    const enough = slides.some((foot) => foot) ? `with ${number(values.friction)}, ${which} slide` : `${number(values.friction)} is enough`;
+    const ground = ` The fore foot requires a friction coefficient of ${number(needs[0])}${needs[1] ? ` and the rear foot one of ${number(needs[1])}` : ""}; ${enough}.`;
+    const how = `The wheel walks at ${number(measures.speed)} m/s, with ${number(measures.period)} s per step${both}${ground}`;
+    if (outcome !== STEPPED) return say("bad", "The step failed", facts.outcomes[outcome].meaning);
+    if (!isStable(gait)) return say("warn", "An unstable gait", `${how} A disturbance grows by a factor of ${radius(gait).toFixed(3)} per step.${premises}`);
+    if (measures.friction_fore < 0) return say("warn", "A stable gait, but the fore foot would slip", `${how}${premises}`);
     if (measures.clearance_sls1 < 0 || measures.clearance_sls2 < 0)
-      return say("warn", "A stable gait, but the rear foot scuffs", `${how} The model lets it pass through the ground.${premises}`);
-    return say("good", "A stable gait", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${premises}`);
+      return say("warn", "A stable gait, but the rear foot scuffs", `${how} In this model it passes through the ground.${premises}`);
+    return say("good", "A stable gait", `${how} A disturbance shrinks to ${(100 * radius(gait)).toFixed(1)} % per step.${premises}`);
   }
   tellLost(say);
 }
@@ -255,27 +255,27 @@ function tellVerdict() {
 function tellLost(say) {
   const { result } = state, { outcome } = result;
   if (result.from && outcome === STEPPED)
-    return say("good", "From there it walks on", "Seven steps are shown, again and again. Move a slider to return to the gait.");
+    return say("good", "The wheel walks from this start", "The picture repeats the last seven steps. Move a slider to return to the gait.");
   if (outcome === STEPPED)
-    return say("warn", "It walks, but never settles", `No gait of one step was found; ${result.taken} steps went on without repeating.`);
+    return say("warn", "The wheel walks without a gait of one step", `It made ${result.taken} steps that do not repeat.`);
   const steps = result.taken === 1 ? "one step" : `${result.taken} steps`;
-  say("bad", `${result.from ? "From there" : "No gait"}: lost after ${result.taken ? steps : "no whole step"}`, facts.outcomes[outcome].meaning);
+  say("bad", `${result.from ? "From this start the walk" : "No gait: the walk"} ended ${result.taken ? `after ${steps}` : "in its first step"}`, facts.outcomes[outcome].meaning);
 }
 
 function tellVerdictOnGround(say) {
   const { gait, measures } = state.result;
   if (!gait) return tellLost(say);
-  const slides = measures.slip > 1e-9 ? `, its feet slide ${number(100 * measures.slip)} cm of a step` : ", no foot slides";
-  const how = `${number(measures.speed)} m/s, ${number(measures.period)} s a step, both feet on the ground for ${(100 * measures.dls_fraction).toFixed(1)} % of it${slides}.`;
+  const slides = measures.slip > 1e-9 ? `; the feet slide ${number(100 * measures.slip)} cm per step` : "; no foot slides";
+  const how = `The wheel walks at ${number(measures.speed)} m/s, with ${number(measures.period)} s per step, and double support lasts ${(100 * measures.dls_fraction).toFixed(1)} % of the step${slides}.`;
   const pulled = facts.stoppers.some((name) => measures[name] < 0);
-  const stoppers = pulled ? ` <a href="#margins-title">A stopper pulls</a>: one that only pushes would let a leg go.` : "";
-  if (isStable(gait)) return say("good", "A stable gait on real ground", `${how} A touch shrinks to ${(100 * radius(gait)).toFixed(1)} % of it with each step.${stoppers}`);
-  say("warn", "An unstable gait on real ground", `${how} A touch grows by a factor of ${radius(gait).toFixed(3)} with each step.${stoppers}`);
+  const stoppers = pulled ? ` <a href="#margins-title">A stopper pulls</a>; a stopper that only pushes would release the leg.` : "";
+  if (isStable(gait)) return say("good", "A stable gait with unilateral contact", `${how} A disturbance shrinks to ${(100 * radius(gait)).toFixed(1)} % per step.${stoppers}`);
+  say("warn", "An unstable gait with unilateral contact", `${how} A disturbance grows by a factor of ${radius(gait).toFixed(3)} per step.${stoppers}`);
 }
 
 function tellGait() {
   const { measures, gait } = state.result;
-  $("gait-hint").textContent = gait ? "Of the step that repeats itself." : "No step repeats itself: of the last step, as far as it came.";
+  $("gait-hint").textContent = gait ? "These values belong to one step of the gait." : "There is no gait. These values belong to the last step, up to its end.";
   const rows = (isReal(state.values) ? ON_GROUND : MEASURED).map((name) => {
     const m = facts.measures[name];
     return `<tr title="${m.meaning}"><th scope="row">${m.label} <i>${set(m.symbol)}</i></th><td data-measure="${name}">${measures[name] === 0 ? "–" : `${number(measures[name])} ${unitText(m.unit)}`}</td></tr>`;
@@ -286,7 +286,7 @@ function tellGait() {
   const text = ({ re, im }) => (im ? `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i` : number(re));
   $("multipliers").innerHTML = gait
     ? `Multipliers of the gait: ${list.map(text).join(", ")}. Spectral radius ρ = <b data-measure="spectral_radius">${number(radius(gait))}</b>.`
-    : "Multipliers need a gait.";
+    : "Only a gait has multipliers.";
   $("circle").setAttribute("aria-label", $("multipliers").textContent);
 }
 
@@ -294,8 +294,8 @@ function tellMargins() {
   const { values } = state, real = isReal(values), L = values.locked_length, mass = values.hub_mass + values.n_legs * values.leg_mass;
   const scale = { N: mass * values.gravity, "N s": 0.2 * mass * Math.sqrt(values.gravity * L), m: 0.2 * L, "": 1 };
   $("margins-hint").textContent = real
-    ? "That its stoppers hold legs in the air, and pull where they must: two margins. Feet slide, lift and land as the laws of contact say."
-    : "Three indicators of double support, and thirteen margins that the model measures but does not act on: negative means that the real wheel would do otherwise.";
+    ? "The model assumes that stoppers hold the legs in the air and may pull. Two margins measure this. Feet slide, lift and land by the laws of contact."
+    : "The table shows three indicators of double support, and thirteen margins. A negative margin means that the motion violates an assumption of the model.";
   const rows = (real ? facts.stoppers : [...INDICATORS, ...Object.keys(facts.margins)]).map((name) => {
     const m = facts.measures[name], [value, leg] = INDICATORS.includes(name) ? [state.result.measures[name], ""] : leastOf(name);
     const broken = value < 0, share = 50 * Math.tanh(Math.abs(value) / scale[m.unit]);
@@ -303,7 +303,7 @@ function tellMargins() {
     if (value === 0)
       return `<tr><th scope="row">${set(m.label)}<small>${m.meaning}</small></th><td></td><td data-measure="${name}">–<small>not reached</small></td></tr>`;
     return `<tr class="${broken ? "broken" : ""}"><th scope="row">${set(m.label)}${leg}<small>${broken ? m.breaks : m.meaning}</small></th>`
-      + `<td>${bar}</td><td data-measure="${name}">${number(value)} ${unitText(m.unit)}<small>${broken ? "broken" : "holds"}</small></td></tr>`;
+      + `<td>${bar}</td><td data-measure="${name}">${number(value)} ${unitText(m.unit)}<small>${broken ? "negative" : "positive"}</small></td></tr>`;
   });
   $("margins").innerHTML = parts(rows, 2).map((some) => table("Indicators and margins of the step", some)).join("");
 }
@@ -449,19 +449,19 @@ function showMap() {
   if (map.stale || now.some((what, i) => what !== map.drawnOf?.[i])) colored();
   map.stale = false;
   map.place = drawGrid($("map"), { last, cells: map.drawn, held: map.held, x, y, dot: [values[map.x], values[map.y]] });
-  $("map-state").textContent = map.given ? "From your dataset." : map.done ? `${map.cells.size.toLocaleString("en")} gaits in ${map.seconds.toFixed(1)} s.` : "Refining …";
+  $("map-state").textContent = map.given ? "The map shows your dataset." : map.done ? `${map.cells.size.toLocaleString("en")} gaits in ${map.seconds.toFixed(1)} s.` : "Computing more points …";
   $("map").setAttribute("aria-label", `Map of ${map.label} over ${named(map.x)}, now ${values[map.x]}, and ${named(map.y)}, now ${values[map.y]}`);
 }
 
 const lostColor = (code) => (code === STEPPED ? "#9aa0a8" : OUTCOME_COLORS[code] || "#555555");
-const lostName = (code) => (code === STEPPED ? "walks, but no gait of one step" : named(facts.outcomes[code].name.toLowerCase()));
+const lostName = (code) => (code === STEPPED ? "walks without a gait of one step" : named(facts.outcomes[code].name.toLowerCase()));
 const swatch = (color, text) => `<span><i class="swatch" style="background:${color}"></i>${text}</span>`;
 
 function basinAxes() {
   const [theta, rate] = state.result.gait.x;
   const symbols = ["theta_touchdown", "dtheta_touchdown"].map((name) => facts.measures[name]);
   const label = ({ symbol, unit }) => `${symbol} [${unit}]`;
-  // On real ground no foot begins below it, nor a leg beyond its stopper.
+  // With unilateral contact no foot starts below the ground, and no leg beyond its stopper.
   const [from, to] = isReal(state.values) ? [0, Math.PI / state.values.n_legs] : [theta - 0.4, theta + 0.4];
   return [
     { from, to, label: label(symbols[0]) },
@@ -476,7 +476,7 @@ function askBasin() {
     basin.cells = new Map();
     basin.axes = null;
     canvas.hidden = true;
-    $("basin-legend").textContent = "There is no stable gait for starts to lead to.";
+    $("basin-legend").textContent = "There is no stable gait, and so no basin.";
     $("basin-state").textContent = "";
     return;
   }
@@ -501,13 +501,13 @@ function showBasin() {
   const home = [...basin.cells.values()].filter(({ code }) => code === SETTLED).length;
   basin.place = drawGrid($("basin"), { last: basin.last, cells: basin.drawn, held: basin.held, x: basin.axes[0], y: basin.axes[1], cross: basin.cross, dot: basin.gait });
   $("basin-legend").innerHTML = [...codes].sort((a, b) => a - b).map((code) =>
-    swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? (isReal(state.values) ? "walks on, not to it" : "never settles") : lostName(code))).join("");
+    swatch(code === SETTLED ? "#0072b2" : lostColor(code), code === SETTLED ? "to the gait" : code === STEPPED ? (isReal(state.values) ? "walks, not to the gait" : "walks without a gait of one step") : lostName(code))).join("");
   const share = `${((100 * home) / Math.max(1, basin.cells.size)).toFixed(0)} % of the starts lead to the gait`;
   $("basin-state").textContent = basin.done ? `${share}; ${basin.cells.size.toLocaleString("en")} starts in ${basin.seconds.toFixed(1)} s.` : `${share} so far.`;
   $("basin").setAttribute("aria-label", `Basin of the gait: ${share}`);
 }
 
-// ---- on real ground
+// ---- with unilateral contact
 
 function askGround() {
   if (isReal(state.values)) return;
@@ -522,11 +522,11 @@ function askGround() {
 function tellGround() {
   const { walk, start } = state.ground, { rung, friction } = state.values;
   const from = start === facts.start ? "the start of Table 1" : `the gait of ${rung === "rigid" ? "rigid legs" : "the springs above"}`;
-  const pace = walk && `${number(walk.speed)} m/s, ${number(walk.period)} s a step, both feet on the ground for ${(100 * walk.dls_fraction).toFixed(1)} % of it.`;
+  const pace = walk && `speed ${number(walk.speed)} m/s, period ${number(walk.period)} s, double support ${(100 * walk.dls_fraction).toFixed(1)} %.`;
   const how = !walk ? "Walking …"
-    : walk.outcome !== STEPPED ? `It is lost after ${walk.taken === 1 ? "one step" : `${walk.taken} steps`}: ${facts.outcomes[walk.outcome].meaning}`
-      : walk.gait ? `It walks: after ${walk.taken} steps each repeats the one before. ${pace}`
-        : `It goes on for ${walk.taken} steps that do not repeat themselves; the last: ${pace}`;
+    : walk.outcome !== STEPPED ? `The walk ended after ${walk.taken === 1 ? "one step" : `${walk.taken} steps`}: ${facts.outcomes[walk.outcome].meaning}`
+      : walk.gait ? `The wheel has a gait: after ${walk.taken} steps, each step equals the previous one; ${pace}`
+        : `The wheel made ${walk.taken} steps that do not repeat; last step: ${pace}`;
   $("ground").className = !walk || walk.gait ? "" : walk.outcome === STEPPED ? "warn" : "bad";
   $("ground").innerHTML = `From ${from}, friction ${number(friction)}. <b>${how}</b>`;
 }
@@ -672,14 +672,14 @@ function fromAddress() {
 
 function built() {
   const rows = Object.entries(facts.parameters).map(([name, p]) => [name, signOf(name), p.unit, p.meaning, p.from, p.to]);
-  rows.push(["friction", "μ", "", "coefficient of friction, of real ground and of margins", 0, 2]);
+  rows.push(["friction", "μ", "", "friction coefficient, for unilateral contact and for margins", 0, 2]);
   const step = (from, to) => 10 ** Math.floor(Math.log10((to - from) / 400));
   $("sliders").innerHTML = rows.map(([name, sign, unit, meaning, from, to]) =>
     `<div class="slider" title="${meaning}"><label for="slider-${name}">${named(name)} <i>${sign}</i></label>`
     + `<input type="number" id="number-${name}" step="any" aria-label="${named(name)}, a number, ${unit}"><span class="unit">${unitText(unit)}</span>`
     + `<input type="range" id="slider-${name}" min="${from}" max="${to}" step="${step(from, to)}" aria-describedby="about-${name}"><span id="about-${name}" class="unseen">${meaning}</span></div>`).join("")
     + `<div class="slider"><label for="number-n_legs">number of legs <i>n</i></label><select id="number-n_legs">${facts.legs.map((n) => `<option>${n}</option>`).join("")}</select></div>`
-    + `<div class="slider"><label for="number-rung">model</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">springs or rigid legs with feet that stay, or springs on real ground</span></div>`;
+    + `<div class="slider"><label for="number-rung">model</label><select id="number-rung" aria-describedby="about-rung">${Object.entries(facts.rungs).map(([name, text]) => `<option value="${name}">${text}</option>`).join("")}</select><span id="about-rung" class="unseen">springs or rigid legs with feet that never slip, or springs with unilateral contact</span></div>`;
   for (const [name] of rows) {
     const least = facts.parameters[name]?.least ?? 0, above = name === "slope" ? -1.5 : least;
     $(`slider-${name}`).addEventListener("input", (event) => update({ [name]: Number(event.target.value) }));
@@ -782,6 +782,6 @@ const ready = (async () => {
 })();
 ready.catch((error) => {
   $("verdict").className = "bad";
-  $("verdict").innerHTML = `<b>This browser can't run the page</b> <span>It needs WebAssembly with vectors (2021) and DecompressionStream (2023): ${error}</span>`;
+  $("verdict").innerHTML = `<b>This browser cannot run the page</b> <span>The page requires WebAssembly with SIMD (2021) and DecompressionStream (2023): ${error}</span>`;
 });
 window.vrw = { ready, state, update };

@@ -77,7 +77,7 @@ function onFeetThatStay(engine, columns, near, guess) {
 
 const FEW = 80; // steps of a walk that looks for one gait of many
 
-// The same on real ground, one by one.
+// The same with unilateral contact, one by one.
 function onGround(engine, columns, near, guess) {
   return columns.map((column, i) => {
     const ground = new Ground(engine, column.slice(0, -1), column[column.length - 1]);
