@@ -23,12 +23,12 @@ STEP_TOLERANCE = mpf("1e-26")
 
 
 def exact(*numbers: float) -> list:
-    """Decimals as they are written, not as floats have them."""
+    """Return decimal literals as exact numbers, without the rounding of 64-bit floats."""
     return [mpf(repr(x)) for x in numbers]
 
 
 def solve(matrix: list[Row], right: Row) -> Row:
-    """Gauss with pivots."""
+    """Solve a linear system by Gaussian elimination with pivots."""
     rows = [[*row, x] for row, x in zip(matrix, right, strict=True)]
     n = len(rows)
     for i in range(n):
@@ -76,7 +76,7 @@ class Mechanism:
         return places + rates
 
     def joints(self, y: Row) -> tuple[list[Row], Row]:
-        """How the joints' gaps change with the places; and what their curvature adds."""
+        """Return the Jacobian of the gaps of the joints, and their curvature terms."""
         rows, bends = [], []
         ends = ((None, 0), (0, 1), (1, 2))  # each joint: the end of one body, the start of the next
         lengths = (self.crank / 2, self.rod / 2, mpf(0))
@@ -98,7 +98,7 @@ class Mechanism:
         return rows, bends
 
     def corners(self, y: Row, face: int) -> tuple[Row, list[Row], list[Row], Row]:
-        """Gaps of a face's two corners, their changes, forces when sliding, and their bends."""
+        """Return gaps, rates, sliding forces and curvature terms of both corners of a face."""
         angle, rate = y[8], y[17]
         gaps, normals, pushes, bends = [], [], [], []
         for transverse_part in (-self.half, self.half):
@@ -117,7 +117,9 @@ class Mechanism:
     def solve_constraints(
         self, y: Row, face: int, bare: Row, joints: Row, corners: Row
     ) -> tuple[Row, Row]:
-        """Changes that obey the joints, and the corners of `face` (0: none), and their forces."""
+        """Return changes that satisfy the joints and the corners of `face` (0 for none), and the
+        forces.
+        """
         rows, _ = self.joints(y)
         forces = list(rows)
         wanted = list(joints)
@@ -134,7 +136,9 @@ class Mechanism:
         return [x / m for x, m in zip(total, self.mass, strict=True)], sizes[6:]
 
     def field(self, y: Row, face: int) -> tuple[Row, Row]:
-        """Rates of places and rates, and the normal forces of the face's corners."""
+        """Return the derivatives of positions and rates, and the normal forces of the corners of a
+        face.
+        """
         bends = [-bend for bend in self.joints(y)[1]]
         open_ = [-bend for bend in self.corners(y, face)[3]] if face else []
         rates, sizes = self.solve_constraints(y, face, self.weight, bends, open_)
@@ -151,7 +155,7 @@ class Mechanism:
 
 
 def extrapolate_step(field: Callable[[Row], Row], y: Row, length: mpf) -> Row:
-    """The midpoint rule with 2, 4, ... substeps, extrapolated."""
+    """Advance one step by the midpoint rule with 2, 4, ... substeps and extrapolation."""
     table: list[Row] = []
     first = field(y)
     for level in range(1, LEVELS + 1):
@@ -204,7 +208,9 @@ def integrate_until(field: Callable, value: Callable, y: Row, length: mpf) -> Ev
 
 
 def simulate_bounces(bounces: int = 60) -> dict[str, mpf]:
-    """Times of the events, s, the crank's rate and the two impulses of the first impact."""
+    """Return event times (s), the angular rate of the crank, and both impulses of the first
+    impact.
+    """
     mechanism, result = Mechanism(), {}
     flight = lambda y: mechanism.field(y, 0)[0]
     above = lambda y: mechanism.corners(y, 1)[0][0]

@@ -96,12 +96,12 @@ def borders(rows: list[Row]) -> Figure:
 
 
 def select_last_rows(rows: list[Row], name: str) -> list[Row]:
-    """The last row for each value of a column."""
+    """Return the last row for each value of a column."""
     return [selection[-1] for selection in group_rows(rows, name).values()]
 
 
 def curves(axes: Axes, rows: list[Row], by_input: str, x: str, y: str, label: str = "{}") -> None:
-    """One curve for each value of a column, each with its own colour and marker; zeros left out."""
+    """Draw one curve for each value of a column, with a color and a marker, and without zeros."""
     looks = zip(COLOURS, "os^Dv<>p", strict=True)
     for (key, selection), (colour, marker) in zip(
         group_rows(rows, by_input).items(), looks, strict=False
@@ -116,7 +116,7 @@ def curves(axes: Axes, rows: list[Row], by_input: str, x: str, y: str, label: st
 def draw_over_steps(
     rows: list[Row], key: str, label: str, shown_values: dict[str, str], height: float
 ) -> tuple[Figure, Axes]:
-    """A panel over the number of steps for each column shown; the last panel too."""
+    """Draw a panel over the number of steps for each column, and return the last panel."""
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, height))
     for axes, (y, name) in zip(
         figure.subplots(1, len(shown_values)), shown_values.items(), strict=True
@@ -168,7 +168,7 @@ def between(rows: list[Row]) -> Figure:
 
 
 def describe_outcome(outcome: str) -> str:
-    """How a step ended, in words."""
+    """Return a short description of the outcome of a step."""
     return "stepped" if outcome == "STEPPED" else OUTCOME_STYLES[Outcome[outcome]][0]
 
 
@@ -212,7 +212,7 @@ def corners(rows: list[Row]) -> str:
 
 
 def limits(rows: list[Row]) -> str:
-    """What happens towards each limit, value by value where it changes."""
+    """Write a table of the behavior near each limit, with the values at which it changes."""
     lines = []
     for limit, selection in group_rows(rows, "limit").items():
         result: list[str] = []
@@ -297,7 +297,7 @@ def scuffing(rows: list[Row]) -> Figure:
 
 
 def growth(rows: list[Row]) -> Figure:
-    """Derivatives through many steps and their error, over steps, by damping."""
+    """Draw derivatives over many steps and their errors, over the number of steps, by damping."""
     shown_by_name = {
         "by_start": "norm of derivative by the start",
         "by_damping": "derivative by $c$",
@@ -310,7 +310,7 @@ def growth(rows: list[Row]) -> Figure:
 
 
 def meeting(rows: list[Row]) -> Figure:
-    """Errors of derivatives of stability measures over the distance to where multipliers meet."""
+    """Draw errors of derivatives of stability measures over the distance between multipliers."""
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, 2, sharey=True)
     for axes, (kind, selection) in zip(grid, group_rows(rows, "multipliers").items(), strict=True):
@@ -385,7 +385,9 @@ def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
 
 
 def automatic(rows: list[Row]) -> str:
-    """The fastest method with an error below 1e-4, and the automatic choice over it."""
+    """Return the fastest method with an error below 1e-4, and the quotient of the automatic
+    choice.
+    """
     lines = []
     fast = lambda selection: min(selection, key=lambda row: float(row["us_per_gait"]))
     for axis in AXES:
@@ -406,7 +408,7 @@ def automatic(rows: list[Row]) -> str:
 
 
 def events(rows: list[Row]) -> list[Row]:
-    """Counts by kind of case, over all chunks."""
+    """Count the cases by kind over all chunks."""
     result_list = []
     for kind, selection in group_rows(rows, "kind").items():
         pairs: dict[str, int] = {}
@@ -426,7 +428,7 @@ def events(rows: list[Row]) -> list[Row]:
 
 
 def dips(rows: list[Row]) -> list[Row]:
-    """Counts by kind of case, over all chunks."""
+    """Count the local minima by kind of case over all chunks."""
     counts = ("cases", "stepped", "gave_up", "differ", "other_outcome", "other_by_tight")
     return [
         {"kind": kind} | {name: str(sum(int(row[name]) for row in selection)) for name in counts}
@@ -435,7 +437,7 @@ def dips(rows: list[Row]) -> list[Row]:
 
 
 def as_table(rows: list[Row]) -> str:
-    """All columns."""
+    """Format all columns as a table."""
     return format_markdown(
         [name.replace("_", " ") for name in rows[0]], [row.values() for row in rows]
     )

@@ -22,7 +22,9 @@ class Point(NamedTuple):
 
 
 def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -> Point:
-    """Of the map returned(x, parameters), with two parameters, from a guess near by."""
+    """Find the Chenciner point of the map returned(x, parameters) with two parameters, from a
+    guess.
+    """
     first = jax.jit(lambda x, k: (returned(x, k), jax.jacfwd(returned)(x, k)))
 
     def higher(x, k, a, b, c):
@@ -43,7 +45,7 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
         return x, matrix
 
     def form(x: np.ndarray, k: np.ndarray, *vectors: np.ndarray) -> np.ndarray:
-        """The second or third derivative along two or three complex vectors, from real ones."""
+        """Evaluate the second or third derivative along complex vectors, from real derivatives."""
         parts: list[tuple] = [()]
         for v in vectors:
             parts = [(*p, (w, u)) for p in parts for w, u in ((1.0, v.real), (1j, v.imag))]
@@ -52,7 +54,9 @@ def chenciner_point(returned: Callable, x: np.ndarray, parameters: np.ndarray) -
         return np.array([np.prod([w for w, _ in p]) for p in parts]) @ values_array
 
     def conditions(k: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The pair's modulus less 1 and the cubic coefficient's real part; state and angle."""
+        """Return |multiplier| − 1 and the real part of the cubic coefficient, with state and
+        angle.
+        """
         value_at_2, matrix = cycle(x, k)
         values, right = np.linalg.eig(matrix)
         place = np.argmax(values.imag)

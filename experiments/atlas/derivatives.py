@@ -28,13 +28,13 @@ from vrw_jax.wheel import transitions
 
 
 def make_reference_model() -> HubForm:
-    """The formulation in the hub's coordinates, at 35 digits."""
+    """Return the formulation in the coordinates of the hub, at 35 digits."""
     multiprecision.BITS, multiprecision.DIGITS, mp.mp.prec = 120, 35, 120
     return HubForm()
 
 
 def to_exact_parameters(params: vrw.WheelParams) -> Vector:
-    """All nine parameters and the number of legs."""
+    """Return all nine parameters and the number of legs as exact numbers."""
     return [mp.mpf(float(getattr(params, n))) for n in multiprecision.NAMES] + [mp.mpf(8)]
 
 
@@ -54,7 +54,9 @@ def start_with(rate: float) -> np.ndarray:
 
 
 def border(created: tuple, wheel: dict[str, float], outside_values: float) -> float:
-    """The last rate from START's towards `beyond` with all three phases, by bisection."""
+    """Return, by bisection, the last rate from START's towards `outside_values` with all three
+    phases.
+    """
     params = vrw.WheelParams(**{name: np.full(1, value) for name, value in wheel.items()})
     good, bad = START[1], outside_values
     for _ in range(60):
@@ -284,7 +286,7 @@ N_RANDOM_GAITS, RANDOM_GAIT_BOX = (
 
 
 def measure_multiplier_distances() -> Rows:
-    """How near to each other the multipliers of random gaits come."""
+    """Measure the distances between multipliers of random gaits."""
     random = np.random.default_rng(3)
     ratios, n_complex = [], 0
     for _ in range(N_RANDOM_GAITS):
@@ -309,9 +311,9 @@ FROM_MEETING = np.logspace(-1.5, -13.0, 24)
 
 
 def meeting() -> Rows:
-    """Errors of derivatives where two eigenvalues of a matrix meet, over the distance s.
+    """Measure errors of derivatives near a double eigenvalue of a matrix, over the distance s.
 
-    The matrix is that of eigenvalues DOUBLE +- sqrt(s), in a frame that hides it. The reference
+    The matrix has the eigenvalues DOUBLE +- sqrt(s) and is not diagonal. The reference
     has 35 digits, and the elements of the matrix are 64-bit numbers.
     """
     mp.mp.prec = 120

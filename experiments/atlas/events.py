@@ -46,7 +46,7 @@ KINDS = {  # ranges of wheels and starts
 
 
 def symbols() -> Symbols:
-    """The paper's symbols as heyoka's run-time parameters, in the order of `peers.pack`."""
+    """Return the paper's symbols as run-time parameters of heyoka, in the order of `peers.pack`."""
     m, a, L0, Ls, k, c, g, sin_phi, cos_phi, Mh = (hy.par[i] for i in range(10))
     return Symbols(
         m=m, a=a, L0=L0, Ls=Ls, k=k, c=c, g=g, sin_phi=sin_phi, cos_phi=cos_phi, Mh=Mh, Mt=Mh + m,
@@ -170,14 +170,14 @@ def step_by_isolated_roots(created: tuple, params: vrw.WheelParams, starts: np.n
 def draw_wheels(
     box: dict, random: np.random.Generator, count: int = CHUNK
 ) -> tuple[vrw.WheelParams, np.ndarray]:
-    """Wheels and starts."""
+    """Draw random wheels and starts."""
     draw = lambda limits: random.uniform(*limits, count)
     fields = {name: draw(limits) for name, limits in box.items() if name != "start"}
     return vrw.WheelParams(**fields), np.stack([draw(limits) for limits in box["start"]], 1)
 
 
 def compare(cases: int, done: int) -> Rows:
-    """Counts of disagreement, chunk by chunk; the first `done` chunks are left out."""
+    """Count disagreements chunk by chunk, without the first `done` chunks."""
     created = phases()
     n_chunks = cases // len(KINDS) // CHUNK
     places = [(i, kind, chunk) for chunk in range(n_chunks) for i, kind in enumerate(KINDS)]
@@ -205,10 +205,10 @@ def compare(cases: int, done: int) -> Rows:
 
 
 def compare_dips(cases: int, done: int) -> Rows:
-    """Steps at the defaults against `Options.tight()`, chunk by chunk; isolated roots decide.
+    """Compare steps at the defaults with `StepOptions.tight()`, chunk by chunk, by isolated roots.
 
-    Where a rate or a height decays to rounding, "fell back" and "still there" can't be told apart,
-    and either may give up: counted by themselves.
+    If a rate or a height decays to round-off, the outcomes "fell back" and "no touchdown" are
+    indistinguishable, and either method may fail. These cases have a separate count.
     """
     created = phases()
     n_chunks = cases // len(KINDS) // N_STARTS

@@ -50,7 +50,7 @@ def import_case(name: str) -> Case:
 
 
 def as_text(name: str, row: Row) -> dict[str, str]:
-    """A row of the table."""
+    """Format one row of the table."""
     return {
         "case": name,
         "quantity": row.quantity,
@@ -79,13 +79,13 @@ VERDICT_LABELS = {
 
 
 def anchor(title: str) -> str:
-    """Of a heading, as the page's markdown makes it."""
+    """Return the anchor of a heading, as the site forms it."""
     plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode()
     return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
 
 
 def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
-    """A line for each method of a case: its worst answer, and what it cost."""
+    """Return a line for each method of a case, with its worst result and its cost."""
     lines, severities = [], list(VERDICT_LABELS)
     for method, own_values in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
@@ -104,7 +104,7 @@ def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
 
 
 def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """What this library answers rightly where the reference is a closed form, or has all digits."""
+    """Return the results of this library for which the reference has all digits."""
     return [
         row
         for row in rows

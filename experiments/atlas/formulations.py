@@ -104,7 +104,7 @@ class ConstrainedWheel:
 
 
 def exchange(q, v):
-    """Legs change names; the hub stays where it is, so that the feet's drift is kept."""
+    """Exchange the legs without a motion of the hub, so that the drift of the feet remains."""
     new = q[2] - 2.0 * math.pi / PARAMS["n_legs"]
     length = PARAMS["locked_length"]
     x = q[0] + q[3] * math.sin(q[2]) - length * math.sin(new)
@@ -114,7 +114,7 @@ def exchange(q, v):
 
 
 def drift() -> Iterator[dict[str, object]]:
-    """How far feet leave the ground and their places, over integrator steps, three treatments."""
+    """Measure the drift of the feet over integrator steps, for three treatments of constraints."""
     for stabilised in ("none", "Baumgarte", "projection"):
         body = ConstrainedWheel(stabilised)
         q, v = reference.pre_impact(PARAMS, START)
@@ -158,10 +158,10 @@ FIT_START_SECONDS = 0.3  # s, of the 0.43 s of double support
 
 
 def penalty() -> Iterator[dict[str, object]]:
-    """One step of the wheel with a penalty ground, error and cost over the fixed step.
+    """Measure error and cost of a penalty model of the ground over the length of the solver step.
 
-    "unilateral" never pulls. "held" may pull for the time HELD, which makes it the paper's landing:
-    an impulse with both feet held.
+    The variant "unilateral" never pulls. The variant "held" may pull for the time HELD, as in the
+    landing of the paper, whose impulse keeps both feet on the ground.
     """
     for ground in ("unilateral", "held"):
         for h in (5e-4, 2e-4, 1e-4, 5e-5, 2e-5):

@@ -60,7 +60,7 @@ class Gait(NamedTuple):
 
 
 def find_by_newton(result: ReturnMap) -> Gait:
-    """This library's own."""
+    """Find the gait by this library's Newton method."""
     parts = modes(result.system)
     options = vrw.StepOptions(rtol=1e-13, atol=1e-13, max_phase_time=result.limit)
 
@@ -90,7 +90,7 @@ def find_by_newton(result: ReturnMap) -> Gait:
 
 
 def find_by_differences(method: Callable[..., MethodRun], result: ReturnMap) -> Gait:
-    """A peer's map under `fsolve`."""
+    """Find the gait by `fsolve` with the map of another library."""
 
     def walked(x: np.ndarray) -> MethodRun:
         return method(result.system, result.begin(x, math), result.events, result.limit)
@@ -125,7 +125,7 @@ def _duration(walk_result: MethodRun, result: ReturnMap) -> float:
 
 
 def gaits(result: ReturnMap) -> list[Gait]:
-    """By all methods, this library first."""
+    """Yield the gait by each method, with this library first."""
     return [
         find_by_newton(result),
         *(find_by_differences(method, result) for method in METHODS[1:]),

@@ -69,7 +69,7 @@ JAX = types.SimpleNamespace(sin=jnp.sin, cos=jnp.cos, exp=jnp.exp, sqrt=jnp.sqrt
 
 
 def modes(system: Sequence[Part]) -> tuple[Mode, ...]:
-    """The system as this library's face takes it."""
+    """Return the modes of the system for `vrw_jax.hybrid`."""
     row = lambda function: lambda y: jnp.stack([jnp.asarray(x, float) for x in function(y, JAX)])
 
     def guard(edge: GuardEdge) -> Guard:
@@ -80,7 +80,7 @@ def modes(system: Sequence[Part]) -> tuple[Mode, ...]:
 
 @functools.lru_cache
 def _our_run(system: tuple[Part, ...], events: int, options: tuple) -> tuple[Callable, Callable]:
-    """The walk, and what its event times may be off by."""
+    """Simulate with this library, and return the walk with the errors of its event times."""
     parts, chosen = modes(system), vrw.StepOptions(**dict(options))
     return (
         jax.jit(lambda y: simulate_hybrid(parts, y, events=events, options=chosen)),
@@ -131,7 +131,9 @@ def _simulate_modes(
     start: Numbers,
     events: int,
 ) -> tuple:
-    """A peer's modes one after the other, as its documents tell to restart."""
+    """Simulate the modes one after another by another library, restarted as its documentation
+    describes.
+    """
     mode, time, is_unfinished, work = 0, 0.0, 0, 0
     y, says = np.asarray(start, float), ""
     times, states, edges = [], [], []
@@ -307,7 +309,9 @@ def make_row(
     digits: int | None = None,
     event: int = 0,
 ) -> Row:
-    """What a walk says of one quantity, of the last event or another: also a bad condition."""
+    """Return the table row of one quantity at an event, with the condition number if it is
+    large.
+    """
     of_values, says = slice(event or None), walk_result.says
     stated, rounding = walk_result.stated_errors[of_values], walk_result.rounding[of_values]
     if not says and len(stated) and stated[-1] > EXACT_ERROR:

@@ -60,17 +60,17 @@ def first_order_rates(s: Symbols, y: jax.Array, ddL2: jax.Array | float = 0.0) -
 
 
 def corrected_rates(s: Symbols, y: jax.Array) -> jax.Array:
-    """The same with L2'' from the rate at which L2' itself changes: an order better in m/c."""
+    """Return rates with L2'' corrected by the change of L2', an order more accurate in m/c."""
     slow = lambda y: first_order_rates(s, y)
     rates = slow(y)
     return first_order_rates(s, y, jax.jvp(slow, (y,), (rates,))[1][2])
 
 
 def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
-    """What the fast mode of lift-off leaves behind, to first order in m/c.
+    """Return the state after the fast mode of lift-off, to first order in m/c.
 
-    The excess of L2' over its slow value dies at the rate c (M^-1)_33 and moves rates and places
-    along M^-1 e_3, like an impact.
+    The difference of L2' from its slow value decays at the rate c (M^-1)_33. It changes rates and
+    positions along M^-1 e_3, as an impact does.
     """
     M = dynamics.mass_matrix(s, state[1], state[2])
     zero = 0.0 * state[0]
@@ -219,7 +219,7 @@ SLOPE_DISTANCES = np.logspace(-1.5, -11.0, 20)  # slope less the one at which th
 def settle_walk(
     created: tuple, slope: float, start: np.ndarray
 ) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Whether the wheel walks on from a start, then its section state and durations."""
+    """Return whether the wheel walks from a start, and its last section state and durations."""
     params = vrw.WheelParams(
         damping=np.full(1, SLOW_WALK_PARAMETERS["damping"]), slope=np.full(1, slope)
     )

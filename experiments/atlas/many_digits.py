@@ -27,7 +27,7 @@ DIFFERENCE, NEWTON_TOLERANCE = mpf("1e-8"), mpf("1e-21")
 
 
 def compute_return_map(result: ReturnMap, x: Sequence[mpf], step: mpf) -> tuple[mpmath.matrix, mpf]:
-    """The map, and how long it takes."""
+    """Return the value of the map and the duration."""
     y, mode, time = list(result.begin(x, mpmath)), 0, mpf(0)
     for _ in range(result.events):
         part = result.system[mode]

@@ -33,7 +33,7 @@ def _run_peer(name: str, *arguments: str) -> dict:
 def make_rows(
     name: str, case: str, references: dict[str, float], *arguments: str, relative: bool = False
 ) -> Iterator[Row]:
-    """What `elsewhere/NAME` answers to a case's questions, beside their references."""
+    """Yield the results of `elsewhere/NAME` for the questions of a case, beside the references."""
     result = _run_peer(name, *arguments)
     answers = {a["name"]: a for a in result.get("answers", ()) if a["case"] == case}
     for question, reference in references.items():

@@ -32,13 +32,13 @@ class Row(NamedTuple):
 
     @property
     def requested_tolerance(self) -> float:
-        """The tolerance among the method's options, 0 without one."""
+        """Return the tolerance among the options of the method, or 0."""
         result = re.search(r"\d\S*e-\d+", self.options)
         return float(result[0].rstrip(",")) if result else 0.0
 
     @property
     def is_within_request(self) -> float:
-        """The error that counts as right, by one rule for all."""
+        """Return whether the error satisfies the rule that holds for all methods."""
         published = 0.0 if self.digits is None else 0.5 * 10.0**-self.digits
         return max(
             ACCEPTED_ERROR,
@@ -72,7 +72,7 @@ def compute_error(solution: float, reference: float, *, relative: bool = False) 
 
 
 def time_second_call(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What a second call gives, and its CPU seconds: compiling does not count."""
+    """Return the result of a second call and its CPU seconds, without compilation."""
     call()
     began = time.process_time()
     result = call()

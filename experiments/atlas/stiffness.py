@@ -95,7 +95,9 @@ def measure_over_rates() -> Rows:
 
 
 def run_library(wheel: dict[str, float], engine: str, solver: str) -> tuple:
-    """Lanes in a call, the call, and what it tells: values, tried steps, outcome, solver."""
+    """Return the number of lanes, values, tried steps, outcome and solver of a call of the
+    library.
+    """
     options = vrw.StepOptions(solver=solver, rtol=TOLERANCE, atol=TOLERANCE)
     lanes = 256 if engine == "diffrax" else 2048  # full blocks
     params, starts = vrw.WheelParams(**wheel), np.tile(START, (lanes, 1))

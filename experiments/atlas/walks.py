@@ -24,9 +24,9 @@ WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
 def with_damping(
     phase: DiffraxPhase, start: jax.Array, params: vrw.WheelParams, options: vrw.StepOptions
 ) -> tuple[PhaseEnd, jax.Array, Motion]:
-    """A phase of the library, the energy that its dampers take (J, eq. 29), and its last motion.
+    """Integrate a phase; return the energy lost in dampers (J, eq. 29) and the last motion too.
 
-    The integral is one more component of the state: its error counts like any other.
+    The energy is a component of the state, so the solver controls its error.
     """
     s = params.symbols()
     power = lambda y: dynamics.damping_power(s, phase.unpack_motion(y))

@@ -72,7 +72,7 @@ SHARED_MODULE_NAME = "shared"
 
 
 def link_module(objects: dict[str, bytes]) -> bytes:
-    """One module of functions by name, that imports `sin` and `cos`."""
+    """Link functions by name into one WebAssembly module that imports `sin` and `cos`."""
     linker = [shutil.which("wasm-ld")]
     if linker == [None]:
         if find_spec("ziglang") is None:
@@ -98,18 +98,20 @@ def compile_page_code(selection: dict[str, Program]) -> str:
 
 
 def pack_bytes(code: bytes) -> str:
-    """As text that may stand in a page: how many zeros follow, and base 85, where `.` is `<`."""
+    """Return bytes as text for a page: the number of appended zeros, then base 85 with `.` for
+    `<`.
+    """
     return f"{-len(code) % 4}{base64.b85encode(code, pad=True).decode().replace('<', '.')}"
 
 
 def unpack_bytes(text: str) -> bytes:
-    """The inverse."""
+    """Return the bytes of a text that `pack_bytes` returned."""
     code = base64.b85decode(text[1:].replace(".", "<"))
     return code[: len(code) - int(text[0])]
 
 
 def list_output_rows(n_legs: int) -> list[str]:
-    """Names of what `told` tells, row by row."""
+    """Return the names of the outputs of a step, one per row."""
     legs = range(3, n_legs + 1)
     margins = [
         [f"{name}[{leg}]" for leg in legs] if measure.dimension else [name]
@@ -140,7 +142,7 @@ def _field_names(result: Any) -> list[str]:
 
 
 def facts() -> dict[str, Any]:
-    """What the page is to know: names, units, sentences, defaults."""
+    """Return names, units, sentences and defaults that the page shows."""
     git = lambda *what: subprocess.run(
         ["git", *what], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.strip()
@@ -190,13 +192,13 @@ def facts() -> dict[str, Any]:
 
 
 def read_page_content(page: str, name: str) -> Any:
-    """What a built page holds under a name."""
+    """Return the JSON content of a built page under a name."""
     _, _, rest = page.partition(f'<script type="application/json" id="{name}">')
     return json.loads(rest.partition("</script>")[0])
 
 
 def write_page(code: dict[str, str]) -> str:
-    """The page with all that it needs inside."""
+    """Return the page with scripts, styles and data inside."""
     part = lambda name: (SOURCES / name).read_text(encoding="utf-8")
     page, held_values = part("page.html"), {}
     for name in ("page.css", "engine.js", "ground.js", "worker.js", "pictures.js", "page.js"):

@@ -56,7 +56,7 @@ class Program(NamedTuple):
     section: int = 3
 
     def object(self, name: str) -> bytes:
-        """As code for WebAssembly."""
+        """Return the program as object code for WebAssembly."""
         rows = len(PARAMETER_NAMES), self.section
         return simd.compile_wasm_object(self.function, self.numbers, rows, name, self.limits)
 
@@ -93,7 +93,7 @@ class _OfAnyLegs(WheelParams):
 
 
 def make_shared_programs() -> dict[str, Program]:
-    """By name: what is the same code for wheels with any number of legs."""
+    """Return by name the programs that do not depend on the number of legs."""
 
     def linearised(tolerance: Array, legs: Array, parameters: Array, x: Array) -> tuple:
         """Section state and durations; outcome and solver's steps; how the first two move with each
@@ -108,13 +108,13 @@ def make_shared_programs() -> dict[str, Program]:
 
 
 def programs(n_legs: int) -> dict[str, Program]:
-    """By name: what of a step is told, of wheels with so many legs."""
+    """Return by name the programs of a step for a number of legs."""
 
     def wheel(parameters: Array) -> WheelParams:
         return wheel_from_parameters(tuple(parameters), n_legs)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
-        """All that the step tells, in `result_of`'s order, and its motion phase by phase."""
+        """Return all outputs of the step in the order of `result_of`, and its motion by phase."""
         params, options = wheel(parameters), _options(tolerance)
         walk_result = run_batch_phases(
             params, tuple(x), options, load_explicit_tableau(SOLVER), True, records_margins=True
@@ -144,9 +144,9 @@ GROUND_TOLD = (
 
 
 def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, Program]:
-    """A walk with unilateral contact from event to event, and the motion between two.
+    """Return the programs of a walk with unilateral contact from event to event.
 
-    Where it stands is a column of numbers, flags and codes among them.
+    The state of the walk is a column of numbers, which include flags and codes.
     """
     model, tableau = UnilateralWheel(), load_explicit_tableau(SOLVER)
     size, n = full_section_size(n_legs), 3 + n_legs
@@ -165,11 +165,13 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         return jnp.concatenate([parameters, (friction + 0.0 * parameters[0])[None]])
 
     def begun(parameters: Array, x: Array) -> tuple:
-        """The section state that a state of the paper's is."""
+        """Return the section state with unilateral contact for a section state of the paper's
+        model.
+        """
         return (embed_section_state(wheel(parameters).symbols(), x),)
 
     def opened(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
-        """Where a step from there stands before its first event."""
+        """Return the state of a step before its first event."""
         return (_flat(init_lane_states(on(tolerance), columns(parameters, friction), x)[1]),)
 
     lane = jax.ShapeDtypeStruct((size, 1), float)
@@ -202,8 +204,10 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         return _flat(after), stretch, _flat((step.section_state, *result)), after.outcome
 
     def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
-        """Of a stretch, sample by sample: coordinates, normal and tangential forces of the first
-        two loaded feet, kinetic energy, that of height, that of springs."""
+        """Return samples of the motion between two events.
+
+        A sample has coordinates, the normal and tangential forces of the first two loaded feet,
+        and the energies (kinetic, of gravity, of springs)."""
         q, v = stretch[:n], stretch[n : 2 * n]
         contact = stretch[2 * n : 2 * n + n_legs].astype(jnp.int32)
         locked = stretch[2 * n + n_legs : -1] > 0.5
@@ -238,7 +242,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
 
 
 def ground_rows(n_legs: int) -> dict[str, int]:
-    """How many numbers there are: of a section state, and of where a walk stands."""
+    """Return the numbers of rows of a section state and of the state of a walk."""
     onward = _on_ground(lambda p: wheel_from_parameters(tuple(p), n_legs), n_legs)["ground_onward"]
     return {"section": full_section_size(n_legs), "lane": onward.section}
 
@@ -248,13 +252,13 @@ def _size(form: Any) -> int:
 
 
 def _flat(tree: Any) -> Array:
-    """All arrays of a tree as rows of floats."""
+    """Return all arrays of a tree as rows of floats."""
     rows = [x.astype(float).reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)]
     return jnp.concatenate(rows)
 
 
 def _rebuild_tree(rows: Array, form: Any) -> Any:
-    """The inverse, by a tree of that form."""
+    """Return the tree of the given form from the rows of `_flat`."""
     leaves, structure = jax.tree.flatten(form)
     solution, begin = [], 0
     for leaf in leaves:
@@ -266,7 +270,7 @@ def _rebuild_tree(rows: Array, form: Any) -> Any:
 
 
 def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
-    """The same of the lowest rung, in whose formulas no tolerance stands."""
+    """Return the programs of the rigid model, whose formulas have no tolerance."""
 
     def rolled(parameters: Array, x: tuple) -> tuple[tuple, tuple]:
         step = RigidWheel().compute_step_elementwise(wheel(parameters), x, jnp.ones_like(x[0]))
@@ -295,7 +299,7 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
 
 
 def _numbers_of(step: StepResult) -> Array:
-    """What a step tells, row by row."""
+    """Return the outputs of a step as rows."""
     parts = (
         step.section_state, step.post_impact, step.durations, step.step_length,
         *vars(step.indicators).values(), *(getattr(step.margins, name) for name in PAGE_MARGINS),
@@ -312,5 +316,5 @@ def _advance(
 
 
 def _options(tolerance: Array) -> StepOptions:
-    """The library's own, but for the tolerance."""
+    """Return the default step options with another tolerance."""
     return eqx.tree_at(lambda o: (o.rtol, o.atol), StepOptions(), (tolerance, tolerance))

@@ -113,8 +113,10 @@ def in_node() -> dict[str, Any]:
 
 
 def in_chromium() -> dict[str, tuple[list[float], float, float]]:
-    """By rung the wall time of an update with all that is drawn, median and 95 in 100, ms; of basin
-    and map, s."""
+    """Measure by model the wall time of an update with its drawing (median and 95th percentile,
+    ms).
+
+    The times of basin and map are in seconds."""
     found_by_name = {}
     path = shutil.which("chromium")
     switches = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync"]

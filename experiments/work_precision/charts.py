@@ -69,7 +69,7 @@ def time_of(row: Row, unit: float) -> float:
 
 
 def unit_of(rows: list[Row]) -> float:
-    """The reference's usual time, us."""
+    """Return the usual time of the reference computation, µs."""
     return float(np.median([float(row["reference_us"]) for row in rows]))
 
 
@@ -80,13 +80,15 @@ def label_of(row: Row) -> str:
 
 
 def is_default(row: Row) -> bool:
-    """Whether this is what a user gets who chooses nothing."""
+    """Return whether a user without own choices gets this setting."""
     named = (row["group"], row["family"], row["name"], row["setting"])
     return named in DEFAULTS and row["precision"] == "float64"
 
 
 def curves(rows: list[Row], quantity: str) -> dict[str, list[Row]]:
-    """Rows of many lanes that tell of a quantity, by label, loosest first."""
+    """Return rows of batches that contain a quantity, by label, with the largest tolerance
+    first.
+    """
     result: dict[str, list[Row]] = {}
     for row in rows:
         if row.get(f"{quantity}_p99") and int(row["lanes"]) > 1:
@@ -116,7 +118,7 @@ def style_of(rows: list[Row]) -> dict[str, dict]:
 
 
 def of_lanes(row: Row) -> int:
-    """Lanes that have a reference among those measured."""
+    """Return the number of measured lanes that have a reference."""
     return min(int(row["lanes"]), 256)
 
 
@@ -153,7 +155,7 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
 
 
 def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure:
-    """One panel for each quantity, with one legend for all."""
+    """Draw one panel for each quantity, with one legend for all."""
     figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.2))
     grid = figure.subplots(1, len(quantities), sharey=True)
     for quantity, axes in zip(quantities, grid, strict=True):
@@ -209,9 +211,10 @@ def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
 
 
 def best(rows: list[Row], group: str, single_result: bool, target: float) -> Row | None:
-    """The fastest row that keeps every quantity's p99 below the target, with no lane failed.
+    """Return the fastest row in which each p99 error is below the target and no lane failed.
 
-    One wheel alone is judged by the errors of many: its own might be lucky.
+    A single wheel is judged by the errors of the batch, because its error alone may be small by
+    chance.
     """
     quantities = [name for name, (of_values, _) in QUANTITIES.items() if of_values == group]
     unit = unit_of(rows)
@@ -234,13 +237,13 @@ def curve_of(row: Row) -> tuple[str, ...]:
 
 
 def format_time(us: float) -> str:
-    """Microseconds with a unit."""
+    """Return microseconds with a unit."""
     scale, unit = (1.0, "µs") if us < 1e3 else (1e-3, "ms") if us < 1e6 else (1e-6, "s")
     return f"{us * scale:.3g} {unit}"
 
 
 def table(rows: list[Row]) -> str:
-    """What to use, ours and of all."""
+    """Return a table of recommended methods, of this library and of all."""
     unit = unit_of(rows)
     ours = [row for row in rows if row["family"] not in (*SCALAR, "diffrax by hand")]
     lines = []
@@ -260,7 +263,7 @@ def table(rows: list[Row]) -> str:
 
 
 def on_the_front(rows: list[Row]) -> str:
-    """How far the defaults lie from the fastest of ours that is at least as accurate."""
+    """Return the distance of the defaults from the fastest method that is at least as accurate."""
     unit = unit_of(rows)
     lines = []
     for row in rows:
@@ -290,7 +293,7 @@ def on_the_front(rows: list[Row]) -> str:
 
 
 def floors(rows: list[Row]) -> str:
-    """The least p99 error of each quantity by number format, whatever it costs, and by what."""
+    """Return the least p99 error of each quantity by number format, and its method."""
     lines = []
     for quantity, (_, title) in QUANTITIES.items():
         cells = [title]
@@ -317,7 +320,7 @@ def floors(rows: list[Row]) -> str:
 
 
 def failures(rows: list[Row]) -> str:
-    """Every row in which lanes failed."""
+    """Return every row in which lanes failed."""
     lines = [
         (f"{r['group']}, {label_of(r)}", r["setting"], f"{r['failed']} of {of_lanes(r)}")
         for r in rows
@@ -335,13 +338,13 @@ CHARTS = {  # quantities, and which rows are shown
 
 
 def is_default_method(row: Row) -> bool:
-    """Whether this is the method that a user gets who chooses none, at any setting."""
+    """Return whether a user without own choices gets this method, at any setting."""
     named = (row["group"], row["family"], row["name"])
     return named in {one[:3] for one in DEFAULTS} and row["precision"] == "float64"
 
 
 def works(unit: float) -> dict[str, tuple[str, Callable[[Row], float]]]:
-    """What work is counted by: label of the axis, and the number of a row."""
+    """Return the label of the axis of work, and a function that reads the work of a row."""
     return {
         "time": ("CPU time per gait [µs]", lambda row: time_of(row, unit)),
         "evaluations": ("evaluations per gait", lambda row: float(row["evaluations"])),
@@ -351,7 +354,7 @@ def works(unit: float) -> dict[str, tuple[str, Callable[[Row], float]]]:
 def write_page(
     rows: list[Row], path: Path, counted: dict[str, tuple[str, Callable[[Row], float]]]
 ) -> None:
-    """All methods and quantities in one page, each to be shown or hidden."""
+    """Write all methods and quantities into one page with a switch for each."""
     curves_of = []
     for quantity, (_, title) in QUANTITIES.items():
         for label, selection in curves(rows, quantity).items():

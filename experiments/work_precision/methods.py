@@ -49,7 +49,7 @@ class Method(NamedTuple):
 
 
 def stages(solver: str) -> int:
-    """Evaluations of a tried step; 0 for an implicit solver, which does not tell."""
+    """Return the evaluations per tried step, 0 for implicit solvers, which report none."""
     tableau = load_explicit_tableau(solver)
     return 0 if tableau is None else len(tableau.nodes) - 1
 
@@ -186,7 +186,7 @@ def _compute_landing_columns(params: vrw.WheelParams, states: jax.Array) -> jax.
 
 
 def peer_steps(name: str, tolerance: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A peer's step of many lanes."""
+    """Return the batch step of another library."""
     if name == "numba":
         return lambda y, packed: peers.numba_steps(y, packed, tolerance)
     if name == "heyoka":
@@ -197,7 +197,7 @@ def peer_steps(name: str, tolerance: float) -> Callable[[np.ndarray, np.ndarray]
 
 
 def by_peer(name: str) -> Callable:
-    """One step; settings are tolerances."""
+    """Return the step of another library as a method, with tolerances as settings."""
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
         y, packed = plane_starts(rows, starts)
@@ -246,7 +246,9 @@ def by_collocation(tolerance: float = 1e-10, dtype: type = np.float64) -> Callab
 
 
 def cycle_of_map(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> tuple:
-    """Newton's method on the event-driven plane map: cycle, Jacobian, durations, solver steps."""
+    """Find the cycle by Newton's method on the event-driven map; return Jacobian, durations and
+    steps.
+    """
     params, model = make_wheels(row), vrw.ViscoelasticWheel()
     s = params.symbols()
 
@@ -320,7 +322,7 @@ def unpack_parameters(packed: np.ndarray) -> np.ndarray:
 def peer_cycle(
     name: str, tolerance: float, rows: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Callable]:
-    """Newton's method with central differences, as a user of an integrator would write it."""
+    """Find the cycle by Newton's method with central differences of another library's step."""
     y, packed = plane_starts(rows, starts)
     function = plane_map(peer_steps(name, tolerance))
     size = max(tolerance, 1e-15) ** (1.0 / 3.0) * 0.1
@@ -338,7 +340,7 @@ def peer_cycle(
 
 
 def by_peer_cycle(name: str) -> Callable:
-    """Settings are tolerances."""
+    """Return the cycle of another library as a method, with tolerances as settings."""
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
         def run() -> np.ndarray:
@@ -392,7 +394,7 @@ def by_columns(mode: str, tolerance: float = 1e-10, dtype: type = np.float64) ->
 
 
 def by_step_jacobian(solver: str) -> Callable:
-    """The step's Jacobian at the cycle and the implicit function theorem; settings: tolerances."""
+    """Return the method that applies the implicit function theorem to the Jacobian of the step."""
 
     def make(tolerance: float, rows: np.ndarray, starts: np.ndarray) -> Run:
         options = jax.tree.map(

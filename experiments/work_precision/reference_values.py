@@ -62,7 +62,7 @@ def draw_wheels() -> dict[str, np.ndarray]:
 
 
 def parameters(row):
-    """All nine parameters and the number of legs as exact numbers."""
+    """Return all nine parameters and the number of legs as exact numbers."""
     wheel = make_wheels(row)
     names = multiprecision.NAMES
     return [mp.mpf(float(getattr(wheel, name))) for name in names] + [mp.mpf(8)]
@@ -88,7 +88,7 @@ def differences(function, point, sizes):
 
 
 def one_lane(models, row, start, guess_step, guess_cycle, check):
-    """What SHAPES names, for one lane."""
+    """Compute the quantities of SHAPES for one lane."""
     hub, other = models
     p = parameters(row)
     x = [mp.mpf(float(v)) for v in start]
@@ -148,7 +148,7 @@ def one_lane(models, row, start, guess_step, guess_cycle, check):
 
 
 def load() -> dict[str, np.ndarray]:
-    """The reference by name; see SHAPES."""
+    """Return the references by name; see SHAPES."""
     with np.load(TARGET) as file:
         return dict(file)
 

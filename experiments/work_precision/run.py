@@ -98,7 +98,7 @@ def measure(
     reference: Run,
     compiling: float,
 ) -> dict:
-    """One row of the table; `compiling` is what numba took before, s."""
+    """Return one row of the table; `compiling` is the compile time of numba, s."""
     n = method.lanes
     rows, starts = (
         np.resize(references[name], (n, references[name].shape[1])) for name in ("rows", "start")
@@ -136,12 +136,12 @@ def measure(
 
 
 def read_measured_rows(table: Path) -> list[Row]:
-    """Rows measured so far."""
+    """Return the rows that were measured in earlier runs."""
     return read_table(table) if table.exists() else []
 
 
 def key_columns(method: Method, setting: Any) -> dict[str, Any]:
-    """The columns of KEY."""
+    """Return the columns of KEY."""
     return dict(zip(KEY, (*method[:4], str(setting), method.lanes), strict=True))
 
 

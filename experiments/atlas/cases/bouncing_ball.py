@@ -24,7 +24,7 @@ BALL = (
 
 
 def times(n: int) -> np.ndarray:
-    """Of the first n bounces."""
+    """Return the times of the first n bounces, s."""
     return FALL * (1.0 + 2.0 * R * (1.0 - R ** np.arange(n)) / (1.0 - R))
 
 

@@ -96,7 +96,9 @@ def make_return_map(level: float) -> Callable:
 
 
 def find_cycle_on_level(level: float) -> tuple[Point, float]:
-    """The Chenciner point by the section at a level, and CPU seconds, compiling among them."""
+    """Return the Chenciner point by the section at a level, and CPU seconds including
+    compilation.
+    """
     k, begin = (
         jnp.array(PUBLISHED_CHENCINER_POINT),
         jnp.array([NEARBY_CYCLE[0], LEVEL, *NEARBY_CYCLE[1:]]),
@@ -121,7 +123,7 @@ def cycle_at(x, k, level):
 
 
 def torus_points() -> Iterator[Row]:
-    """Two more published points with a pair on the circle."""
+    """Yield two more published points with a pair of multipliers on the unit circle."""
     largest = lambda cycle: float(np.abs(np.linalg.eigvals(cycle.jacobian)).max())
     options = "Dopri8 1e-13; Newton 1e-11"
     first, seconds = time_second_call(

@@ -38,7 +38,7 @@ def drive(t: Any, m: Any) -> Any:
 
 
 def first_clutch_torque(t: Any, m: Any) -> Any:
-    """By the first clutch while it slides, N m."""
+    """Return the torque of the first clutch while it slides, N m."""
     return SLIDING * m.cos(float(SLOW_FREQUENCY) * t)
 
 
@@ -66,7 +66,9 @@ def gap(first: int, second: int) -> Callable:
 
 
 def grip(mode: int) -> Callable:
-    """What the first clutch holds beyond what it passes while it is locked."""
+    """Return a guard: the largest torque of the locked first clutch, minus the transmitted
+    torque.
+    """
     a, _, c = SHARES[mode][0]
     return lambda y, m: STATIC_RATIO * first_clutch_torque(y[4], m) - ((1 - a) * drive(y[4], m) - c)
 
@@ -100,7 +102,7 @@ SYSTEM = tuple(part(mode) for mode in range(len(ENDS)))
 
 
 def reference() -> tuple[np.ndarray, float]:
-    """Times of the events, and the rate of the first wheel at the last."""
+    """Return the event times, and the rate of the first wheel at the last event."""
     with mpmath.workdps(30):
         fast, slow = mpmath.mpf(float(FAST_FREQUENCY)), mpmath.mpf(float(SLOW_FREQUENCY))
         y, begin, result = [mpmath.mpf(x) for x in START], mpmath.mpf(0), []

@@ -24,7 +24,7 @@ PUBLISHED_STATE = (0.2187, -1.0918, -0.3772)  # stance angle, its rate, the swin
 
 
 def field(y, m):
-    """Lagrange's equations of two masses and a hip, angles from the vertical."""
+    """Evaluate Lagrange's equations of two leg masses and a hip; angles are from the vertical."""
     stance, w, swing, v = y
     sin, cos = m.sin(stance - swing), m.cos(stance - swing)
     m11 = (HIP + MASS) * LEG**2 + MASS * HALF**2
@@ -37,7 +37,9 @@ def field(y, m):
 
 
 def impact(y, m):
-    """Legs change; angular momentum stays about the new foot, and about the hip for the old leg."""
+    """Exchange the legs and conserve angular momentum about the new foot, and of the old leg about
+    the hip.
+    """
     stance, w, swing, v = y
     cos = m.cos(stance - swing)
     a11 = HIP * LEG**2 + MASS * HALF**2 + MASS * LEG**2 - MASS * LEG * HALF * cos
@@ -51,7 +53,7 @@ def impact(y, m):
 
 
 def depth(y, m):
-    """Of the swing foot below the ground, up to a positive factor while the leg swings forwards."""
+    """Return the depth of the swing foot below the ground, up to a positive factor."""
     return y[0] + y[2] + 2.0 * SLOPE
 
 

@@ -45,7 +45,7 @@ def field(y, m):
 
 
 def compute_collocation_multiplier(n: int) -> float:
-    """The multiplier of `n` equal segments of Gauss collocation with four nodes."""
+    """Return the multiplier by Gauss collocation with four nodes on `n` equal segments."""
     result, h = 1.0, PERIOD / n
     for i in range(n):
         rates = np.array([growth(h * (i + node), np) for node in GAUSS_NODES])

@@ -93,7 +93,7 @@ def compute_impact_derivative(w: float, depth: float) -> ReturnMap:
 
 
 def derivative() -> Iterator[Row]:
-    """Of the time of touching by the depth, where it grows as 1/sqrt(depth)."""
+    """Return the derivative of the touching time by the depth, which grows as 1/sqrt(depth)."""
     c = 1.0 + GRAZING_DEPTH
     reference = -1.0 / (W * c * math.sqrt(c * c - 1.0))
     parts, options = modes(make_stopped_oscillator(W)), vrw.StepOptions.tight()

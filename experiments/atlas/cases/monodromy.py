@@ -34,7 +34,7 @@ def field(y: Any, m: Any) -> tuple:
 
 
 def columns(z: Any, m: Any) -> tuple:
-    """Two solutions at once, and the clock."""
+    """Evaluate the linear equation for two solutions and the clock."""
     (a, b, t), (c, d, _) = field((z[0], z[1], z[4]), m), field((z[2], z[3], z[4]), m)
     return a, b, c, d, t
 
@@ -43,7 +43,7 @@ BEGIN = (1.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def compute_by_segments(n: int) -> Any:
-    """This library's multipliers, with `n` segments."""
+    """Return the multipliers that this library computes with `n` segments."""
     flow = lambda y: jnp.stack(field(y, JAX))
     cut = segment_maps(flow, jnp.zeros(3), PERIOD, n, vrw.StepOptions.tight(), n_directions=2)
     return product_multipliers(cut.jacobians), np.asarray(cut.jacobians)

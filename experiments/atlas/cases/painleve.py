@@ -32,7 +32,7 @@ STIFF = 1e7
 
 
 def contact(angle, rate, friction, m=np):
-    """A and b."""
+    """Return the coefficients A and b of the contact law."""
     sin, cos = m.sin(angle), m.cos(angle)
     return 1.0 + 3.0 * cos * (cos - friction * sin), rate * rate * sin - G
 

@@ -41,7 +41,7 @@ START = (START_ANGLE, 0.0)
 
 
 def reference(events: int) -> np.ndarray:
-    """Times of touching and leaving the pin."""
+    """Return the times at which the pendulum touches and leaves the pin."""
     with mpmath.workdps(40):
         half = lambda high, angle: mpmath.sin(mpmath.mpf(angle) / 2) / mpmath.sin(high / 2)
 

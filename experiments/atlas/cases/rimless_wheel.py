@@ -38,7 +38,7 @@ RATE = math.sqrt(
 
 
 def period() -> float:
-    """Of the gait: the integral of an angle over its rate."""
+    """Return the period of the gait, which is the integral of an angle over its rate."""
     with mpmath.workdps(30):
         begin, end = mpmath.mpf(SLOPE) - mpmath.mpf(ALPHA), mpmath.mpf(SLOPE) + mpmath.mpf(ALPHA)
         rate = lambda a: mpmath.sqrt(

@@ -35,7 +35,9 @@ def heelstrike(y, m):
 
 
 def height(y, m):
-    """Of the swing foot, up to a positive factor: zero just after heelstrike, and rising."""
+    """Return the height of the swing foot up to a positive factor; it is zero just after
+    heelstrike.
+    """
     return y[2] - 2.0 * y[0]
 
 

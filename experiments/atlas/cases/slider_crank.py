@@ -51,7 +51,7 @@ def gap(y: Numbers, m: Any, transverse_part: float, face: float) -> Any:
 
 
 def opening(y: Numbers, m: Any, transverse_part: float, face: float) -> tuple:
-    """How the gap changes with each angle."""
+    """Return the derivatives of the gap with respect to each angle."""
     return (
         -face * CRANK * m.cos(y[0]),
         -face * ROD * m.cos(y[1]),
@@ -72,7 +72,7 @@ def generalized_contact_force(y: Numbers, m: Any, transverse_part: float, face: 
 
 
 def solve_mass_matrix(y: Numbers, m: Any, force: Numbers) -> tuple:
-    """The accelerations, or jumps, that forces, or impulses, make."""
+    """Return accelerations for given forces, or jumps of rates for given impulses."""
     both_values = COUPLING_INERTIA * m.cos(y[1] - y[0])
     scale = 1.0 / (CRANK_SELF * ROD_SELF - both_values * both_values)
     return (
@@ -87,7 +87,7 @@ def dot(a: Numbers, b: Numbers) -> Any:
 
 
 def forces(y: Numbers, m: Any) -> tuple:
-    """Of gravity, and what the turning of crank and rod adds."""
+    """Return generalized forces: gravity, and the velocity terms of crank and rod."""
     turning = COUPLING_INERTIA * m.sin(y[1] - y[0])
     crank = (0.5 * CRANK_MASS + ROD_MASS + SLIDER_MASS) * GRAVITY * CRANK * m.cos(y[0])
     rod = (0.5 * ROD_MASS + SLIDER_MASS) * GRAVITY * ROD * m.cos(y[1])
@@ -95,7 +95,9 @@ def forces(y: Numbers, m: Any) -> tuple:
 
 
 def impulses(y: Numbers, m: Any, face: float, free: tuple) -> tuple:
-    """Of two corners that slide and shall open with rates, or accelerations, opposite to `free`."""
+    """Return forces or impulses of two sliding corners that cancel the free accelerations or rates
+    `free`.
+    """
     openings = [opening(y, m, transverse_part, face) for transverse_part in (BEHIND, AHEAD)]
     jumps = [
         solve_mass_matrix(y, m, generalized_contact_force(y, m, transverse_part, face))
@@ -116,10 +118,13 @@ def total(y: Numbers, m: Any, face: float, sizes: tuple) -> list:
 
 
 def plain(y: Numbers, m: Any) -> tuple:
-    """Angles and their rates, of a state (three angles, the crank's rate, two rates, two gaps).
+    """Return the angles and their rates for a state.
 
-    Rates and gaps of the upper corners are numbers of the state, so that an impact leaves the gaps
-    at zero and turns the rates to the last digit.
+    The state is (three angles, the crank's rate, two rates, two gaps).
+
+    Rates and gaps of the upper corners are components of the state, so that an impact keeps the
+    gaps
+    at zero and reverses the rates without round-off.
     """
     slider = (y[4] - y[5]) / (2.0 * HALF * m.cos(y[2]))
     middle = HEIGHT * m.sin(y[2]) * slider - 0.5 * (y[4] + y[5]) - CRANK * m.cos(y[0]) * y[3]
@@ -127,13 +132,13 @@ def plain(y: Numbers, m: Any) -> tuple:
 
 
 def compute_curvature(q: Numbers, m: Any) -> list:
-    """What the turning adds to the second derivatives of the upper gaps."""
+    """Return the velocity terms in the second derivatives of the upper gaps."""
     turns = CRANK * m.sin(q[0]) * q[3] * q[3] + ROD * m.sin(q[1]) * q[4] * q[4]
     return [turns + (x * m.sin(q[2]) + HEIGHT * m.cos(q[2])) * q[5] * q[5] for x in (BEHIND, AHEAD)]
 
 
 def lift_to_coordinates(q: Numbers, m: Any, changes: tuple) -> list:
-    """How the upper gaps' rates change with those of the angles."""
+    """Return the changes of the rates of the upper gaps for given changes of the angular rates."""
     return [
         dot(opening(q, m, transverse_part, ABOVE), changes) for transverse_part in (BEHIND, AHEAD)
     ]
@@ -147,7 +152,7 @@ def flying(y: Numbers, m: Any) -> tuple:
 
 
 def contact_forces(y: Numbers, m: Any) -> tuple:
-    """Of the two upper corners while they slide, N."""
+    """Return the forces of both upper corners while they slide, N."""
     q = plain(y, m)
     pairs = zip(
         lift_to_coordinates(q, m, solve_mass_matrix(q, m, forces(q, m))),
@@ -177,7 +182,7 @@ def make_impact(retained: float) -> Callable:
 
 
 def make_single_impact(corner: int) -> Callable:
-    """One corner, as if the other were not there."""
+    """Return the impact of one corner, without contact at the other."""
     transverse_part = (BEHIND, AHEAD)[corner]
 
     def reset(y: Numbers, m: Any) -> tuple:
@@ -198,13 +203,13 @@ def make_single_impact(corner: int) -> Callable:
 
 
 def make_flight_part(resets: Sequence[Callable]) -> tuple[Part, ...]:
-    """In flight below the upper face."""
+    """Return the mode of flight below the upper face."""
     edges = tuple(GuardEdge(lambda y, m, i=i: y[6 + i], resets[i]) for i in (0, 1))
     return (Part(flying, edges),)
 
 
 def make_start_state(rates: Numbers = RATES) -> tuple:
-    """The state with all angles zero."""
+    """Return the start state, in which all angles are zero."""
     upper = -CRANK * rates[0] - ROD * rates[1]
     return (0.0, 0.0, 0.0, rates[0], upper, upper, PLAY, PLAY)
 
@@ -240,7 +245,9 @@ SICONOS_EVENT_TIMES = {"first impact": 0.0028, "touch of the other face": 0.0259
 
 
 def first_impulses() -> Iterator[Row]:
-    """By this library's contact solver: how many answers, and which."""
+    """Return the number of solutions of the first impact, and the chosen one, by this library's
+    solver.
+    """
     walk_result = run_library(SIMULTANEOUS_IMPACTS, make_start_state(), 1, LIMIT)
     y = walk_result.states[0]
     q = plain(y, math)

@@ -47,7 +47,7 @@ def dot(a, b):
 
 
 def solve_mass_matrix(force):
-    """The accelerations, or jumps, that forces, or impulses, make."""
+    """Return accelerations for given forces, or jumps of rates for given impulses."""
     return tuple(dot(line, force) for line in INVERSE)
 
 
@@ -58,7 +58,7 @@ def generalized_contact_force(contact: int, sign: float) -> tuple[float, ...]:
 
 
 def forces(y):
-    """Of gravity and spring; the state is (y', M, M', S, S')."""
+    """Return the forces of gravity and spring; the state is (y', M, M', S, S')."""
     wound = STIFFNESS * (y[1] - y[3])
     return (
         -(SLEEVE + BIRD) * GRAVITY + 0.0 * y[0],
@@ -68,7 +68,7 @@ def forces(y):
 
 
 def normal_force(y, contact, sign):
-    """Of a contact that slides."""
+    """Return the normal force of a sliding contact."""
     transverse_part = NORMAL[contact]
     return -dot(transverse_part, solve_mass_matrix(forces(y))) / dot(
         transverse_part, solve_mass_matrix(generalized_contact_force(contact, sign))
@@ -111,7 +111,9 @@ def grip(y, m):
 
 
 def make_impact(contact, sign):
-    """The state after an impact that slides; the sleeve doesn't bounce, and is put on the pole."""
+    """Return the reset map of a sliding impact without restitution, which places the sleeve on the
+    pole.
+    """
 
     def reset(y, m):
         before, push = (y[0], y[2], y[4]), generalized_contact_force(contact, sign)

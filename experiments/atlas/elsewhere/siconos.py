@@ -19,7 +19,7 @@ from typing import Any
 
 
 def simulate_bounces(step: float) -> tuple[list[float], float, int]:
-    """Times of bounces, CPU seconds, and steps."""
+    """Return the times of bounces, CPU seconds, and the number of steps."""
     import numpy as np
     from siconos import kernel as sk
 
@@ -47,7 +47,7 @@ def compute_normal_impulses(stepping: Any, contacts: list) -> tuple[list[list[fl
 
 
 def find_contact_onsets(pushes: list[bool]) -> list[int]:
-    """Steps that push and follow one that does not."""
+    """Return the steps with a contact force that follow a step without one."""
     return [k for k, push in enumerate(pushes) if push and not (k and pushes[k - 1])]
 
 
@@ -56,7 +56,7 @@ PLUGIN = Path(__file__).with_name("slider_crank.c")
 
 
 def crank(numbers: dict[str, float], step: float) -> tuple[dict[str, float], float, int]:
-    """What the slider–crank does until both lower corners hit, CPU seconds, and steps."""
+    """Simulate the slider–crank until both lower corners hit; return CPU seconds and steps too."""
     import numpy as np
     from siconos import kernel as sk
 
@@ -94,7 +94,9 @@ def crank(numbers: dict[str, float], step: float) -> tuple[dict[str, float], flo
 
 
 def forces(rod: dict) -> dict:
-    """How many answers Lemke's method gives, 1 or 0, its own code, and CPU seconds."""
+    """Return the number of solutions that Lemke's method finds, its status code, and CPU
+    seconds.
+    """
     import numpy as np
     from siconos import numerics as sn
 
