@@ -49,7 +49,8 @@ def sobol_indices(
 
     Rows with a sample without a gait are omitted, and then more rows, so that their number `rows`
     is a power of two. `left_out` is the share of rows without a gait. If it is not small, the
-    indices are those of gaits only, whose parameters are no longer independent.
+    indices are biased: wheels near those without a gait lose more of their rows than other wheels.
+    The indices are then not those of the region with gaits.
 
     A measure that varies by no more than round-off has no variance: its indices are 0, it is marked
     in `is_constant`, and a warning names it.
