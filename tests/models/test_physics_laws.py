@@ -26,6 +26,32 @@ def test_impacts_only_lose_energy(sample_steps):
     assert np.all(np.asarray(sample_steps.energy.damping) > 0.0)
 
 
+@pytest.mark.parametrize("name", vrw.parameter_sets)
+def test_a_gait_loses_the_energy_of_its_descent(name):
+    """The reference is the weight times the descent, M g D sin(phi)."""
+    params = vrw.parameter_sets[name].params
+    # All sets are found on this mesh, so that one program is compiled.
+    cycle = vrw.limit_cycle(params, options=vrw.CycleOptions(mesh_intervals=(40, 32, 16)))
+    step = vrw.step(params, cycle.section_state, options=vrw.StepOptions.tight())
+    loss = step.energy.landing + step.energy.stopper + step.energy.damping
+    assert float(loss) == pytest.approx(compute_descent_energy(params, step), rel=1e-9)
+
+
+@pytest.mark.parametrize("held_landing", [False, True])
+def test_a_rigid_gait_loses_the_energy_of_its_descent_in_its_landing(held_landing):
+    params, model = vrw.WheelParams(slope=0.1), vrw.RigidWheel(held_landing=held_landing)
+    step = vrw.step(params, vrw.limit_cycle(params, model=model).section_state, model=model)
+    assert float(step.energy.landing) == pytest.approx(
+        compute_descent_energy(params, step), rel=1e-12
+    )
+
+
+def compute_descent_energy(params, step):
+    """Return the potential energy that the wheel gives up over one step, J."""
+    s = params.symbols()
+    return float(s.Mt * s.g * s.sin_phi * step.step_length)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     theta=st.floats(-0.3, 0.6),
