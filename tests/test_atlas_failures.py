@@ -15,6 +15,7 @@ from experiments.atlas import failures, many_digits
 from experiments.atlas.hybrid import METHODS, GuardEdge, Part, last_time, run_library, run_scipy
 from experiments.atlas.results import Row
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 FAILURE_TABLE = list(csv.DictReader((ROOT / "docs" / "figures" / "atlas_failures.csv").open()))
 

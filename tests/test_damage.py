@@ -25,6 +25,7 @@ def rows(tmp_path_factory) -> dict[tuple[str, str], str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "fault", "endings"),
     [

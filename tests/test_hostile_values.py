@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -17,6 +19,7 @@ def test_every_argument_of_the_public_functions_takes_or_refuses_hostile_values(
     assert run.returncode == 0, run.stdout + run.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_random_calls_by_their_seed_end_without_a_fault(tmp_path):
     run = subprocess.run(
         [sys.executable, "-m", "experiments.hardening.random_calls", tmp_path, "60", "--seed", "7"],

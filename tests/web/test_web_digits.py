@@ -12,6 +12,7 @@ import vrw_jax as vrw
 from experiments.web.build import list_output_rows
 from vrw_jax.wheel import PARAMETER_NAMES
 
+pytestmark = pytest.mark.slow
 SAME_TOLERANCE = 1e-9
 """Difference of digits over their scale."""
 RANGES = {

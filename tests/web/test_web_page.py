@@ -12,6 +12,7 @@ from support.web_code import PAGE_PATH
 import vrw_jax as vrw
 from vrw_jax.web import explorer
 
+pytestmark = pytest.mark.slow
 BROWSER_SWITCHES = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
