@@ -123,8 +123,7 @@ def plain(y: Numbers, m: Any) -> tuple:
     The state is (three angles, the crank's rate, two rates, two gaps).
 
     Rates and gaps of the upper corners are components of the state, so that an impact keeps the
-    gaps
-    at zero and reverses the rates without round-off.
+    gaps at zero and reverses the rates without round-off.
     """
     slider = (y[4] - y[5]) / (2.0 * HALF * m.cos(y[2]))
     middle = HEIGHT * m.sin(y[2]) * slider - 0.5 * (y[4] + y[5]) - CRANK * m.cos(y[0]) * y[3]
