@@ -35,18 +35,18 @@ SURFACE_PATH = Path(surface.__file__).with_name("surface.npz")
 def find_gaits_by_continuation(problem: search.CollocationSystem, parameters: jax.Array) -> object:
     """Return gaits found by a homotopy of the parameters from Table 1."""
 
-    def search_from_table_1(parameters: jax.Array) -> search.SearchResult:
+    def search_from_table_1(parameters: jax.Array) -> search.CycleSearchResult:
         lanes = parameters.shape[-1:]
         table_1_parameters = stack_parameters(vrw.WheelParams())[:, None]
         section, durations = (
             jnp.broadcast_to(jnp.asarray(x)[:, None], (len(x), *lanes)) for x in GAIT_OF_TABLE_1
         )
-        start = search.make_start(problem, section, durations, jnp.ones(lanes, bool))
+        start = search.make_start_state(problem, section, durations, jnp.ones(lanes, bool))
         table_1_parameters = jnp.broadcast_to(table_1_parameters, parameters.shape)
         stages = jnp.int32(N_STAGES)
         pending = jnp.ones(lanes, bool)
         limit = problem.options.max_newton_iterations
-        return search.run_newton(
+        return search.run_newton_iterations(
             problem, parameters, start, table_1_parameters, stages, limit, pending
         )
 
@@ -55,7 +55,7 @@ def find_gaits_by_continuation(problem: search.CollocationSystem, parameters: ja
 
 def main() -> None:
     parse_and_start_jax(make_parser(__doc__))
-    steps = tuple(mesh.n_intervals for mesh in surface.SURFACE_MESHES)
+    steps = tuple(mesh.n_intervals for mesh in surface.GAIT_SURFACE_MESHES)
     options = dataclasses.replace(
         vrw.CycleOptions(), max_newton_iterations=20, mesh_intervals=steps
     )
@@ -68,7 +68,7 @@ def main() -> None:
     search_result = find_gaits_by_continuation(problem, jnp.asarray(parameters))
     is_found = np.asarray(search_result.located.found) > 0.5
     solution = search_result.located.solution
-    time_unit = float(surface.time_unit(table_1))  # L0 = 1 m in Table 1.
+    time_unit = float(surface.compute_time_unit(table_1))  # L0 = 1 m in Table 1.
     rows = [
         solution.section[0],
         solution.section[1] * time_unit,
@@ -79,7 +79,7 @@ def main() -> None:
     unknowns = np.stack([np.asarray(row) for row in rows])[:, is_found]
 
     wheels = wheel_from_parameters(jnp.asarray(parameters[:, is_found]), 8)
-    coordinates = np.stack([np.asarray(x) for x in surface.surface_coordinates(wheels)])
+    coordinates = np.stack([np.asarray(x) for x in surface.compute_surface_coordinates(wheels)])
     centre, spread = coordinates.mean(1), coordinates.std(1)
     features = np.stack(
         [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS, confirm_outcome, make_finder
+from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS, confirm_outcome_by_step, make_finder
 from vrw_jax.cycles.finder import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.cycles.return_map_finder import ReturnMapFinder
 from vrw_jax.measures import MEASURES
@@ -121,14 +121,14 @@ def test_a_cycle_is_confirmed_only_if_the_step_from_it_returns_to_it():
     coarse = outcome.MESH_TOO_COARSE
     state = np.zeros((4, 3))
     reached = state + np.array([0.0, 0.9, 1.1, 0.0])[:, None] * STATE_AGREEMENT_TOLERANCE
-    result = confirm_outcome(
+    result = confirm_outcome_by_step(
         [solution, solution, solution, lost_values],
         state,
         [solution, solution, solution, fell],
         reached,
     )
     assert list(result) == [solution, solution, coarse, lost_values]
-    assert confirm_outcome(solution, state[0], fell, reached[0]) == fell
+    assert confirm_outcome_by_step(solution, state[0], fell, reached[0]) == fell
 
 
 @pytest.mark.slow

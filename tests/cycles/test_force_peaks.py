@@ -132,7 +132,10 @@ def test_derivatives_are_central_differences():
     names = tuple(name for name in FORCE_PEAK_MEASURES if not name.startswith("n_"))
     cycle = vrw.limit_cycle(TWO_PEAKS)
     table = vrw.sensitivities(
-        TWO_PEAKS, measures=(*names, "n_force_peaks"), guess=cycle, options=cycle.system.options
+        TWO_PEAKS,
+        measures=(*names, "n_force_peaks"),
+        guess=cycle,
+        options=cycle.system.cycle_options,
     )
     np.testing.assert_allclose(table.value[-1], 2.0)
     np.testing.assert_array_equal(table.derivative[-1], 0.0)
@@ -141,7 +144,7 @@ def test_derivatives_are_central_differences():
 
         def measures(shift, parameter=parameter, value=value):
             wheel = dataclasses.replace(TWO_PEAKS, **{parameter: jnp.asarray(value + shift)})
-            shifted = vrw.limit_cycle(wheel, guess=cycle, options=cycle.system.options)
+            shifted = vrw.limit_cycle(wheel, guess=cycle, options=cycle.system.cycle_options)
             return np.array(list(shifted.measures(names).values()), float)
 
         outer, inner = ((measures(k * h) - measures(-k * h)) / (2.0 * k * h) for k in (2.0, 1.0))
@@ -153,7 +156,7 @@ def test_derivatives_are_central_differences():
 @pytest.mark.slow  # its program compiles for a minute on a busy machine
 def test_a_scan_of_peaks_has_those_of_each_gait(tmp_path):
     names = ["n_force_peaks", "peak_force", "second_peak_rate"]
-    options = vrw.limit_cycle(TABLE_1).system.options
+    options = vrw.limit_cycle(TABLE_1).system.cycle_options
     scan = vrw.scan(
         vrw.grid(damping=[100.0, 200.0]), names, store=tmp_path / "scan", cycle_options=options
     )

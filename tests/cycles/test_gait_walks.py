@@ -26,7 +26,7 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
         end_states = FIXED_POINT + multiplier**n_steps * (states - FIXED_POINT)
         return end_states, np.full(len(states), int(outcome))
 
-    monkeypatch.setattr(gait_walks, "_take_steps", take_steps)
+    monkeypatch.setattr(gait_walks, "_walk_wheels", take_steps)
     finder = SimpleNamespace(model=vrw.ViscoelasticWheel(), n_legs=8, period_n=1)
     values = np.asarray(vrw.ViscoelasticWheel().parameter_values(vrw.WheelParams()))[None]
     starts = (FIXED_POINT + 0.01 * np.ones(N_COORDINATES))[None, None]
@@ -35,13 +35,13 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
 
 def test_a_walk_stops_after_the_round_in_which_it_settles(monkeypatch):
     walk_ends = walk_by_linear_map(monkeypatch, 0.5)
-    first_round = gait_walks.GAIT_WALK_OPTIONS.round_steps[0]
+    first_round = gait_walks.GAIT_WALK_OPTIONS.steps_by_round[0]
     np.testing.assert_allclose(walk_ends.section_states[0], FIXED_POINT + 0.5**first_round * 0.01)
-    assert walk_ends.period_defect[0] < gait_walks.GAIT_WALK_OPTIONS.settled_defect
+    assert walk_ends.period_defects[0] < gait_walks.GAIT_WALK_OPTIONS.max_settled_defect
 
 
 def test_a_walk_that_ends_keeps_its_last_state_near_a_repelling_gait(monkeypatch):
     """The multiplier is 1.2. The state after the first round is usable, and the walk ends later."""
     walk_ends = walk_by_linear_map(monkeypatch, 1.2, last_step=10)
     np.testing.assert_allclose(walk_ends.section_states[0], FIXED_POINT + 1.2**8 * 0.01)
-    assert 0.0 < walk_ends.period_defect[0] < gait_walks.GAIT_WALK_OPTIONS.start_defect
+    assert 0.0 < walk_ends.period_defects[0] < gait_walks.GAIT_WALK_OPTIONS.max_newton_start_defect

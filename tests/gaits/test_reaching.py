@@ -7,7 +7,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.cycles import gait_search
-from vrw_jax.cycles.gait_search import FALLBACK_OPTIONS
+from vrw_jax.cycles.gait_search import SEARCH_FALLBACK_OPTIONS
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
     damping=[224.5, 214.0, 119.3, 200.0],
@@ -27,8 +27,8 @@ def cycles():
 def test_gaits_outside_the_fitted_box_are_found_on_a_refined_mesh(cycles):
     assert np.asarray(cycles.found).tolist() == [True, True, True, False]
     np.testing.assert_allclose(cycles.durations[:3], REFERENCE_DURATIONS, atol=2e-3)
-    assert np.all(cycles.mesh_error <= FALLBACK_OPTIONS.refine_above)
-    assert cycles.system.options.mesh_intervals > vrw.CycleOptions().mesh_intervals
+    assert np.all(cycles.mesh_error <= SEARCH_FALLBACK_OPTIONS.max_unrefined_mesh_error)
+    assert cycles.system.cycle_options.mesh_intervals > vrw.CycleOptions().mesh_intervals
 
 
 def test_gaits_outside_the_fitted_box_repeat_in_a_walk(cycles):
@@ -41,7 +41,7 @@ def test_a_search_under_vmap_uses_only_the_mesh_of_its_options():
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, 4), WHEELS_OUTSIDE_BOX)
     single_result = jax.vmap(vrw.limit_cycle)(batch)
     assert not np.any(single_result.found)
-    assert single_result.system.options == vrw.CycleOptions()
+    assert single_result.system.cycle_options == vrw.CycleOptions()
 
 
 def test_a_wheel_has_the_same_outcome_whichever_function_searches():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cycles import compute_gait_sensitivity, make_finder, slope_response
+from vrw_jax.cycles import compute_sensitivity_norms, make_finder, slope_response
 from vrw_jax.simulation import walk
 
 TABLE_1 = vrw.WheelParams()
@@ -35,10 +35,10 @@ def test_squares_of_the_parts_add_up_to_the_square_of_the_norm(sensitivity):
 def test_collocation_and_event_driven_steps_give_the_same_norms(sensitivity):
     finder = make_finder(None, TABLE_1.n_legs)
     x = vrw.limit_cycle(TABLE_1).section_state
-    response = slope_response.step_slope_response(
+    response = slope_response.compute_step_slope_response(
         finder.model, TABLE_1, x, MEASURES, vrw.StepOptions.tight()
     )
-    by_steps = compute_gait_sensitivity(response)
+    by_steps = compute_sensitivity_norms(response)
     # The states are taken at different instants of the step; the norm does not depend on that.
     np.testing.assert_allclose(by_steps.norm, sensitivity.norm, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(by_steps.beginning_step, sensitivity.beginning_step, atol=1e-6)
@@ -62,7 +62,7 @@ def test_a_long_walk_on_slightly_uneven_ground_has_that_standard_deviation(sensi
 def test_the_linear_map_is_that_of_differences_of_walks():
     # Central differences with steps of 1e-4 have errors near 1e-9 of derivatives near 1.
     cycle, h = vrw.limit_cycle(TABLE_1), 1e-4
-    response = slope_response.step_slope_response(
+    response = slope_response.compute_step_slope_response(
         vrw.ViscoelasticWheel(), TABLE_1, cycle.section_state, ("period",), vrw.StepOptions.tight()
     )
     exact = np.concatenate([response.C[0], response.D1, response.D0])
@@ -126,7 +126,7 @@ def test_an_unstable_gait_has_an_infinite_norm():
     response = slope_response.SlopeResponse(
         jnp.diag(jnp.array([1.1, 0.2])), *jnp.ones((2, 2)), jnp.ones((1, 2)), *jnp.ones((2, 1))
     )
-    assert float(compute_gait_sensitivity(response).norm[0]) == np.inf
+    assert float(compute_sensitivity_norms(response).norm[0]) == np.inf
 
 
 @pytest.mark.parametrize(

@@ -170,9 +170,9 @@ def test_resets_agree_with_the_collisions():
     before = sls1.motion_at(q, v)
     hit = transitions.hit_stopper(SYMBOLS, before).motion
     np.testing.assert_array_equal(jnp.stack(sls1.reset_map(before)), jnp.stack(hit))
-    constants = sequence.compute_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
+    constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     following = (
-        sequence.held_landing_sequence(PARAMS.n_legs)
+        sequence.make_held_landing_sequence(PARAMS.n_legs)
         .phases[1]
         .reset(constants, PhasePoint((), q, v))
     )
@@ -220,8 +220,8 @@ def end_by_step_collocation():
 
 def end_by_cycle_collocation():
     """Apply Newton's method to the angle of the event."""
-    phase = sequence.held_landing_sequence(PARAMS.n_legs).phases[2]
-    constants = sequence.compute_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
+    phase = sequence.make_held_landing_sequence(PARAMS.n_legs).phases[2]
+    constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     _, q, v = make_state_at(2)
     event = lambda theta: phase.event(constants, PhasePoint((), (theta, q[1]), v))
     theta = q[0]

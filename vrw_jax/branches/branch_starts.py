@@ -21,7 +21,13 @@ from vrw_jax.branches.continuation_problems import (
 )
 from vrw_jax.collocation import CollocationSolution
 from vrw_jax.continuation import ContinuationPoint
-from vrw_jax.cycles import CycleOptions, LimitCycle, limit_cycles, make_finder, transfer_to_mesh
+from vrw_jax.cycles import (
+    CycleOptions,
+    LimitCycle,
+    limit_cycles,
+    make_finder,
+    transfer_solution_to_mesh,
+)
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.simulation import walk_toward_gait
@@ -115,8 +121,8 @@ def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
             additional_quantities=None,
             reads_force_peaks=request.reads_force_peaks,
         ),
-        BranchWheel(params, start_cycle.collocation_state.phase_active),
-        jax.vmap(lambda solution: transfer_to_mesh(start_cycle.system, system, solution))(
+        BranchWheel(params, start_cycle.collocation_state.is_phase_active),
+        jax.vmap(lambda solution: transfer_solution_to_mesh(start_cycle.system, system, solution))(
             start_cycle.collocation_state.solution
         ),
         np.asarray(start_cycle.outcome),
@@ -180,7 +186,7 @@ def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchSta
     )
     values = problem.parameter_values(wheels, request.parameter_values)
     if cycle is None:
-        cycle = finder.find_cycles_near(values, finder.initial_guesses(values))
+        cycle = finder.find_cycles_near(values, finder.make_initial_guesses(values))
 
     outcomes = np.asarray(cycle.outcome)
     return BranchStart(

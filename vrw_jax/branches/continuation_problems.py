@@ -33,10 +33,10 @@ from vrw_jax.cycles import (
     CollocationState,
     CollocationSystem,
     PeriodMap,
-    collocation_correction_norm,
-    compile_batched,
+    compile_batch_function,
+    compute_correction_norm,
     compute_force_peaks,
-    gait_takeoff_acceleration,
+    compute_takeoff_acceleration,
     init_search_flags,
     solve_linear_systems,
 )
@@ -143,7 +143,7 @@ class CollocationProblem(AbstractGaitProblem):
         return z.section_state
 
     def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
-        return unbatch(collocation_correction_norm)(z, correction)
+        return unbatch(compute_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether the durations are positive; the event-driven step checks all other
@@ -162,11 +162,11 @@ class CollocationProblem(AbstractGaitProblem):
         parameters = self._parameters_at(wheel, p)
         s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
         _, steps = self.system.evaluate_phase_points(parameters, z)
-        takeoff_accelerations = [gait_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
+        takeoff_accelerations = [compute_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
         step_end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
         solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
         mesh_error = estimate_mesh_error(
-            self.system.sequence, self.system.meshes, solution_with_lane
+            self.system.phase_sequence, self.system.phase_meshes, solution_with_lane
         )[0]
         continued_quantities = {
             "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
@@ -241,7 +241,9 @@ def linearize_with_quantities(
         parameter_indices,
         compute_quantities.__name__ if compute_quantities else "",
     )
-    return unbatch(compile_batched(linearize_trial, make_output_template, cache_key, batch_size=0))
+    return unbatch(
+        compile_batch_function(linearize_trial, make_output_template, cache_key, batch_size=0)
+    )
 
 
 class AbstractReturnMapProblem(AbstractGaitProblem):
@@ -334,10 +336,10 @@ class GroundProblem(AbstractReturnMapProblem):
         period = self._period_map(wheel, p).evaluate_period(
             self.options, section_states, is_continued
         )
-        nan_if_invalid = np.where(period.is_valid, 0.0, np.nan)[:, None]
-        defect = period.end_state - section_states + nan_if_invalid
-        return_jacobian = period.return_jacobian[:, :n_coordinates, :n_coordinates]
-        parameter_jacobian = period.value_jacobian[:, :n_coordinates, is_continued]
+        nan_if_invalid = np.where(period.is_complete, 0.0, np.nan)[:, None]
+        defect = period.end_states - section_states + nan_if_invalid
+        return_jacobian = period.return_map_jacobian[:, :n_coordinates, :n_coordinates]
+        parameter_jacobian = period.parameter_jacobian[:, :n_coordinates, is_continued]
         right_sides = np.concatenate([defect[:, :n_coordinates, None], parameter_jacobian], -1)
         solutions = solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides)
         code_changes = defect[:, n_coordinates:]
@@ -357,10 +359,10 @@ class GroundProblem(AbstractReturnMapProblem):
         )
         additional_columns = {
             "section_state": jnp.asarray(points.z),
-            CONTACT_ORDER_COLUMN: hash_contact_orders(period.steps, self.n_legs),
+            CONTACT_ORDER_COLUMN: hash_contact_orders(period.period_steps, self.n_legs),
             FRICTION_SURPLUS_COLUMN: np.asarray(jax.vmap(self._friction_surplus)(wheels, points.p)),
         }
-        return _measure_periods(period.steps, points.z) | additional_columns
+        return _measure_periods(period.period_steps, points.z) | additional_columns
 
     def _friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
         """Return the friction coefficient minus the smallest one with a gait.

@@ -48,7 +48,7 @@ from vrw_jax.continuation import (
     TestFunctionCurve,
     TestFunctionPoint,
 )
-from vrw_jax.cycles import CollocationSystem, transfer_to_mesh
+from vrw_jax.cycles import CollocationSystem, transfer_solution_to_mesh
 from vrw_jax.measures import MARGIN_MEASURES, measure_attrs, provenance
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
@@ -222,7 +222,7 @@ class CurveTracer(NamedTuple):
         cycle = special_point.cycle
         params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
         first_value, second_value = (float(getattr(params, name)) for name in self.parameters)
-        gait = BranchWheel(params, cycle.collocation_state.phase_active)
+        gait = BranchWheel(params, cycle.collocation_state.is_phase_active)
         z = cycle.collocation_state.solution
         name = name_special_point(special_point.name, gait, z, self.tracing_options)
         return CurveSeed(name, (first_value, second_value), cycle.system, gait, z)
@@ -305,9 +305,9 @@ class CurveTracer(NamedTuple):
             mesh_limited_seeds = []
             for seed, (branch, system) in zip(seeds, branches, strict=True):
                 if branch is not None and branch.is_mesh_limited and not is_finest:
-                    options = system.options.refine_mesh()
+                    options = system.cycle_options.refine_mesh()
                     mesh_limited_seeds.append(
-                        self._transfer_seed(seed, system._replace(options=options))
+                        self._transfer_seed(seed, system._replace(cycle_options=options))
                     )
                 elif branch is not None:
                     curves.append(self._label_traced(seed._replace(system=system), branch))
@@ -321,7 +321,9 @@ class CurveTracer(NamedTuple):
         """Return the seed transferred to the mesh of `system`."""
         if seed.system == system:
             return seed
-        return seed._replace(system=system, z=transfer_to_mesh(seed.system, system, seed.z))
+        return seed._replace(
+            system=system, z=transfer_solution_to_mesh(seed.system, system, seed.z)
+        )
 
     def _continue_batch(
         self, quantity_group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
@@ -330,7 +332,7 @@ class CurveTracer(NamedTuple):
         the seeds.
         """
         system = max(
-            (seed.system for seed in seeds), key=lambda system: system.options.mesh_intervals
+            (seed.system for seed in seeds), key=lambda system: system.cycle_options.mesh_intervals
         )
         seeds = [self._transfer_seed(seed, system) for seed in seeds]
         padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % batch_sizes.CURVE_BATCH_SIZE)]

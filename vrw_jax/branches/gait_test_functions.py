@@ -32,8 +32,8 @@ from vrw_jax.continuation import (
 from vrw_jax.cycles import (
     CollocationState,
     CollocationSystem,
-    collocation_correction_norm,
-    gait_takeoff_acceleration,
+    compute_correction_norm,
+    compute_takeoff_acceleration,
     init_search_flags,
 )
 from vrw_jax.measures import MARGIN_MEASURES
@@ -263,7 +263,7 @@ class GaitTestFunction(AbstractTestFunction):
         return z.section_state
 
     def correction_norm(self, z: CollocationSolution, correction: CollocationSolution) -> Scalar:
-        return unbatch(collocation_correction_norm)(z, correction)
+        return unbatch(compute_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array) -> Array:
         is_nonnegative = z.durations > -self.options.duration_roundoff
@@ -333,7 +333,7 @@ def _compute_continued_quantities(
     values = (
         *forces,
         *other_durations,
-        gait_takeoff_acceleration(s, sls1),
+        compute_takeoff_acceleration(s, sls1),
         *_force_decrease_rates(s, dls, dls_duration),
     )
     return dict(zip(CONTINUED_QUANTITIES, values, strict=True))

@@ -12,23 +12,23 @@ from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
     CollocationSystem,
-    collocation_correction_norm,
+    compute_correction_norm,
     init_search_flags,
 )
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, format_multipliers
-from vrw_jax.cycles.derivatives import compile_batched
+from vrw_jax.cycles.derivatives import compile_batch_function
 from vrw_jax.cycles.finder import (
     STATE_AGREEMENT_TOLERANCE,
     AbstractGaitFinder,
     Gait,
     MeasureReader,
-    confirm_outcome,
+    confirm_outcome_by_step,
     evaluate_on_gait,
     evaluate_on_gaits,
     is_same_branch,
 )
 from vrw_jax.cycles.finder_selection import (
-    Guess,
+    CycleGuess,
     make_finder,
     resolve_finder,
     resolve_model,
@@ -43,10 +43,10 @@ from vrw_jax.cycles.gait_search import (
     retry_from_walks,
 )
 from vrw_jax.cycles.gait_walks import compute_walk_starts
-from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_to_mesh
-from vrw_jax.cycles.margin_defaults import default_margins, gait_takeoff_acceleration
+from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
+from vrw_jax.cycles.margin_defaults import compute_takeoff_acceleration, default_margins
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.cycles.sensitivity import sensitivities
-from vrw_jax.cycles.slope_response import compute_gait_sensitivity
+from vrw_jax.cycles.slope_response import compute_sensitivity_norms
 from vrw_jax.cycles.unilateral_finder import PeriodMap, solve_linear_systems

@@ -1,6 +1,4 @@
-"""Finder of the gaits of the paper's model: one algebraic system for the cycle, and one step as
-a check.
-"""
+"""Finder of the paper's gaits, which solves one algebraic system and checks it by one step."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,24 +11,28 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.cycles.collocation_search import CollocationState, CollocationSystem, surface_start
+from vrw_jax.cycles.collocation_search import (
+    CollocationState,
+    CollocationSystem,
+    predict_start_from_surface,
+)
 from vrw_jax.cycles.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.cycles.finder import (
     AbstractGaitFinder,
     BranchPoint,
     Gait,
     GaitMeasures,
-    Values,
-    measure_from_cycle,
-    measure_from_gait,
+    ParameterValues,
+    measure_on_cycle,
+    measure_on_gait,
     move_derivative_axis_first,
 )
 from vrw_jax.cycles.limit_cycle_result import (
     LimitCycle,
-    find_limit_cycle,
     guess_from_walk,
     sample_walk,
-    transfer_to_mesh,
+    solve_limit_cycle,
+    transfer_solution_to_mesh,
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
@@ -55,7 +57,10 @@ from vrw_jax.wheel import (
 
 
 class CollocationFinder(AbstractGaitFinder):
-    """Finder of limit cycles that needs no start. `period_n` applies to `find_cycle` alone."""
+    """Finder of limit cycles that needs no start.
+
+    `period_n` applies to `find_cycle` alone.
+    """
 
     model: ViscoelasticWheel
     n_legs: int = eqx.field(static=True)
@@ -69,13 +74,13 @@ class CollocationFinder(AbstractGaitFinder):
         dict.fromkeys((*cycle_measures, *DIFFERENTIABLE_STEP_NAMES, *MARGIN_MEASURES))
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
-        n for n in readable_measures if not MEASURES[n].dimension
+        measure_name for measure_name in readable_measures if not MEASURES[measure_name].dimension
     )
     supports_cold_start: ClassVar[bool] = True
     default_measures: ClassVar[tuple[str, ...]] = tuple(
-        n
-        for n in cycle_measures
-        if n not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
+        measure_name
+        for measure_name in cycle_measures
+        if measure_name not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
     )
 
     @classmethod
@@ -95,21 +100,21 @@ class CollocationFinder(AbstractGaitFinder):
 
     @property
     def system(self) -> CollocationSystem:
-        """Return the collocation system of the search."""
+        """Return the collocation system that the search solves."""
         return CollocationSystem(
             self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
         )
 
     def with_finer_mesh(self) -> "CollocationFinder":
-        """Return this finder with a finer mesh."""
+        """Return this finder with a finer mesh of each phase."""
         return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
 
     @classmethod
     def read_measure(cls, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
         """Return a measure of a gait by name.
 
-        If the foot scuffs at take-off, the clearance in SLS-I is that in SLS-II, because it would
-        otherwise jump. Callers must check `takeoff_acceleration` too.
+        At a scuffing take-off the clearance in SLS-I would jump, so the clearance in SLS-II is
+        returned. Callers must check `takeoff_acceleration` too.
         """
         value = cycle.measure(name) if name in cls.cycle_measures else step.measures()[name]
         if name == "clearance_sls1":
@@ -117,155 +122,181 @@ class CollocationFinder(AbstractGaitFinder):
             return jnp.where(is_scuffing, step.measures()["clearance_sls2"], value)
         return value
 
-    def find_cycle(self, params: WheelParams, guess: Any = None) -> LimitCycle:
-        if isinstance(guess, LimitCycle) and guess.system == self.system:
-            guess = guess.collocation_state
-        elif guess is not None and not isinstance(guess, CollocationState):
-            section_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+    def find_cycle(self, params: WheelParams, search_guess: Any = None) -> LimitCycle:
+        if isinstance(search_guess, LimitCycle) and search_guess.system == self.system:
+            search_guess = search_guess.collocation_state
+        elif search_guess is not None and not isinstance(search_guess, CollocationState):
+            section_state = (
+                search_guess.section_state
+                if isinstance(search_guess, AbstractCycle)
+                else search_guess
+            )
             params, state, _, _ = validate_arguments(params, section_state, None, None)
-            guess = self.guess_from_state(*lax.stop_gradient((params, state)))
-        return dataclasses.replace(find_limit_cycle(params, self.system, guess), model=self.model)
+            search_guess = self.guess_from_state(*lax.stop_gradient((params, state)))
+        return dataclasses.replace(
+            solve_limit_cycle(params, self.system, search_guess), model=self.model
+        )
 
     def guess_from_state(
         self, params: WheelParams, section_state: SectionState
     ) -> CollocationState:
-        """Return a start of the search from a walk: the next `period_n` steps from a section
-        state.
-        """
-        walk = sample_walk(self.model, params, section_state, self.period_n)
-        return guess_from_walk(self.system, params, walk)
+        """Return a start of the search from a walk of `period_n` steps from a section state."""
+        walk_samples = sample_walk(self.model, params, section_state, self.period_n)
+        return guess_from_walk(self.system, params, walk_samples)
 
     @eqx.filter_jit
-    def shift_first_step(
-        self, step_index: int, params: WheelParams, collocation_state: CollocationState
+    def start_at_step(
+        self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
     ) -> CollocationState:
-        """Return the same cycle with the step of this index as the first one."""
-        previous_end = collocation_state.ends[step_index - 1]
-        landing = transitions.land(params.symbols(), previous_end[0], *previous_end[2:])
+        """Return the same cycle with the step of the given index as the first one."""
+        previous_end_state = collocation_state.step_end_states[first_step_index - 1]
+        landing = transitions.land(params.symbols(), previous_end_state[0], *previous_end_state[2:])
         solution, is_active, ends = jax.tree.map(
-            lambda x: jnp.roll(x, -step_index, 0),
-            (collocation_state.solution, collocation_state.phase_active, collocation_state.ends),
+            lambda x: jnp.roll(x, -first_step_index, 0),
+            (
+                collocation_state.solution,
+                collocation_state.is_phase_active,
+                collocation_state.step_end_states,
+            ),
         )
         section_state = jnp.stack([landing.theta, landing.motion.dtheta])
         return collocation_state._replace(
             solution=solution._replace(section_state=section_state),
-            phase_active=is_active,
-            ends=ends,
+            is_phase_active=is_active,
+            step_end_states=ends,
         )
 
     def transfer_to_mesh(
         self, system: CollocationSystem, collocation_state: CollocationState
     ) -> CollocationState:
         """Return a start on this finder's mesh from a solution on the mesh of `system`."""
-        solution = transfer_to_mesh(system, self.system, collocation_state.solution)
+        solution = transfer_solution_to_mesh(system, self.system, collocation_state.solution)
         return collocation_state._replace(solution=solution)
 
     @eqx.filter_jit
-    def initial_guess(self, values: Values) -> CollocationState:
-        start = surface_start(self.system, values[:, None], jnp.ones((1,), bool))
+    def make_initial_guess(self, parameter_values: ParameterValues) -> CollocationState:
+        start = predict_start_from_surface(
+            self.system, parameter_values[:, None], jnp.ones((1,), bool)
+        )
         return jax.tree.map(lambda x: x[..., 0], start)
 
-    def find_gait(self, values: Values, guess: CollocationState) -> Gait:
-        cycle, d_cycle = cycle_with_jacobian(self.system, values, guess)
-        section_state, section_state_derivatives = cycle.section_state, d_cycle.section_state
-        step, d_step = step_with_jacobian(
+    def find_gait(self, parameter_values: ParameterValues, start_state: CollocationState) -> Gait:
+        cycle, cycle_derivatives = compute_cycle_and_derivatives(
+            self.system, parameter_values, start_state
+        )
+        section_state, section_state_derivatives = (
+            cycle.section_state,
+            cycle_derivatives.section_state,
+        )
+        step, step_derivatives = compute_step_and_derivatives(
             self.model,
             self.n_legs,
-            values,
+            parameter_values,
             section_state,
             section_state_derivatives,
             self.step_options,
         )
         gait_coordinates = lambda cycle: jnp.concatenate([cycle.section_state, cycle.durations], -1)
-        branch_point = (
+        branch_point_fields = (
             gait_coordinates(cycle),
-            gait_coordinates(d_cycle),
-            cycle.collocation_state.phase_active,
+            gait_coordinates(cycle_derivatives),
+            cycle.collocation_state.is_phase_active,
             cycle.monodromy_value,
         )
-        return Gait(cycle, step, d_cycle, d_step, BranchPoint(*branch_point))
+        return Gait(
+            cycle, step, cycle_derivatives, step_derivatives, BranchPoint(*branch_point_fields)
+        )
 
-    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
-        if set(names) <= set(self.cycle_measures):
-            return measure_from_cycle(self, values, guess, names)
-        cycle: Any = None if guess is None else self.find_cycle_from_values(values, guess)
-        start = self.initial_guess(values) if cycle is None else cycle.collocation_state
-        return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
+    def measure_gait(
+        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+    ) -> GaitMeasures:
+        if set(measure_names) <= set(self.cycle_measures):
+            return measure_on_cycle(self, parameter_values, guess, measure_names)
+        cycle: Any = None if guess is None else self.find_cycle_from_values(parameter_values, guess)
+        start_state = (
+            self.make_initial_guess(parameter_values) if cycle is None else cycle.collocation_state
+        )
+        return measure_on_gait(
+            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
+        )
 
-    def slope_response(
-        self, params: WheelParams, cycle: Any, names: Sequence[str]
+    def compute_slope_response(
+        self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
     ) -> SlopeResponse:
-        """Return the response from the collocation if it determines the measures, else from the
+        """Return the response of the step and its measures to the slopes of two lines.
+
+        It is computed from the collocation if that determines the measures, else from the
         event-driven step.
         """
-        if not set(names) <= set(COLLOCATION_RESPONSE_MEASURES):
-            return super().slope_response(params, cycle, names)
+        if not set(measure_names) <= set(COLLOCATION_RESPONSE_MEASURES):
+            return super().compute_slope_response(params, cycle, measure_names)
         response: SlopeResponse = cycle.slope_response
-        return response.select([COLLOCATION_RESPONSE_MEASURES.index(name) for name in names])
+        return response.select_measures(
+            [COLLOCATION_RESPONSE_MEASURES.index(name) for name in measure_names]
+        )
 
     def precompile(self, params: WheelParams) -> None:
-        values = stack_parameters(params)
-        section_state = jnp.asarray(self.model.default_start(params), values.dtype)
+        parameter_values = stack_parameters(params)
+        section_state = jnp.asarray(self.model.default_start(params), parameter_values.dtype)
         section_state_derivatives = jnp.zeros(
             (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
         )
-        with ThreadPoolExecutor(2) as compile_threads:
-            cycle = compile_threads.submit(
-                with_default_settings(cycle_with_jacobian),
+        with ThreadPoolExecutor(2) as compile_pool:
+            cycle_future = compile_pool.submit(
+                with_default_settings(compute_cycle_and_derivatives),
                 self.system,
-                values,
-                self.initial_guess(values),
+                parameter_values,
+                self.make_initial_guess(parameter_values),
             )
-            step = compile_threads.submit(
-                with_default_settings(step_with_jacobian),
+            step_future = compile_pool.submit(
+                with_default_settings(compute_step_and_derivatives),
                 self.model,
                 self.n_legs,
-                values,
+                parameter_values,
                 section_state,
                 section_state_derivatives,
                 self.step_options,
             )
-            cycle.result(), step.result()
+            cycle_future.result(), step_future.result()
 
 
 @eqx.filter_jit
-def cycle_with_jacobian(
-    system: CollocationSystem, values: Array, guess: CollocationState
+def compute_cycle_and_derivatives(
+    system: CollocationSystem, parameter_values: Array, guess: CollocationState
 ) -> tuple[LimitCycle, LimitCycle]:
-    """Return the cycle near `guess`, and its derivatives with respect to all parameters, which
-    lead its axes.
-    """
+    """Return the cycle near `guess`, and its derivatives by all parameters on a leading axis."""
 
-    find_cycle = lambda values: find_limit_cycle(
-        wheel_from_parameters(values, system.n_legs), system, guess
+    find_cycle = lambda parameter_values: solve_limit_cycle(
+        wheel_from_parameters(parameter_values, system.n_legs), system, guess
     )
-    cycle, jacobian = value_and_jacobian(find_cycle, values)
-    return cycle, move_derivative_axis_first(jacobian)
+    cycle, parameter_jacobian = value_and_jacobian(find_cycle, parameter_values)
+    return cycle, move_derivative_axis_first(parameter_jacobian)
 
 
 @eqx.filter_jit
-def step_with_jacobian(
+def compute_step_and_derivatives(
     model: ViscoelasticWheel,
     n_legs: int,
-    values: Array,
+    parameter_values: Array,
     section_state: Array,
     section_state_derivatives: Array,
     options: StepOptions,
 ) -> tuple[StepResult, StepResult]:
-    """Return one step, and its derivatives with respect to all parameters if its start moves with
-    them.
+    """Return one step, and its derivatives by all parameters along the branch of gaits.
 
-    `section_state_derivatives` are those of the section state from which the step starts.
+    `section_state_derivatives` are the derivatives of the step's section state by the parameters.
     """
 
-    n_values = values.shape[0]
-    take_step = lambda inputs: model.take_step(
-        wheel_from_parameters(inputs[:n_values], n_legs), inputs[n_values:], options
+    n_values = parameter_values.shape[0]
+    take_step = lambda step_inputs: model.take_step(
+        wheel_from_parameters(step_inputs[:n_values], n_legs), step_inputs[n_values:], options
     )
-    step, jacobian = value_and_jacobian(take_step, jnp.concatenate([values, section_state]))
+    step, input_jacobian = value_and_jacobian(
+        take_step, jnp.concatenate([parameter_values, section_state])
+    )
     input_tangents = jnp.concatenate(
         [jnp.eye(n_values, dtype=section_state.dtype), section_state_derivatives], axis=1
     )
     return step, move_derivative_axis_first(
-        jax.tree.map(lambda derivative: derivative @ input_tangents.T, jacobian)
+        jax.tree.map(lambda input_derivative: input_derivative @ input_tangents.T, input_jacobian)
     )

@@ -1,8 +1,8 @@
 """Derivatives of limit cycles by the implicit function theorem, to any order and in any mode.
 
-First derivatives are the tangents of the linearized pass at the cycle. Second derivatives are
-derivatives of that pass, of its tangents and of the monodromy matrix. They are taken along the
-tangents of the cycle, one parameter after another. Both are machine code on a CPU.
+First derivatives are the tangents of the linearization at the cycle. Second derivatives are
+derivatives of that linearization, of its tangents and of the monodromy matrix. They are taken along
+the tangents of the cycle, one parameter after another. On a CPU, both orders are machine code.
 """
 
 import functools
@@ -20,12 +20,12 @@ from vrw_jax.collocation import CollocationSolution
 from vrw_jax.cycles.collocation_search import (
     CollocationState,
     CollocationSystem,
-    Parameters,
-    SearchResult,
-    register_export_names,
-    search_in_stages,
-    search_lanes,
-    state_tangents,
+    CycleSearchResult,
+    LaneParameters,
+    compute_state_tangents,
+    register_export_types,
+    run_search_attempts,
+    search_all_attempts,
 )
 from vrw_jax.models import unit_scaling as scales
 from vrw_jax.numerics import (
@@ -42,80 +42,85 @@ from vrw_jax.runtime import cached_lane_function, cached_trace, with_default_set
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, compute_wheel_units
 
 
-def _collocation_tangents(
-    system: CollocationSystem, parameters: Parameters, collocation_state: CollocationState
+def _compute_collocation_tangents(
+    system: CollocationSystem, parameters: LaneParameters, collocation_state: CollocationState
 ) -> CollocationState:
-    """Return the derivatives of the state with respect to the parameters, on a leading axis, for
-    each lane.
+    """Return the derivatives of the state by the parameters on a leading axis, for each lane.
 
-    They are zero if no cycle was found.
+    They are zero in lanes without a cycle.
     """
     linearized_pass = system.linearize_at(
         parameters, collocation_state, tuple(range(parameters.shape[0]))
     )
-    return _mask_not_found(collocation_state, state_tangents(linearized_pass, collocation_state))
+    return _zero_without_cycle(
+        collocation_state, compute_state_tangents(linearized_pass, collocation_state)
+    )
 
 
-def _masked_monodromy(
-    system: CollocationSystem, parameters: Parameters, collocation_state: CollocationState
+def _compute_masked_monodromy(
+    system: CollocationSystem, parameters: LaneParameters, collocation_state: CollocationState
 ) -> Array:
-    return _mask_not_found(
+    """Return the monodromy matrix of each lane, which is zero in lanes without a cycle."""
+    return _zero_without_cycle(
         collocation_state, system.linearize_at(parameters, collocation_state).monodromy
     )
 
 
-def _monodromy_tangents(
+def _compute_monodromy_tangents(
     system: CollocationSystem,
-    parameters: Parameters,
+    parameters: LaneParameters,
     solution_and_tangents: tuple[CollocationState, CollocationState],
 ) -> Array:
-    """Return the derivatives of the monodromy matrix along the branch, on a leading axis over
-    parameters.
+    """Return the derivatives of the monodromy matrix along the branch, parameters on a leading
+    axis.
 
-    `solution_and_tangents` are z and dz/dp. The directions are computed one after another, so that
-    the compiled code is as short as for one. Three of the nine derivatives follow from a change of
-    units. For the unit of mass, the direction increases both masses by the same factor; it leaves
-    the forces of the ground and of the legs unchanged.
+    The directions are computed one after another, so that the compiled code is as short as for one
+    direction. Three of the nine derivatives follow from a change of units. For the unit of mass,
+    the direction increases both masses by the same factor and leaves the forces unchanged.
+
+    - `solution_and_tangents`: the solution z and its derivatives dz/dp.
     """
-    collocation_state, tangents = solution_and_tangents
+    collocation_state, state_tangents = solution_and_tangents
     hub_index, leg_index = (PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass"))
     total_mass = parameters[hub_index] + parameters[leg_index]
     hub_share, leg_share = parameters[hub_index] / total_mass, parameters[leg_index] / total_mass
-    other_indices = [
+    plain_indices = [
         i
         for i in range(len(parameters))
         if i not in (hub_index, leg_index, *scales.SCALING_BY_PARAMETER)
     ]
-    ones, zeros = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
-    first_indices = jnp.asarray([*other_indices, leg_index])
-    second_indices = jnp.asarray([*other_indices, hub_index])
-    weights = (
-        jnp.stack([ones] * len(other_indices) + [hub_share]),
-        jnp.stack([zeros] * len(other_indices) + [-leg_share]),
+    unit_weights, zero_weights = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
+    first_indices = jnp.asarray([*plain_indices, leg_index])
+    second_indices = jnp.asarray([*plain_indices, hub_index])
+    direction_weights = (
+        jnp.stack([unit_weights] * len(plain_indices) + [hub_share]),
+        jnp.stack([zero_weights] * len(plain_indices) + [-leg_share]),
     )
     identity = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
     parameter_tangents = jnp.broadcast_to(identity, (len(parameters), *parameters.shape))
 
-    def monodromy_tangent(direction: tuple) -> tuple[Array, Array]:
-        first_index, second_index, first_weight, second_weight = direction
-        select_entry = lambda x, first_index: lax.dynamic_index_in_dim(
+    def monodromy_tangent(indices_and_weights: tuple) -> tuple[Array, Array]:
+        first_index, second_index, first_weight, second_weight = indices_and_weights
+        select_tangent = lambda x, first_index: lax.dynamic_index_in_dim(
             x, first_index, keepdims=False
         )
-        direction = jax.tree.map(
+        indices_and_weights = jax.tree.map(
             lambda x: (
-                first_weight * select_entry(x, first_index)
-                + second_weight * select_entry(x, second_index)
+                first_weight * select_tangent(x, first_index)
+                + second_weight * select_tangent(x, second_index)
             ),
-            (parameter_tangents, tangents),
+            (parameter_tangents, state_tangents),
         )
         return jax.jvp(
-            functools.partial(_masked_monodromy, system), (parameters, collocation_state), direction
+            functools.partial(_compute_masked_monodromy, system),
+            (parameters, collocation_state),
+            indices_and_weights,
         )
 
-    matrices, monodromy_tangents = lax.map(
-        monodromy_tangent, (first_indices, second_indices, *weights)
+    monodromy_matrices, monodromy_tangents = lax.map(
+        monodromy_tangent, (first_indices, second_indices, *direction_weights)
     )
-    tangent_by_parameter = dict(zip(other_indices, monodromy_tangents[:-1], strict=True))
+    tangent_by_parameter = dict(zip(plain_indices, monodromy_tangents[:-1], strict=True))
     mass_scale_tangent = (
         scales.MASS_SCALING.subtract_columns(
             jnp.zeros_like(monodromy_tangents[0]), tuple(parameters), tangent_by_parameter
@@ -130,8 +135,8 @@ def _monodromy_tangents(
         leg_share * mass_scale_tangent + hub_share * monodromy_tangents[-1]
     ) / squared_direction_norm
     time_scale_tangent = (
-        jnp.asarray([[0, 1], [-1, 0]])[..., None] * matrices[0]
-    )  # tangent of the monodromy over (angle, rate)
+        jnp.asarray([[0, 1], [-1, 0]])[..., None] * monodromy_matrices[0]
+    )  # derivative of the monodromy matrix by the logarithm of the time unit
     time_scale_tangents = {
         i: time_scale_tangent
         if unit_scale is scales.TIME_SCALING
@@ -144,37 +149,40 @@ def _monodromy_tangents(
     return jnp.stack([tangent_by_parameter[i] for i in range(len(parameters))])
 
 
-def _mask_not_found(collocation_state: CollocationState, tree: Any) -> Any:
+def _zero_without_cycle(collocation_state: CollocationState, tree: Any) -> Any:
     """Return the tree with zeros in the lanes without a cycle."""
-    return jax.tree.map(lambda x: jnp.where(collocation_state.found > 0.5, x, 0.0), tree)
+    return jax.tree.map(lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree)
 
 
-def compile_batched(
+def compile_batch_function(
     function: BatchFunction, make_output_template: Callable, cache_key: tuple, batch_size: int
 ) -> BatchFunction:
-    """Return a batched function compiled in its fastest form: machine code on a CPU, else XLA in
-    blocks.
+    """Return a batch function compiled in its fastest form.
+
+    The fastest form is machine code on a CPU, else XLA in blocks of `batch_size` lanes.
     """
     if simd.is_available():
         return cached_lane_function(function, make_output_template, cache_key)
-    register_export_names()
+    register_export_types()
     return cached_trace(make_blockwise(function, batch_size), cache_key)
 
 
-def _make_compiler(
-    name: str, make_templates: tuple[Callable, ...], system: CollocationSystem
+def _make_derivative_compiler(
+    function_name: str, make_output_templates: tuple[Callable, ...], system: CollocationSystem
 ) -> ExecutionWrapper:
-    """Return a function that compiles a batch function, given the order of the derivative it
-    computes.
+    """Return a function that compiles a batch function for a given order of derivatives.
 
-    Orders with an output template use `compile_batched`, higher orders XLA.
+    Orders with an output template use `compile_batch_function`, higher orders XLA.
     """
-    batch_size = system.options.batch_size
+    batch_size = system.cycle_options.batch_size
 
-    def compile_function(function: BatchFunction, order: int) -> BatchFunction:
-        if order < len(make_templates):
-            return compile_batched(
-                function, make_templates[order], (name, order, system), batch_size
+    def compile_function(function: BatchFunction, derivative_order: int) -> BatchFunction:
+        if derivative_order < len(make_output_templates):
+            return compile_batch_function(
+                function,
+                make_output_templates[derivative_order],
+                (function_name, derivative_order, system),
+                batch_size,
             )
         return make_blockwise(function, batch_size)
 
@@ -182,115 +190,128 @@ def _make_compiler(
 
 
 def _make_tangent_function(system: CollocationSystem) -> Callable:
-    """Return `_collocation_tangents` of one wheel as a differentiable function."""
-    make_templates = (
+    """Return `_compute_collocation_tangents` of one wheel as a differentiable function."""
+    make_output_templates = (
         (lambda parameters, collocation_state: collocation_state),
         (lambda parameters, solution_and_tangents: solution_and_tangents[0]),
     )
-    compile_function = _make_compiler("columns", make_templates, system)
-    tangents = with_implicit_derivative(
-        functools.partial(_collocation_tangents, system),
-        lambda *at: tangents(*at),
+    compile_function = _make_derivative_compiler("columns", make_output_templates, system)
+    compute_tangents = with_implicit_derivative(
+        functools.partial(_compute_collocation_tangents, system),
+        lambda *inputs: compute_tangents(*inputs),
         compile_function,
     )
-    return tangents
+    return compute_tangents
 
 
 def _search_in_scaled_units(
     system: CollocationSystem,
-    search: BatchFunction,
-    parameters: Parameters,
-    *guess: CollocationState,
-) -> SearchResult:
-    """Return the result of `search_in_stages` in SI, searched in the wheel's own units of length
-    and time.
+    run_attempts: BatchFunction,
+    parameters: LaneParameters,
+    *si_guess: CollocationState,
+) -> CycleSearchResult:
+    """Return the result of `search_all_attempts` in SI units.
 
-    The section is (theta, dtheta) after a landing; the step ends are (theta, L1) and their rates.
-    Mass is not converted, because no unknown contains it.
+    The search uses units of length and time of the wheel. The section state is (theta, dtheta)
+    after a landing. Step ends are (theta, L1) and their rates. Mass is not converted, because no
+    unknown contains it.
     """
-    units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(mass=1.0)
-    angle_unit, time_unit = jnp.ones_like(units.time), units.time
-    position_units = jnp.stack([angle_unit, units.length, units.length])
+    wheel_units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(
+        mass=1.0
+    )
+    angle_unit, time_unit = jnp.ones_like(wheel_units.time), wheel_units.time
+    position_units = jnp.stack([angle_unit, wheel_units.length, wheel_units.length])
     section_units = jnp.stack([angle_unit, 1.0 / time_unit])
     end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
 
     def convert_units(
-        state: CollocationState, apply_unit: Callable[[Array, Array], Array]
+        collocation_state: CollocationState, apply_unit: Callable[[Array, Array], Array]
     ) -> CollocationState:
         """Return the state with each number converted by `apply_unit(number, unit)`."""
-        solution = state.solution
+        collocation_solution = collocation_state.solution
         accelerations = tuple(
             apply_unit(x, position_units[: x.shape[-2]] / (time_unit * time_unit))
-            for x in solution.accelerations
+            for x in collocation_solution.accelerations
         )
-        solution = CollocationSolution(
-            apply_unit(solution.section_state, section_units),
-            apply_unit(solution.durations, time_unit),
+        collocation_solution = CollocationSolution(
+            apply_unit(collocation_solution.section_state, section_units),
+            apply_unit(collocation_solution.durations, time_unit),
             accelerations,
         )
-        return state._replace(solution=solution, ends=apply_unit(state.ends, end_units))
+        return collocation_state._replace(
+            solution=collocation_solution,
+            step_end_states=apply_unit(collocation_state.step_end_states, end_units),
+        )
 
-    scaled_guess = tuple(convert_units(state, operator.truediv) for state in guess)
+    scaled_guess = tuple(convert_units(state, operator.truediv) for state in si_guess)
     parameter_units = [
-        units.si_value(parameter_domain.unit) for parameter_domain in PARAMETER_DOMAINS.values()
+        wheel_units.si_value(parameter_domain.unit)
+        for parameter_domain in PARAMETER_DOMAINS.values()
     ]
-    scaled_parameters = [x / unit for x, unit in zip(parameters, parameter_units, strict=True)]
-    result = search_in_stages(system, search, jnp.stack(scaled_parameters), *scaled_guess)
-    monodromy = section_units[:, None] * result.monodromy / section_units
-    return result._replace(state=convert_units(result.state, operator.mul), monodromy=monodromy)
+    scaled_parameters = [
+        parameter_value / parameter_unit
+        for parameter_value, parameter_unit in zip(parameters, parameter_units, strict=True)
+    ]
+    search_result = search_all_attempts(
+        system, run_attempts, jnp.stack(scaled_parameters), *scaled_guess
+    )
+    monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
+    return search_result._replace(
+        collocation_state=convert_units(search_result.collocation_state, operator.mul),
+        monodromy_matrix=monodromy_matrix,
+    )
 
 
 def solve_cycle_with_derivatives(
     system: CollocationSystem, parameters: Array, guess: CollocationState | None
 ) -> tuple[CollocationState, tuple]:
-    """Return the cycle of one wheel, differentiable in its parameters, and the diagnostics of the
-    search.
+    """Return the cycle of one wheel and the diagnostics of the search.
 
-    The guess has no derivative.
+    The cycle is differentiable with respect to the parameters. The guess has no derivative.
     """
-    search_problem = functools.partial(search_lanes, system)
-    make_template = lambda parameters, start, *_: start
-    batched_search = compile_batched(
-        search_problem, make_template, ("search", system), system.options.batch_size
+    search_function = functools.partial(run_search_attempts, system)
+    make_output_template = lambda parameters, start, *_: start
+    batched_search = compile_batch_function(
+        search_function, make_output_template, ("search", system), system.cycle_options.batch_size
     )
-    search_single_wheel = unbatch(
-        functools.partial(_search_in_scaled_units, system, batched_search)
-    )
-    tangents_of = _make_tangent_function(system)
+    search_one_wheel = unbatch(functools.partial(_search_in_scaled_units, system, batched_search))
+    compute_tangents = _make_tangent_function(system)
 
     @jax.custom_jvp
     def solve_with_rule(
         parameters: Array, *guess: CollocationState
     ) -> tuple[CollocationState, tuple]:
-        collocation_state, *diagnostics = search_single_wheel(parameters, *guess)
+        collocation_state, *diagnostics = search_one_wheel(parameters, *guess)
         return collocation_state, tuple(diagnostics)
 
     @solve_with_rule.defjvp
     @with_default_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         collocation_state, diagnostics = solve_with_rule(*primals)
-        tangent = apply_jacobian(tangents_of(primals[0], collocation_state), tangents[0])
+        tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
         return (collocation_state, diagnostics), (tangent, zero_tangent(diagnostics))
 
     return solve_with_rule(parameters, *(() if guess is None else (guess,)))
 
 
-def attach_monodromy(
+def attach_monodromy_derivatives(
     system: CollocationSystem,
     monodromy_value: Array,
     parameters: Array,
     collocation_state: CollocationState,
 ) -> Array:
     """Return `monodromy_value` with the derivatives of the monodromy matrix along the branch."""
-    make_template = lambda parameters, solution_and_tangents: parameters
-    compile_function = _make_compiler("monodromy", (make_template, make_template), system)
-    monodromy_of = functools.partial(_masked_monodromy, system)
-    tangents_of_monodromy = functools.partial(_monodromy_tangents, system)
-    jacobian_of = implicit_jacobian(
-        monodromy_of,
+    make_output_template = lambda parameters, solution_and_tangents: parameters
+    compile_function = _make_derivative_compiler(
+        "monodromy", (make_output_template, make_output_template), system
+    )
+    compute_monodromy = functools.partial(_compute_masked_monodromy, system)
+    compute_monodromy_tangents = functools.partial(_compute_monodromy_tangents, system)
+    compute_parameter_jacobian = implicit_jacobian(
+        compute_monodromy,
         _make_tangent_function(system),
         compile_function,
-        make_jacobian=tangents_of_monodromy,
+        make_jacobian=compute_monodromy_tangents,
     )
 
     @jax.custom_jvp
@@ -302,6 +323,8 @@ def attach_monodromy(
     @attach_with_rule.defjvp
     @with_default_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
-        return attach_with_rule(*primals), apply_jacobian(jacobian_of(*primals[1:]), tangents[1])
+        return attach_with_rule(*primals), apply_jacobian(
+            compute_parameter_jacobian(*primals[1:]), tangents[1]
+        )
 
     return attach_with_rule(monodromy_value, parameters, collocation_state)

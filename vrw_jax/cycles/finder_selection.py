@@ -1,4 +1,4 @@
-"""Selection of the finder for a model, and checks of the arguments of a search."""
+"""Selection of the gait finder for a model, and checks of the arguments of a search."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -29,7 +29,7 @@ from vrw_jax.simulation import (
 from vrw_jax.validation import check_type, is_traced
 from vrw_jax.wheel import WheelParams
 
-Guess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
+CycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
 """Guess of a user: a neighbor's cycle, or a section state near the gait."""
 
 FINDER_CLASSES: dict[GaitMethod, type[AbstractGaitFinder]] = {
@@ -38,7 +38,7 @@ FINDER_CLASSES: dict[GaitMethod, type[AbstractGaitFinder]] = {
     GaitMethod.RETURN_MAP: ReturnMapFinder,
     GaitMethod.SELECTION: ReturnMapFinder,
 }
-"""Finder class by gait method."""
+"""Class of the gait finder by the gait method of a model."""
 
 
 def make_finder(
@@ -53,18 +53,18 @@ def make_finder(
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
-    make_from_options = FINDER_CLASSES[resolved_model.capabilities.gait_method].from_options
-    return make_from_options(resolved_model, n_legs, check_options(step_options), period_n,
+    make_finder_from_options = FINDER_CLASSES[resolved_model.capabilities.gait_method].from_options
+    return make_finder_from_options(resolved_model, n_legs, check_options(step_options), period_n,
                 CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
-    """Return the model of this wheel's gait: for the ladder, the lowest model whose margins are
-    met.
+    """Return the model of this wheel's gait.
 
-    The paper's gait is tried first. If it is not found or violates a margin on this ground, the
-    upper model is returned. Any other model is returned unchanged. The ladder is returned unchanged
-    if the parameters have no concrete values.
+    For the ladder, it is the lowest model whose margins are met. The paper's gait is tried first.
+    If it is not found or violates a margin on its ground, the upper model is returned. Any other
+    model is returned unchanged. The ladder is returned unchanged if the parameters have no concrete
+    values.
     """
     return resolve_model_with_reason(params, model)[0]
 
@@ -73,34 +73,33 @@ def resolve_model_with_reason(
     params: WheelParams, model: ModelLike | None
 ) -> tuple[ModelLike | None, str | None]:
     """Return `resolve_model` and, for the ladder, the reason in one sentence."""
-    ladder: Any = check_model(model)
-    if ladder.fallback_model is ladder or not isinstance(params, WheelParams):
+    selected_model: Any = check_model(model)
+    if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
         return model, None
     if is_traced(params, model) or params.damping.ndim:
         return model, None
-    cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
-    if not bool(cycle.found):
-        return ladder.fallback_model, f"The paper's wheel has no gait: {cycle.why}"
-    section_state = ladder.embed_section(params, cycle.section_state)
-    ladder_choice = ladder.choose_model(params, section_state, StepOptions())[0]
-    return ladder_choice.model, ladder_choice.why
+    paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
+    if not bool(paper_cycle.found):
+        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.why}"
+    section_state = selected_model.embed_section(params, paper_cycle.section_state)
+    model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
+    return model_choice.model, model_choice.why
 
 
 def check_guess(guess: Any) -> Any:
     """Return a user's guess: a cycle, a `CollocationState` or a finite section state.
 
-    Raises: ValueError: the section state is not finite.
+    Raise ValueError if the section state is not finite.
     """
     if guess is None or isinstance(guess, AbstractCycle | CollocationState):
         return guess
-    state = check_section_state(guess, "guess")
-    if not is_traced(state) and not np.isfinite(state).all():
+    section_state = check_section_state(guess, "guess")
+    if not is_traced(section_state) and not np.isfinite(section_state).all():
         raise ValueError(
-            f"guess is {format_numbers(state)}, but a search can begin at finite numbers only: "
-            f"give a "
-            "neighbour's cycle, or a section state near the gait."
+            f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
+            "only: give a neighbour's cycle, or a section state near the gait."
         )
-    return state
+    return section_state
 
 
 def resolve_finder(
@@ -109,9 +108,9 @@ def resolve_finder(
     options: CycleOptions | StepOptions | None,
     period_n: int = 1,
 ) -> AbstractGaitFinder:
-    """Return the finder for these options, after checks of the arguments.
+    """Return the finder for a model and options, after checks of the arguments.
 
-    Raises: TypeError, ValueError: the arguments do not fit the model.
+    Raise TypeError or ValueError if the arguments do not fit the model.
     """
     check_single_wheel(
         params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
@@ -119,22 +118,22 @@ def resolve_finder(
     if options is not None:
         check_type("options", options, (CycleOptions, StepOptions), "give vrw.CycleOptions()")
     has_cycle_options = isinstance(options, CycleOptions)
-    finder = make_finder(
+    gait_finder = make_finder(
         model,
         params.n_legs,
         period_n=period_n,
         cycle_options=options if has_cycle_options else None,  # type: ignore[arg-type]
         step_options=None if has_cycle_options else options,  # type: ignore[arg-type]
     )
-    if options is not None and not isinstance(options, finder.options_type):
+    if options is not None and not isinstance(options, gait_finder.options_type):
         if has_cycle_options:
             raise TypeError(
-                f"options is a CycleOptions, but {type(finder.model).__name__} is solved on its "
-                "return map: give the vrw.StepOptions of its step."
+                f"options is a CycleOptions, but {type(gait_finder.model).__name__} is solved on "
+                "its return map: give the vrw.StepOptions of its step."
             )
         raise TypeError(
             "options is an Options, but the paper's wheel is solved by collocation: "
             "give vrw.CycleOptions(), or CycleOptions.tight()."
         )
-    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
-    return finder
+    gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    return gait_finder

@@ -1,6 +1,7 @@
-"""Peaks of the ground's normal force in a gait of the paper's model, located on its collocation.
+"""Peaks of the ground's normal force in a gait of the paper's model.
 
-A peak is a smooth maximum inside a phase. Impacts and changes of phase are no peaks.
+The peaks are located on the collocation of the gait. A peak is a smooth maximum inside a phase.
+Impacts and changes of phase are no peaks.
 """
 
 import functools
@@ -27,60 +28,74 @@ def compute_force_peaks(
     system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> dict[str, Scalar]:
     """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps."""
-    s = wheel_from_parameters(parameters, system.n_legs).symbols()
-    step_peaks, (_, steps) = [], system.evaluate_phase_points(parameters, solution)
-    for step_index, phase_points in enumerate(steps):
-        phases = make_phases(s, phase_points[0].start.held_constants[0], stop_at_lift_off=False)
-        durations = solution.durations[step_index]
-        fore_extrema, total_extrema = [], []
-        for i, (phase, points) in enumerate(zip(phases, phase_points, strict=True)):
-            motion = CollocatedPhase.from_nodes(
-                system.meshes[i],
-                jnp.stack(points.start.q),
-                jnp.stack(points.start.v),
-                durations[i],
-                solution.accelerations[i][step_index],
+    wheel_symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
+    peaks_by_step, (_, phase_points_by_step) = (
+        [],
+        system.evaluate_phase_points(parameters, solution),
+    )
+    for step_index, phase_points in enumerate(phase_points_by_step):
+        phases = make_phases(
+            wheel_symbols, phase_points[0].start.held_constants[0], stop_at_lift_off=False
+        )
+        phase_durations = solution.durations[step_index]
+        fore_force_extrema, total_force_extrema = [], []
+        for phase_index, (phase, points_of_phase) in enumerate(
+            zip(phases, phase_points, strict=True)
+        ):
+            collocated_phase = CollocatedPhase.from_nodes(
+                system.phase_meshes[phase_index],
+                jnp.stack(points_of_phase.start.q),
+                jnp.stack(points_of_phase.start.v),
+                phase_durations[phase_index],
+                solution.accelerations[phase_index][step_index],
             )
-            fore_extrema.append(_find_force_extrema(phase, motion, with_rear_foot=False))
-            has_rear_foot = i == 0
-            total_extrema.append(
-                _find_force_extrema(phase, motion, with_rear_foot=True)
+            fore_force_extrema.append(
+                _find_force_extrema(phase, collocated_phase, with_rear_foot=False)
+            )
+            has_rear_foot = phase_index == 0
+            total_force_extrema.append(
+                _find_force_extrema(phase, collocated_phase, with_rear_foot=True)
                 if has_rear_foot
-                else fore_extrema[-1]
+                else fore_force_extrema[-1]
             )
-        fore, total = (_summarize(extrema, durations) for extrema in (fore_extrema, total_extrema))
-        end = phase_points[-1].end
-        landing = transitions.land(s, end.q[0], *end.v)
-        step_peaks.append(
+        fore_peaks, total_peaks = (
+            _summarize_force_extrema(extrema, phase_durations)
+            for extrema in (fore_force_extrema, total_force_extrema)
+        )
+        end_point = phase_points[-1].end
+        landing = transitions.land(wheel_symbols, end_point.q[0], *end_point.v)
+        peaks_by_step.append(
             {
-                "n_force_peaks": fore.n_peaks,
-                "peak_force": fore.peak_force,
-                "force_trough_depth": fore.trough_depth,
-                "second_peak_rate": fore.second_peak_rate,
-                "n_total_force_peaks": total.n_peaks,
-                "peak_total_force": total.peak_force,
+                "n_force_peaks": fore_peaks.n_peaks,
+                "peak_force": fore_peaks.peak_force,
+                "force_trough_depth": fore_peaks.trough_depth,
+                "second_peak_rate": fore_peaks.second_peak_rate,
+                "n_total_force_peaks": total_peaks.n_peaks,
+                "peak_total_force": total_peaks.peak_force,
                 "landing_impulse": landing.fore_impulse.normal,
             }
         )
-    return jax.tree.map(lambda *values: jnp.nanmax(jnp.stack(values)), *step_peaks)
+    return jax.tree.map(
+        lambda *values_by_step: jnp.nanmax(jnp.stack(values_by_step)), *peaks_by_step
+    )
 
 
 def _find_force_extrema(
-    phase: AbstractPhase, motion: CollocatedPhase, with_rear_foot: bool
+    phase: AbstractPhase, collocated_phase: CollocatedPhase, with_rear_foot: bool
 ) -> PhaseExtrema:
     """Return the extrema of the normal force on the fore foot, or on both feet, in a phase."""
 
-    def acceleration_at(q: Array, v: Array) -> Array:
+    def evaluate_acceleration(q: Array, v: Array) -> Array:
         return jnp.stack(phase.acceleration(phase.motion_at(tuple(q), tuple(v)))[: phase.n_dof])
 
-    def normal_force_at(q: Array, v: Array) -> Array:
-        instant = PhaseInstant(phase, phase.motion_at(tuple(q), tuple(v)), None)
-        force = jnp.asarray(instant.fore_force.normal)
-        if with_rear_foot and instant.rear_force is not None:
-            force = force + instant.rear_force.normal
-        return force
+    def evaluate_normal_force(q: Array, v: Array) -> Array:
+        phase_instant = PhaseInstant(phase, phase.motion_at(tuple(q), tuple(v)), None)
+        normal_force = jnp.asarray(phase_instant.fore_force.normal)
+        if with_rear_foot and phase_instant.rear_force is not None:
+            normal_force = normal_force + phase_instant.rear_force.normal
+        return normal_force
 
-    return find_extrema(motion, acceleration_at, normal_force_at)
+    return find_extrema(collocated_phase, evaluate_acceleration, evaluate_normal_force)
 
 
 class _ForcePeaks(NamedTuple):
@@ -92,28 +107,36 @@ class _ForcePeaks(NamedTuple):
     second_peak_rate: Scalar
 
 
-def _summarize(extrema_of_phases: list[PhaseExtrema], durations: Array) -> _ForcePeaks:
+def _summarize_force_extrema(
+    extrema_of_phases: list[PhaseExtrema], phase_durations: Array
+) -> _ForcePeaks:
     """Return the peaks of a step from the extrema in its phases."""
-    starts = jnp.cumsum(durations) - durations
+    phase_start_times = jnp.cumsum(phase_durations) - phase_durations
     shifted_extrema = [
-        extrema._replace(time=extrema.time + start, rate_time=extrema.rate_time + start)
-        for extrema, start in zip(extrema_of_phases, starts, strict=True)
+        step_extrema._replace(
+            time=step_extrema.time + start, rate_time=step_extrema.rate_time + start
+        )
+        for step_extrema, start in zip(extrema_of_phases, phase_start_times, strict=True)
     ]
-    extrema = jax.tree.map(lambda *parts: jnp.concatenate(parts), *shifted_extrema)
-    peaks = jnp.where(extrema.is_maximum, extrema.value, -jnp.inf)
-    order = jnp.arange(len(peaks))
-    highest_where = lambda mask: jnp.max(jnp.where(mask, peaks, -jnp.inf), axis=1)
-    highest_before = highest_where(order < order[:, None])
-    highest_after = highest_where(order > order[:, None])
-    lower_peak = jnp.minimum(highest_before, highest_after)
-    is_trough = extrema.is_minimum & jnp.isfinite(lower_peak)
-    depths = jnp.where(is_trough, jnp.where(is_trough, lower_peak, 0.0) - extrema.value, 0.0)
-    first_peak_time = jnp.min(jnp.where(extrema.is_maximum, extrema.time, jnp.inf))
-    is_later_maximum = extrema.is_rate_maximum & (extrema.rate_time > first_peak_time)
-    largest_rate = jnp.max(jnp.where(is_later_maximum, extrema.rate, -jnp.inf))
+    step_extrema = jax.tree.map(lambda *phase_parts: jnp.concatenate(phase_parts), *shifted_extrema)
+    peak_forces = jnp.where(step_extrema.is_maximum, step_extrema.value, -jnp.inf)
+    extremum_indices = jnp.arange(len(peak_forces))
+    find_highest_peak = lambda extremum_mask: jnp.max(
+        jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
+    )
+    highest_peak_before = find_highest_peak(extremum_indices < extremum_indices[:, None])
+    highest_peak_after = find_highest_peak(extremum_indices > extremum_indices[:, None])
+    lower_peak = jnp.minimum(highest_peak_before, highest_peak_after)
+    is_force_trough = step_extrema.is_minimum & jnp.isfinite(lower_peak)
+    trough_depths = jnp.where(
+        is_force_trough, jnp.where(is_force_trough, lower_peak, 0.0) - step_extrema.value, 0.0
+    )
+    first_peak_time = jnp.min(jnp.where(step_extrema.is_maximum, step_extrema.time, jnp.inf))
+    is_later_maximum = step_extrema.is_rate_maximum & (step_extrema.rate_time > first_peak_time)
+    largest_force_rate = jnp.max(jnp.where(is_later_maximum, step_extrema.rate, -jnp.inf))
     return _ForcePeaks(
-        n_peaks=jnp.sum(extrema.is_maximum).astype(durations.dtype),
-        peak_force=jnp.where(jnp.any(extrema.is_maximum), jnp.max(peaks), 0.0),
-        trough_depth=jnp.max(depths),
-        second_peak_rate=jnp.where(jnp.any(is_later_maximum), largest_rate, jnp.nan),
+        n_peaks=jnp.sum(step_extrema.is_maximum).astype(phase_durations.dtype),
+        peak_force=jnp.where(jnp.any(step_extrema.is_maximum), jnp.max(peak_forces), 0.0),
+        trough_depth=jnp.max(trough_depths),
+        second_peak_rate=jnp.where(jnp.any(is_later_maximum), largest_force_rate, jnp.nan),
     )

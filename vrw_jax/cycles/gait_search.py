@@ -17,16 +17,16 @@ import numpy as np
 from jax import lax
 
 from vrw_jax.batches import SolverIndex, select_solver, step_batch
-from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_indices
+from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
 from vrw_jax.cycles.finder import AbstractGaitFinder
-from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.finder_selection import CycleGuess, check_guess, resolve_finder, resolve_model
 from vrw_jax.cycles.gait_walks import (
     GAIT_WALK_OPTIONS,
-    compute_fallback_starts,
+    compute_fallback_walk_starts,
     compute_walk_starts,
-    measure_period_defect,
+    measure_period_defects,
     walk_to_gaits,
 )
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
@@ -56,37 +56,36 @@ RETRY_OUTCOMES = (
 
 
 @dataclass(frozen=True)
-class FallbackOptions:
+class SearchFallbackOptions:
     """Options of finer meshes, which are fallbacks of the search for gaits of the paper's model."""
 
-    refine_above: float = 1e-7
+    max_unrefined_mesh_error: float = 1e-7
     """Estimate of the mesh error above which a finer mesh is used.
 
-    It is chosen because the errors themselves are a hundredth of the estimate.
-    """
-    max_refinements: int = 3
+    The value is chosen because the actual errors are a hundredth of the estimate."""
+    max_mesh_refinements: int = 3
     """Largest number of times that the number of mesh intervals is doubled."""
 
 
-FALLBACK_OPTIONS = FallbackOptions()
+SEARCH_FALLBACK_OPTIONS = SearchFallbackOptions()
 
-FailureValue = Literal["zeros", "nan"]
-FAILURE_VALUES: tuple[str, ...] = get_args(FailureValue)
+FailureFill = Literal["zeros", "nan"]
+FAILURE_FILLS: tuple[str, ...] = get_args(FailureFill)
 
 GaitChoice = Literal["slowest", "fastest"] | int
-"""Choice among the attracting gaits of a wheel, by speed: the slowest, the fastest, or an index,
-slowest first."""
+"""Choice among the attracting gaits of a wheel by speed: the slowest, the fastest, or an index in
+their list, slowest first."""
 
 
 @overload
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: Guess | None = None,
+    guess: CycleGuess | None = None,
     period_n: int = 1,
     model: None = None,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureValue = "zeros",
+    on_failure: FailureFill = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle: ...
 
@@ -95,11 +94,11 @@ def limit_cycle(
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: Guess | None = None,
+    guess: CycleGuess | None = None,
     period_n: int = 1,
     model: ModelLike,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureValue = "zeros",
+    on_failure: FailureFill = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle: ...
 
@@ -109,11 +108,11 @@ def limit_cycle(
 def limit_cycle(
     params: WheelParams,
     *,
-    guess: Guess | None = None,
+    guess: CycleGuess | None = None,
     period_n: int = 1,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
-    on_failure: FailureValue = "zeros",
+    on_failure: FailureFill = "zeros",
     which: GaitChoice = "slowest",
 ) -> LimitCycle | ReturnMapCycle:
     """Return the limit cycle of this wheel: the gait that repeats after `period_n` steps.
@@ -166,15 +165,17 @@ def limit_cycle(
     """
     parse_gait_choice(which)
     model = resolve_model(params, model)
-    finder = resolve_finder(params, model, options, check_int("period_n", period_n))
-    uses_nan = check_choice("on_failure", on_failure, FAILURE_VALUES) == "nan"
-    if guess is None and period_n > 1 and not finder.is_multistable:
+    gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
+    returns_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
+    if guess is None and period_n > 1 and not gait_finder.is_multistable:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle: Any = _search_with_fallbacks(finder, params, check_guess(guess), options is None, which)
-    return cycle.replace_missing_by_nan(params) if uses_nan else cycle
+    cycle: Any = _search_with_fallbacks(
+        gait_finder, params, check_guess(guess), options is None, which
+    )
+    return cycle.replace_missing_gaits_by_nan(params) if returns_nan else cycle
 
 
 @with_default_settings
@@ -212,29 +213,31 @@ def limit_cycles(
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
     parse_gait_choice(which)
-    shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
-    if not shape:
+    batch_shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
+    if not batch_shape:
         model = resolve_model(params, model)
-        finder = resolve_finder(params, model, options, check_int("period_n", period_n))
-        if finder.is_multistable:
+        gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
+        if gait_finder.is_multistable:
             check_not_traced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
-            return find_attracting_gaits(finder, finder.model.parameter_values(params)[None])[1]
-    if len(shape) != 1:
-        raise ValueError(f"the wheels' batch has shape {shape}, but it must have one axis.")
-    if shape == (0,):
+            return find_attracting_gaits(
+                gait_finder, gait_finder.model.parameter_values(params)[None]
+            )[1]
+    if len(batch_shape) != 1:
+        raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
+    if batch_shape == (0,):
         invalid_params = jax.tree.map(lambda x: jnp.full((1,), jnp.nan, x.dtype), params)
         missing_cycle = limit_cycles(
             invalid_params, period_n=period_n, model=model, options=options, which=which
         )
         return _take_rows_on_device(missing_cycle, slice(0, 0))
     if is_traced(params):
-        params = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), params)
+        params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch_shape), params)
         single_params = jax.tree.map(lambda x: x[0], params)
     else:  # NumPy is used because JAX would compile a program for each batch size.
-        params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), shape), params)
+        params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
         params, single_params = jax.device_put((params, take_rows(params, 0)))
-    finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
-    cycle: Any = _search_with_fallbacks(finder, params, None, options is None, which)
+    gait_finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
+    cycle: Any = _search_with_fallbacks(gait_finder, params, None, options is None, which)
     return cycle
 
 
@@ -250,69 +253,84 @@ def parse_gait_choice(which: GaitChoice) -> int:
     return int(which)
 
 
-def _select_gait(finder: Any, params: WheelParams, which: GaitChoice) -> Any:
+def _find_chosen_gaits(gait_finder: Any, params: WheelParams, which: GaitChoice) -> Any:
     """Return the attracting gait that `which` selects for each wheel."""
     n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(which)
-    wheel_index, gaits = find_attracting_gaits(
-        finder, jax.vmap(finder.model.parameter_values)(params)
+    gait_wheel_indices, attracting_gaits = find_attracting_gaits(
+        gait_finder, jax.vmap(gait_finder.model.parameter_values)(params)
     )
-    n_gaits_per_wheel = np.bincount(wheel_index, minlength=n_wheels)
-    has_too_few_gaits = n_gaits_per_wheel[
+    n_gaits_per_wheel = np.bincount(gait_wheel_indices, minlength=n_wheels)
+    insufficient_gait_counts = n_gaits_per_wheel[
         (gait_rank >= n_gaits_per_wheel) | (gait_rank < -n_gaits_per_wheel)
     ]
-    if len(has_too_few_gaits):
-        n_gaits = int(has_too_few_gaits[0])
+    if len(insufficient_gait_counts):
+        n_available_gaits = int(insufficient_gait_counts[0])
         raise ValueError(
-            f"which is {which}, but {n_gaits} gait{'s' * (n_gaits > 1)} of this wheel attract"
-            f"{'s' * (n_gaits == 1)}: vrw.limit_cycles(params, model=...) returns them."
+            f"which is {which}, but {n_available_gaits} gait{'s' * (n_available_gaits > 1)} of "
+            f"this wheel attract{'s' * (n_available_gaits == 1)}: "
+            "vrw.limit_cycles(params, model=...) returns them."
         )
     return _take_rows_on_device(
-        gaits, find_slowest_indices(wheel_index, n_wheels) + gait_rank % n_gaits_per_wheel
+        attracting_gaits,
+        find_slowest_gait_indices(gait_wheel_indices, n_wheels) + gait_rank % n_gaits_per_wheel,
     )
 
 
 def _search_with_fallbacks(
-    finder: Any, params: WheelParams, guess: Any, refines_mesh: bool, which: GaitChoice
+    gait_finder: Any, params: WheelParams, guess: Any, can_refine_mesh: bool, which: GaitChoice
 ) -> Any:
     """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
     is_batch = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
-    is_traced_value, is_concrete = is_traced(params_without_tangents), not is_traced(params)
-    if finder.is_multistable and guess is None and not is_traced_value:
-        cycle = _select_gait(
-            finder,
+    has_no_values, is_concrete = is_traced(params_without_tangents), not is_traced(params)
+    if gait_finder.is_multistable and guess is None and not has_no_values:
+        cycle = _find_chosen_gaits(
+            gait_finder,
             params_without_tangents
             if is_batch
             else _take_rows_on_device(params_without_tangents, None),
             which,
         )
         cycle = cycle if is_batch else _take_rows_on_device(cycle, 0)
-        return cycle if is_concrete else _search(finder, params, cycle.section_state)
-    cycle = _search(finder, params, guess)
+        return cycle if is_concrete else _run_search(gait_finder, params, cycle.section_state)
+    cycle = _run_search(gait_finder, params, guess)
     params_and_cycle = lax.stop_gradient((params, cycle))  # Differentiated arrays have values, too.
-    if not finder.supports_cold_start or is_traced(params_and_cycle):
+    if not gait_finder.supports_cold_start or is_traced(params_and_cycle):
         return cycle
     if not is_batch:
         params_and_cycle = _take_rows_on_device(params_and_cycle, None)
     section_state = None
     if guess is not None:
-        section_state = np.asarray(lax.stop_gradient(_guess_section_state(guess)))[None]
-    fallback = _fallback_starts(finder, *params_and_cycle, section_state, refines_mesh)
-    if finder.period_n > 1 and section_state is not None:
-        if fallback is None:
-            fallback = _retry_from_other_steps(finder, *params_and_cycle, section_state)
-        fallback = _align_first_step(finder, *params_and_cycle, section_state, fallback)
-    if fallback is None:
+        if isinstance(guess, CollocationState):
+            guess_state = guess.step_end_states[-1][jnp.array([0, 2, 3])]
+        else:
+            guess_state = getattr(guess, "section_state", guess)
+        section_state = np.asarray(lax.stop_gradient(guess_state))[None]
+    finder_and_starts = _find_fallback_starts(
+        gait_finder, *params_and_cycle, section_state, can_refine_mesh
+    )
+    if gait_finder.period_n > 1 and section_state is not None:
+        if finder_and_starts is None:
+            finder_and_starts = _retry_from_other_steps(
+                gait_finder, *params_and_cycle, section_state
+            )
+        finder_and_starts = _align_first_step(
+            gait_finder, *params_and_cycle, section_state, finder_and_starts
+        )
+    if finder_and_starts is None:
         return cycle
-    finder, collocation_state = fallback
+    gait_finder, collocation_state = finder_and_starts
     if is_concrete:
         retried_cycle = map_in_batches(
-            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params_and_cycle[0], collocation_state
+            gait_finder.find_cycles,
+            batch_sizes.GAIT_BATCH_SIZES,
+            params_and_cycle[0],
+            collocation_state,
         )  # a compiled program
         retried_cycle = retried_cycle if is_batch else _take_rows_on_device(retried_cycle, 0)
     else:
-        retried_cycle = _search(
-            finder,
+        retried_cycle = _run_search(
+            gait_finder,
             params,
             jax.device_put(collocation_state)
             if is_batch
@@ -322,25 +340,35 @@ def _search_with_fallbacks(
 
 
 def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
-    """Return the cycles of the retry; a wheel without a gait keeps the reason of the first search.
+    """Return the cycles of the retry, with the reason of the first search where no gait exists.
 
     All functions therefore report the same reason, with or without fallbacks, and in any batch.
     """
-    get_reason = lambda x: (x.outcome, x.collocation_state.failed_check)
-    first_reason, last_reason = get_reason(cycle), get_reason(retried_cycle)
-    select_array: Any = jnp.where
-    if not is_traced((first_reason, last_reason)):  # numpy compiles nothing for a new batch size
-        first_reason, last_reason = jax.tree.map(np.asarray, (first_reason, last_reason))
-        select_array = lambda *arrays: jax.device_put(np.where(*arrays))
-    is_missing = (first_reason[0] != Outcome.STEPPED) & (last_reason[0] != Outcome.STEPPED)
-    reason = [
-        select_array(is_missing, *pair) for pair in zip(first_reason, last_reason, strict=True)
+    get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
+    first_failure_reason, last_failure_reason = (
+        get_failure_reason(cycle),
+        get_failure_reason(retried_cycle),
+    )
+    select_values: Any = jnp.where
+    if not is_traced(
+        (first_failure_reason, last_failure_reason)
+    ):  # NumPy compiles nothing for a new batch size.
+        first_failure_reason, last_failure_reason = jax.tree.map(
+            np.asarray, (first_failure_reason, last_failure_reason)
+        )
+        select_values = lambda *arrays: jax.device_put(np.where(*arrays))
+    is_missing = (first_failure_reason[0] != Outcome.STEPPED) & (
+        last_failure_reason[0] != Outcome.STEPPED
+    )
+    failure_reason = [
+        select_values(is_missing, *reason_pair)
+        for reason_pair in zip(first_failure_reason, last_failure_reason, strict=True)
     ]
-    return eqx.tree_at(get_reason, retried_cycle, tuple(reason))
+    return eqx.tree_at(get_failure_reason, retried_cycle, tuple(failure_reason))
 
 
-def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
-    """Return the cycle of one wheel, or the cycles of a batch."""
+def _run_search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
+    """Return the cycle of one wheel, or the cycles of a batch, without fallbacks."""
     if not params.damping.ndim:
         return finder.find_cycle(params, guess)
     if guess is not None or is_traced(params):
@@ -349,258 +377,283 @@ def _search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> Any:
 
 
 def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
-    """Return rows of a tree on the device, selected by NumPy because JAX would compile a program
-    for each shape.
+    """Return rows of a tree on the device.
+
+    NumPy selects the rows, because JAX would compile a program for each shape.
     """
     return jax.device_put(take_rows(tree, row_indices))
 
 
-def _stack_known_parameters(params: WheelParams) -> np.ndarray:
-    """Return `stack_parameters` of a batch by numpy, for the same reason."""
+def _stack_concrete_parameters(params: WheelParams) -> np.ndarray:
+    """Return `stack_parameters` of a batch, computed by NumPy.
+
+    JAX would compile a program for each number of wheels.
+    """
     return np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
 
 
-def _replace_rows(tree: Any, row_indices: np.ndarray, values: Any) -> Any:
-    """Return a tree of arrays with these rows replaced by `values`."""
+def _replace_rows(tree: Any, row_indices: np.ndarray, new_rows_tree: Any) -> Any:
+    """Return a tree of arrays with the given rows replaced by `new_rows_tree`."""
 
     def replace_leaf_rows(leaf: Any, new_rows: Any) -> np.ndarray:
         leaf = np.array(leaf)
         leaf[row_indices] = new_rows
         return leaf
 
-    return jax.tree.map(replace_leaf_rows, tree, values)
+    return jax.tree.map(replace_leaf_rows, tree, new_rows_tree)
 
 
-def _walk_from_all_starts(
+def _find_walk_end_states(
     finder: CollocationFinder,
     params: WheelParams,
     needs_walk: np.ndarray,
     guess_states: np.ndarray | None,
 ) -> np.ndarray:
-    """Return the ends of the walks with the smallest period defects, from all starts of the wheels
-    that need a walk.
+    """Return, for each wheel that needs a walk, the end of the walk with the smallest period
+    defect.
 
-    The ends are section states, (wheels, 3), NaN if no walk of the wheel nearly repeats. A guess
-    that nearly repeats replaces the walks of its wheel. Wheels too stiff for explicit solvers do
-    not walk, because the walks of one such wheel would take minutes with an implicit solver.
+    The ends are section states, shape (wheels, 3). They are NaN if no walk of the wheel nearly
+    repeats. A guess that nearly repeats replaces the walks of its wheel. Wheels too stiff for
+    explicit solvers do not walk, because the walks of one such wheel would take minutes with an
+    implicit solver.
     """
-    parameter_rows = _stack_known_parameters(params)
-    is_explicit = select_solver(parameter_rows, StepOptions()) != SolverIndex.IMPLICIT
-    wheel_indices = np.flatnonzero(needs_walk & is_explicit)
-    values, end_states = parameter_rows.T, np.full((len(needs_walk), 3), np.nan)
-    smallest_defect = np.full(len(needs_walk), GAIT_WALK_OPTIONS.start_defect)
+    parameter_rows = _stack_concrete_parameters(params)
+    is_solver_explicit = select_solver(parameter_rows, StepOptions()) != SolverIndex.IMPLICIT
+    unsettled_wheels = np.flatnonzero(needs_walk & is_solver_explicit)
+    parameter_values, walk_end_states = parameter_rows.T, np.full((len(needs_walk), 3), np.nan)
+    smallest_period_defects = np.full(len(needs_walk), GAIT_WALK_OPTIONS.max_newton_start_defect)
     if guess_states is not None:
-        states = guess_states[wheel_indices]
-        is_usable = (
-            measure_period_defect(finder, values[wheel_indices], states)
-            < GAIT_WALK_OPTIONS.start_defect
+        guess_section_states = guess_states[unsettled_wheels]
+        is_guess_usable = (
+            measure_period_defects(finder, parameter_values[unsettled_wheels], guess_section_states)
+            < GAIT_WALK_OPTIONS.max_newton_start_defect
         )
-        end_states[wheel_indices[is_usable]] = states[is_usable]
-        wheel_indices = wheel_indices[~is_usable]
-    for compute_starts in (compute_walk_starts, compute_fallback_starts):
-        if not len(wheel_indices):
+        walk_end_states[unsettled_wheels[is_guess_usable]] = guess_section_states[is_guess_usable]
+        unsettled_wheels = unsettled_wheels[~is_guess_usable]
+    for compute_starts in (compute_walk_starts, compute_fallback_walk_starts):
+        if not len(unsettled_wheels):
             break
-        walk_ends = walk_to_gaits(finder, values[wheel_indices], compute_starts)
-        for wheel, state, period_defect in zip(
-            wheel_indices[walk_ends.wheel_index], *walk_ends[1:], strict=True
+        walk_ends = walk_to_gaits(finder, parameter_values[unsettled_wheels], compute_starts)
+        for wheel_index, walk_end_state, period_defect in zip(
+            unsettled_wheels[walk_ends.wheel_indices], *walk_ends[1:], strict=True
         ):
-            if period_defect < smallest_defect[wheel]:
-                smallest_defect[wheel], end_states[wheel] = period_defect, state
-        is_unsettled = smallest_defect[wheel_indices] >= GAIT_WALK_OPTIONS.settled_defect
-        wheel_indices = wheel_indices[is_unsettled]
-    return end_states
+            if period_defect < smallest_period_defects[wheel_index]:
+                smallest_period_defects[wheel_index], walk_end_states[wheel_index] = (
+                    period_defect,
+                    walk_end_state,
+                )
+        has_not_settled = (
+            smallest_period_defects[unsettled_wheels] >= GAIT_WALK_OPTIONS.max_settled_defect
+        )
+        unsettled_wheels = unsettled_wheels[has_not_settled]
+    return walk_end_states
 
 
-def _initial_guesses(
-    finder: CollocationFinder,
+def _make_search_starts(
+    gait_finder: CollocationFinder,
     params: WheelParams,
     collocation_state: CollocationState,
-    has_state: np.ndarray,
+    has_known_state: np.ndarray,
     walk_end_states: np.ndarray,
 ) -> CollocationState:
-    """Return the starts of searches: the known states, else states from walks, else predictions
-    of the surface.
+    """Return starts of searches: known states, else states from walks, else predictions.
+
+    The predictions are those of the gait surface.
     """
-    guesses = map_in_batches(
-        lambda batch_params: finder.initial_guesses(stack_parameters(batch_params).T),
+    start_states = map_in_batches(
+        lambda batch_params: gait_finder.make_initial_guesses(stack_parameters(batch_params).T),
         batch_sizes.GAIT_BATCH_SIZES,
         params,
     )
-    walk_indices = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_state)
-    if len(walk_indices):
-        guess_from_state = jax.vmap(finder.guess_from_state)
-        guesses = _replace_rows(
-            guesses,
-            walk_indices,
+    wheels_with_walk = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_known_state)
+    if len(wheels_with_walk):
+        guess_from_state = jax.vmap(gait_finder.guess_from_state)
+        start_states = _replace_rows(
+            start_states,
+            wheels_with_walk,
             map_in_batches(
                 guess_from_state,
                 batch_sizes.GAIT_BATCH_SIZES,
-                _take_rows_on_device(params, walk_indices),
-                walk_end_states[walk_indices],
+                _take_rows_on_device(params, wheels_with_walk),
+                walk_end_states[wheels_with_walk],
             ),
         )
-    return _replace_rows(guesses, has_state, _take_rows_on_device(collocation_state, has_state))
+    return _replace_rows(
+        start_states, has_known_state, _take_rows_on_device(collocation_state, has_known_state)
+    )
 
 
-def _fallback_starts(
-    finder: CollocationFinder,
+def _find_fallback_starts(
+    gait_finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
     guess_states: np.ndarray | None,
-    refines_mesh: bool,
-    options: FallbackOptions = FALLBACK_OPTIONS,
+    can_refine_mesh: bool,
+    fallback_options: SearchFallbackOptions = SEARCH_FALLBACK_OPTIONS,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and starts from which it finds more gaits of a batch, or None if there are
+    """Return a finder and starts from which it finds more gaits of a batch, or None if it finds
     none.
 
-    `guess_states` are the section states of guesses, (wheels, 3). `refines_mesh` allows a finer
-    mesh.
+    `guess_states` are the section states of guesses, shape (wheels, 3). `can_refine_mesh` allows a
+    finer mesh.
     """
-    outcome = np.asarray(cycle.outcome)
-    mesh_error = map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle)
-    has_large_mesh_error = refines_mesh & (np.asarray(mesh_error) > options.refine_above)
-    is_missing = np.isin(outcome, RETRY_OUTCOMES)
-    is_unresolved = is_missing | has_large_mesh_error
-    if not is_unresolved.any():
+    search_outcomes = np.asarray(cycle.outcome)
+    mesh_errors = map_in_batches(
+        lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle
+    )
+    has_large_mesh_error = can_refine_mesh & (
+        np.asarray(mesh_errors) > fallback_options.max_unrefined_mesh_error
+    )
+    is_gait_missing = np.isin(search_outcomes, RETRY_OUTCOMES)
+    needs_better_gait = is_gait_missing | has_large_mesh_error
+    if not needs_better_gait.any():
         return None
-    walk_end_states = _walk_from_all_starts(finder, params, is_missing, guess_states)
-    # The best start of each wheel so far was found by a search, on the mesh of `finder`.
-    collocation_state, has_state = cycle.collocation_state, has_large_mesh_error.copy()
-    is_coarse = outcome == Outcome.MESH_TOO_COARSE
-    best_result = None
-    for refinement_index in range(1 + options.max_refinements * refines_mesh):
+    walk_end_states = _find_walk_end_states(gait_finder, params, is_gait_missing, guess_states)
+    # `collocation_state` holds the best start of each wheel so far, on the mesh of the last finder.
+    collocation_state, has_known_state = cycle.collocation_state, has_large_mesh_error.copy()
+    is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
+    best_finder_and_starts = None
+    for refinement_index in range(1 + fallback_options.max_mesh_refinements * can_refine_mesh):
         if refinement_index:
-            coarser_finder, finder = finder, finder.with_finer_mesh()
+            coarser_finder, gait_finder = gait_finder, gait_finder.with_finer_mesh()
             transfer_solution = jax.vmap(
-                functools.partial(finder.transfer_to_mesh, coarser_finder.system)
+                functools.partial(gait_finder.transfer_to_mesh, coarser_finder.system)
             )
             collocation_state = map_in_batches(
                 transfer_solution, batch_sizes.GAIT_BATCH_SIZES, collocation_state
             )
         # The search without walks has used this mesh already. One finer mesh is always tried.
-        is_promising = (
+        is_retry_promising = (
             np.isfinite(walk_end_states[:, 0])
-            | has_state
-            | (is_coarse & (refinement_index > 0))
+            | has_known_state
+            | (is_mesh_too_coarse & (refinement_index > 0))
             | (refinement_index == 1)
         )
-        wheel_indices = np.flatnonzero(is_unresolved & is_promising)
-        if not len(wheel_indices):
+        retried_wheels = np.flatnonzero(needs_better_gait & is_retry_promising)
+        if not len(retried_wheels):
             continue
-        subset_params = _take_rows_on_device(params, wheel_indices)
-        guesses = _initial_guesses(
-            finder,
-            subset_params,
-            _take_rows_on_device(collocation_state, wheel_indices),
-            has_state[wheel_indices],
-            walk_end_states[wheel_indices],
+        retried_params = _take_rows_on_device(params, retried_wheels)
+        start_states = _make_search_starts(
+            gait_finder,
+            retried_params,
+            _take_rows_on_device(collocation_state, retried_wheels),
+            has_known_state[retried_wheels],
+            walk_end_states[retried_wheels],
         )
         retried_cycle = map_in_batches(
-            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, guesses
+            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, retried_params, start_states
         )
-        is_found = np.asarray(retried_cycle.outcome) == Outcome.STEPPED
-        mesh_error = np.asarray(
-            map_in_batches(lambda x: x.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retried_cycle)
+        is_gait_found = np.asarray(retried_cycle.outcome) == Outcome.STEPPED
+        mesh_errors = np.asarray(
+            map_in_batches(
+                lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, retried_cycle
+            )
         )
         collocation_state = _replace_rows(
             collocation_state,
-            wheel_indices[is_found],
-            _take_rows_on_device(retried_cycle.collocation_state, is_found),
+            retried_wheels[is_gait_found],
+            _take_rows_on_device(retried_cycle.collocation_state, is_gait_found),
         )
-        if is_found.any():
-            best_result = finder, collocation_state
-        has_state[wheel_indices[is_found]] = True
-        is_coarse[wheel_indices] = np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
-        is_unresolved[
-            wheel_indices[is_found & ((mesh_error <= options.refine_above) | (not refines_mesh))]
+        if is_gait_found.any():
+            best_finder_and_starts = gait_finder, collocation_state
+        has_known_state[retried_wheels[is_gait_found]] = True
+        is_mesh_too_coarse[retried_wheels] = (
+            np.asarray(retried_cycle.outcome) == Outcome.MESH_TOO_COARSE
+        )
+        needs_better_gait[
+            retried_wheels[
+                is_gait_found
+                & (
+                    (mesh_errors <= fallback_options.max_unrefined_mesh_error)
+                    | (not can_refine_mesh)
+                )
+            ]
         ] = False
-    return best_result
+    return best_finder_and_starts
 
 
 def retry_from_walks(finder: Any, params: WheelParams, search_result: LimitCycle) -> LimitCycle:
-    """Return the search's result, with cycles from walks for wheels without a cycle, on the same
-    mesh.
+    """Return the search's result, completed by cycles from walks on the same mesh.
+
+    Only wheels without a cycle are searched again.
     """
-    fallback = _fallback_starts(finder, params, search_result, None, refines_mesh=False)
-    if fallback is None:
+    finder_and_starts = _find_fallback_starts(
+        finder, params, search_result, None, can_refine_mesh=False
+    )
+    if finder_and_starts is None:
         return search_result
     retried_cycle = map_in_batches(
-        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, fallback[1]
+        finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, finder_and_starts[1]
     )
     return _keep_first_reason(search_result, retried_cycle)
-
-
-def _guess_section_state(guess: Any) -> Any:
-    """Return the section state of a guess, which is a cycle, a `CollocationState` or a section
-    state.
-    """
-    if isinstance(guess, CollocationState):
-        return guess.ends[-1][jnp.array([0, 2, 3])]
-    return getattr(guess, "section_state", guess)
 
 
 def _retry_from_other_steps(
     finder: CollocationFinder, params: WheelParams, cycle: LimitCycle, section_states: np.ndarray
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same orbits, found with another of their steps as the first one; None
-    if none is found.
+    """Return a finder and the same orbits, found with another step as the first one.
 
-    A guess contains the accelerations of all steps, whose errors accumulate. A step without double
-    support is the most sensitive one. As the first or last step it may make the guess fail.
+    Return None if no orbit is found. A guess contains the accelerations of all steps, whose errors
+    accumulate. A step without double support is the most sensitive one. As the first or last step
+    it may make the guess fail.
     """
-    missing_indices = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
-    if not len(missing_indices):
+    missing_wheels = np.flatnonzero(np.isin(np.asarray(cycle.outcome), RETRY_OUTCOMES))
+    if not len(missing_wheels):
         return None
-    subset_params = _take_rows_on_device(params, missing_indices)
-    section_states = np.array(section_states[missing_indices])
-    best_result = None
+    missing_params = _take_rows_on_device(params, missing_wheels)
+    section_states = np.array(section_states[missing_wheels])
+    best_finder_and_starts = None
     collocation_state = cycle.collocation_state
     for _ in range(1, finder.period_n):
         section_states = np.asarray(
-            step_batch(subset_params, section_states, model=finder.model).section_state
+            step_batch(missing_params, section_states, model=finder.model).section_state
         )
         retried_cycle = map_in_batches(
-            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, subset_params, section_states
+            finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, missing_params, section_states
         )
-        found_indices = np.flatnonzero(
+        found_positions = np.flatnonzero(
             np.asarray(retried_cycle.found)
-            & (np.asarray(collocation_state.found)[missing_indices] < 0.5)
+            & (np.asarray(collocation_state.has_cycle)[missing_wheels] < 0.5)
         )
-        if len(found_indices):
+        if len(found_positions):
             collocation_state = _replace_rows(
                 collocation_state,
-                missing_indices[found_indices],
-                _take_rows_on_device(retried_cycle.collocation_state, found_indices),
+                missing_wheels[found_positions],
+                _take_rows_on_device(retried_cycle.collocation_state, found_positions),
             )
-            best_result = finder, collocation_state
-    return best_result
+            best_finder_and_starts = finder, collocation_state
+    return best_finder_and_starts
 
 
 def _align_first_step(
     finder: CollocationFinder,
     params: WheelParams,
     cycle: LimitCycle,
-    first_states: np.ndarray,
-    fallback: tuple[CollocationFinder, CollocationState] | None,
+    start_section_states: np.ndarray,
+    finder_and_starts: tuple[CollocationFinder, CollocationState] | None,
 ) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same orbits with the step nearest to `first_states` as the first
-    one.
+    """Return a finder and the same orbits, with the step nearest to `start_section_states`
+    first.
     """
-    finder, collocation_state = fallback or (finder, cycle.collocation_state)
-    ends = np.asarray(collocation_state.ends)[:, :, [0, 2, 3]]
-    distances = np.abs(np.roll(ends, 1, axis=1) - first_states[:, None]).max(-1)
-    distances = np.where(np.asarray(collocation_state.found)[:, None] > 0.5, distances, 0.0)
+    finder, collocation_state = finder_and_starts or (finder, cycle.collocation_state)
+    end_states = np.asarray(collocation_state.step_end_states)[:, :, [0, 2, 3]]
+    distances_to_start = np.abs(np.roll(end_states, 1, axis=1) - start_section_states[:, None]).max(
+        -1
+    )
+    distances_to_start = np.where(
+        np.asarray(collocation_state.has_cycle)[:, None] > 0.5, distances_to_start, 0.0
+    )
     for step_index in range(1, finder.period_n):
-        indices = np.flatnonzero(np.argmin(distances, 1) == step_index)
-        if len(indices):
-            shift_step = jax.vmap(functools.partial(finder.shift_first_step, step_index))
+        shifted_wheels = np.flatnonzero(np.argmin(distances_to_start, 1) == step_index)
+        if len(shifted_wheels):
+            start_at_step = jax.vmap(functools.partial(finder.start_at_step, step_index))
             collocation_state = _replace_rows(
                 collocation_state,
-                indices,
-                shift_step(
-                    _take_rows_on_device(params, indices),
-                    _take_rows_on_device(collocation_state, indices),
+                shifted_wheels,
+                start_at_step(
+                    _take_rows_on_device(params, shifted_wheels),
+                    _take_rows_on_device(collocation_state, shifted_wheels),
                 ),
             )
-            fallback = finder, collocation_state
-    return fallback
+            finder_and_starts = finder, collocation_state
+    return finder_and_starts

@@ -1,11 +1,11 @@
-"""Prediction of gaits by a cubic polynomial fitted to the gaits of many wheels, the start of every
-search.
+"""Prediction of gaits by a cubic polynomial that is fitted to the gaits of many wheels.
 
-Lengths are in L0, times in sqrt(L0 / g) and masses in the total mass, so that wheels of any size
-are covered. The polynomial surface was fitted by experiments/gaits/fit_surface.py to the gaits that
-a continuation from Table 1 reaches. The fit uses Table 1's mass ratio, center of mass and eight
-legs, for which it is accurate to about 1 %. For other wheels it is clipped to its range and is the
-start of a homotopy.
+The prediction is the start of every search. Lengths are in L0, times in sqrt(L0 / g) and masses in
+the total mass, so that wheels of any size are covered. The polynomial surface was fitted by
+experiments/gaits/fit_surface.py to the gaits that a continuation from Table 1 reaches. The fit uses
+Table 1's mass ratio, center of mass and eight legs, for which it is accurate to about 1 %.
+Parameters of other wheels are clipped to the range of the fit, and the prediction is the start of a
+homotopy.
 """
 
 import functools
@@ -21,15 +21,17 @@ from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution, PhaseMesh, m
 from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import PAPER_PHASES, WheelParams
 
-SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
+GAIT_SURFACE_MESHES = (PhaseMesh(2, 1.0), PhaseMesh(4, 2.0), PhaseMesh(1, 1.0))
 """Meshes of the surface's accelerations for DLS, SLS-I and SLS-II."""
-SURFACE_DEGREE = 3
-"""Degree of the surface's polynomials, that of the stored coefficients."""
+GAIT_SURFACE_DEGREE = 3
+"""Degree of the polynomials whose coefficients are stored."""
 
 
 class GaitSurface(NamedTuple):
-    """Polynomial coefficients (monomial, unknown) in centered coordinates, and the range of the
-    coordinates.
+    """Polynomial coefficients of the gait surface, shape (monomials, unknowns), and coordinate
+    ranges.
+
+    The coordinates are centered.
     """
 
     centre: np.ndarray
@@ -40,77 +42,85 @@ class GaitSurface(NamedTuple):
 
 
 @functools.cache
-def load_surface() -> GaitSurface:
+def load_gait_surface() -> GaitSurface:
     """Return the surface that is stored beside this file."""
-    file = importlib.resources.files(__package__) / "surface.npz"
-    with file.open("rb") as stream, np.load(stream) as arrays:
-        return GaitSurface(**{name: arrays[name] for name in GaitSurface._fields})
+    surface_file = importlib.resources.files(__package__) / "surface.npz"
+    with surface_file.open("rb") as surface_stream, np.load(surface_stream) as stored_arrays:
+        return GaitSurface(**{name: stored_arrays[name] for name in GaitSurface._fields})
 
 
-def time_unit(params: WheelParams) -> Elementwise:
-    """Return the wheel's own unit of time, sqrt(L0 / g), s."""
+def compute_time_unit(params: WheelParams) -> Elementwise:
+    """Return the unit of time of a wheel, sqrt(L0 / g), s."""
     return jnp.sqrt(params.locked_length / params.gravity)
 
 
-def surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
-    """Return the coordinates of the surface: root of damping, stiffness, natural length and
-    slope, dimensionless.
+def compute_surface_coordinates(params: WheelParams) -> tuple[Elementwise, ...]:
+    """Return the dimensionless coordinates of the surface.
+
+    They are the root of damping, stiffness, natural length and slope.
     """
-    mass = params.hub_mass + params.n_legs * params.leg_mass
-    length, gravity = params.locked_length, params.gravity
+    total_mass = params.hub_mass + params.n_legs * params.leg_mass
+    leg_length, gravity = params.locked_length, params.gravity
     return (
-        jnp.sqrt(params.damping * time_unit(params) / mass),
-        params.stiffness * length / (mass * gravity),
-        params.natural_length / length,
+        jnp.sqrt(params.damping * compute_time_unit(params) / total_mass),
+        params.stiffness * leg_length / (total_mass * gravity),
+        params.natural_length / leg_length,
         params.slope,
     )
 
 
 def evaluate_monomials(centered_coordinates: tuple[Elementwise, ...]) -> list[Elementwise]:
     """Return all monomials of the coordinates up to the surface's degree, the constant first."""
-    ones = jnp.ones_like(centered_coordinates[0])
+    constant_monomial = jnp.ones_like(centered_coordinates[0])
     return [
-        functools.reduce(operator.mul, factors, ones)
-        for degree in range(SURFACE_DEGREE + 1)
-        for factors in itertools.combinations_with_replacement(centered_coordinates, degree)
+        functools.reduce(operator.mul, monomial_factors, constant_monomial)
+        for monomial_degree in range(GAIT_SURFACE_DEGREE + 1)
+        for monomial_factors in itertools.combinations_with_replacement(
+            centered_coordinates, monomial_degree
+        )
     ]
 
 
 def predict_gait(params: WheelParams, meshes: tuple[PhaseMesh, ...]) -> CollocationSolution:
-    """Return the predicted section state, durations and accelerations at the nodes of `meshes`,
-    lanes last.
+    """Return the predicted section state, durations and accelerations of each lane.
+
+    The accelerations belong to the nodes of `meshes`. Lanes are the last axis.
     """
-    surface = load_surface()
+    gait_surface = load_gait_surface()
     # Python floats preserve the dtype of the parameters.
-    ranges = (x.tolist() for x in surface[:4])
+    coordinate_ranges = (coordinate.tolist() for coordinate in gait_surface[:4])
     centered_coordinates = tuple(
-        (jnp.clip(x, lower, upper) - center) / spread
-        for x, center, spread, lower, upper in zip(
-            surface_coordinates(params), *ranges, strict=True
+        (jnp.clip(coordinate, lower, upper) - center) / half_range
+        for coordinate, center, half_range, lower, upper in zip(
+            compute_surface_coordinates(params), *coordinate_ranges, strict=True
         )
     )
     monomials = jnp.stack(evaluate_monomials(centered_coordinates))
-    values = jnp.tensordot(jnp.asarray(surface.coefficients.T, monomials.dtype), monomials, 1)
-    time_scale = time_unit(params)
-    section = jnp.stack([values[0], values[1] / time_scale])
-    durations = values[None, 2:5] * time_scale
-    accelerations, start_index = [], 5
-    for phase, surface_mesh, mesh in zip(PAPER_PHASES, SURFACE_MESHES, meshes, strict=True):
+    predicted_values = jnp.tensordot(
+        jnp.asarray(gait_surface.coefficients.T, monomials.dtype), monomials, 1
+    )
+    time_scale = compute_time_unit(params)
+    section_state = jnp.stack([predicted_values[0], predicted_values[1] / time_scale])
+    phase_durations = predicted_values[None, 2:5] * time_scale
+    accelerations, value_index = [], 5
+    for phase, surface_mesh, mesh in zip(PAPER_PHASES, GAIT_SURFACE_MESHES, meshes, strict=True):
         n_coordinates = phase.n_dof
         n_values = surface_mesh.n_intervals * N_GAUSS_NODES * n_coordinates
-        surface_accelerations = values[start_index : start_index + n_values].reshape(
+        surface_accelerations = predicted_values[value_index : value_index + n_values].reshape(
             -1, n_coordinates, *monomials.shape[1:]
         )
-        start_index += n_values
-        matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), monomials.dtype)
-        # These are the units of the accelerations of (theta, L1, L2).
+        value_index += n_values
+        transfer_matrix = jnp.asarray(mesh_transfer_matrix(surface_mesh, mesh), monomials.dtype)
+        # The accelerations are those of (theta, L1, L2).
         angle_scale = 1.0 / time_scale**2
         length_scale = params.locked_length / time_scale**2
         acceleration_units = jnp.stack([angle_scale, length_scale, length_scale][:n_coordinates])
-        phase_accelerations = jnp.tensordot(matrix, surface_accelerations, 1) * acceleration_units
+        phase_accelerations = (
+            jnp.tensordot(transfer_matrix, surface_accelerations, 1) * acceleration_units
+        )
         accelerations.append(
             phase_accelerations.reshape(
                 1, mesh.n_intervals, N_GAUSS_NODES, *phase_accelerations.shape[1:]
             )
         )
-    return CollocationSolution(section, durations, tuple(accelerations))
+    return CollocationSolution(section_state, phase_durations, tuple(accelerations))

@@ -1,4 +1,4 @@
-"""Walks of many wheels from a fixed set of starts until they settle on gaits."""
+"""Walks of many wheels from fixed starts until they settle on gaits."""
 
 import math
 from collections.abc import Callable
@@ -17,97 +17,113 @@ from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, compute_wheel_u
 
 @dataclass(frozen=True)
 class GaitWalkOptions:
-    """Options of the walks toward gaits. Distances are those of section states, in the wheel's own
-    units.
+    """Options of the walks toward attracting gaits.
+
+    All distances compare section states in units of the wheel.
     """
 
-    round_steps: tuple[int, ...] = (8, 12, 30, 50, 100)
+    steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
     """Numbers of steps toward a gait, one for each round. After a round, settled walks stop and
-    walks to the same gait are merged.
-    """
-    step_tolerance: float = 1e-8
+    walks to the same gait are merged."""
+    walk_step_tolerance: float = 1e-8
     """Tolerance of the Tsit5 steps toward a gait, which is independent of the tolerance of the
-    gait.
-    """
-    settled_defect: float = 1e-3
+    gait."""
+    max_settled_defect: float = 1e-3
     """Largest distance between the state of a settled walk and its state one period earlier."""
-    start_defect: float = 0.1
-    """Largest such distance of an unsettled walk from which Newton's method starts."""
-    merge_distance: float = 0.02
+    max_newton_start_defect: float = 0.1
+    """Largest distance between states one period apart of an unsettled walk from which Newton's
+    method starts."""
+    walk_merge_distance: float = 0.02
     """Distance up to which two walks are considered to reach the same gait."""
 
 
 GAIT_WALK_OPTIONS = GaitWalkOptions()
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
-"""Starts of walks. The first number is the static contraction of Leg 1 at touchdown, as a
-fraction. The second is the rate of the hub as a fraction of the rigid rolling gait's rate. Of 4,800
-random wheels with 5 to 16 legs, 1,240 walk from one of these starts or from a grid of 78. From
-these starts alone, 1,175 walk (ranges: experiments/gaits/off_the_box.py).
-"""
+"""Starts of walks. The first number is the static contraction of Leg 1 at touchdown, as a fraction.
+The second is the rate of the hub as a fraction of the rigid rolling gait's rate. Of 4,800 random
+wheels with 5 to 16 legs, 1,240 walk from one of these starts or from a grid of 78 starts. From
+these starts alone, 1,175 wheels walk (ranges: experiments/gaits/off_the_box.py)."""
 
-FALLBACK_STARTS = (
+FALLBACK_WALK_STARTS = (
     (0.002, 0.4), (0.002, 0.3), (0.002, 0.5), (0.5, 1.1), (0.2, 0.4), (0.2, 1.1), (0.2, 0.8),
     (0.35, 1.0), (0.35, 1.1), (0.43, 1.6), (0.4, 1.35), (0.46, 1.6), (0.43, 1.35),
 )  # fmt: skip
 """Starts of walks that are tried if none of WALK_STARTS leads to a gait. The first number is Leg
 1's angle to the slope's normal at touchdown, as a fraction of the angle between legs. The second
-number is the rate, as in WALK_STARTS. The first nine starts reach the other 65 wheels. With many
-legs, gaits roll from double support into double support, with an angle near 0. The last four are
-chosen because some gaits of few legs are only reached from large angles and high rates. Of 442
-wheels with 5 to 7 legs that walk from one of these starts or from a grid of 30, they reach the last
-18.
-"""
+number is the rate, as in WALK_STARTS. The first nine starts reach 65 wheels that WALK_STARTS miss.
+With many legs, gaits roll from double support into double support, with an angle near 0. The last
+four starts are chosen because some gaits of few legs are only reached from large angles and high
+rates. Of 442 wheels with 5 to 7 legs that walk from one of these starts or from a grid of 30, the
+last four starts reach 18 wheels that other starts miss."""
 
 
 def compute_walk_starts(params: WheelParams) -> np.ndarray:
-    """Return the states of WALK_STARTS for each wheel, section states of shape (starts, wheels,
-    3).
-    """
-    p, sin, cos = _params_as_numpy(params), math.sin(params.leg_angle), math.cos(params.leg_angle)
-    weight = (p.hub_mass + params.n_legs * p.leg_mass) * p.gravity * np.cos(p.slope)
-    static_length_ratio = (p.natural_length - weight / p.stiffness) / p.locked_length
+    """Return the section states of WALK_STARTS for each wheel, shape (starts, wheels, 3)."""
+    numpy_params, sin, cos = (
+        _convert_params_to_numpy(params),
+        math.sin(params.leg_angle),
+        math.cos(params.leg_angle),
+    )
+    normal_weight = (
+        (numpy_params.hub_mass + params.n_legs * numpy_params.leg_mass)
+        * numpy_params.gravity
+        * np.cos(numpy_params.slope)
+    )
+    static_length_ratio = (
+        numpy_params.natural_length - normal_weight / numpy_params.stiffness
+    ) / numpy_params.locked_length
     leg_lengths = [
         np.clip(1.0 + contraction_share * (static_length_ratio - 1.0), cos + 0.02, 1.0)
         for contraction_share, _ in WALK_STARTS
     ]
-    thetas = [np.arctan((length - cos) / sin) for length in leg_lengths]
-    return _make_section_states(params, thetas, [rate_share for _, rate_share in WALK_STARTS])
+    touchdown_angles = [np.arctan((length - cos) / sin) for length in leg_lengths]
+    return _make_section_states(
+        params, touchdown_angles, [rate_share for _, rate_share in WALK_STARTS]
+    )
 
 
-def compute_fallback_starts(params: WheelParams) -> np.ndarray:
-    """Return the states of FALLBACK_STARTS for each wheel, section states of shape (starts,
+def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
+    """Return the section states of FALLBACK_WALK_STARTS for each wheel, shape (starts,
     wheels, 3).
     """
-    thetas = [
+    touchdown_angles = [
         np.full(np.shape(params.slope), angle_share * params.leg_angle)
-        for angle_share, _ in FALLBACK_STARTS
+        for angle_share, _ in FALLBACK_WALK_STARTS
     ]
-    return _make_section_states(params, thetas, [rate_share for _, rate_share in FALLBACK_STARTS])
+    return _make_section_states(
+        params, touchdown_angles, [rate_share for _, rate_share in FALLBACK_WALK_STARTS]
+    )
 
 
-def _params_as_numpy(params: WheelParams) -> Any:
-    """Return the parameters as NumPy arrays, because JAX would compile each operation on them."""
+def _convert_params_to_numpy(params: WheelParams) -> Any:
+    """Return the parameters as NumPy arrays.
+
+    JAX would compile each operation on its arrays for every number of wheels.
+    """
     return SimpleNamespace(**{name: np.asarray(getattr(params, name)) for name in PARAMETER_NAMES})
 
 
 def _make_section_states(
-    params: WheelParams, thetas: list[np.ndarray], rate_shares: list[float]
+    params: WheelParams, touchdown_angles: list[np.ndarray], rolling_rate_shares: list[float]
 ) -> np.ndarray:
-    """Return section states with these angles, rad, and with rates as fractions of the rigid
-    rolling gait's rate.
+    """Return section states with the given touchdown angles, rad, shape (starts, wheels, 3).
 
-    The shape is (starts, wheels, 3).
+    Hub rates are given as fractions of the rate of the rigid rolling gait.
     """
-    p, alpha = _params_as_numpy(params), params.leg_angle
+    numpy_params, leg_angle = _convert_params_to_numpy(params), params.leg_angle
     rigid_leg_rate = np.sqrt(
-        4.0 * p.gravity / p.locked_length * np.sin(0.5 * alpha) * np.sin(p.slope)
+        4.0
+        * numpy_params.gravity
+        / numpy_params.locked_length
+        * np.sin(0.5 * leg_angle)
+        * np.sin(numpy_params.slope)
     )
     rolling_rate, leg_rate = (
-        rigid_leg_rate / np.sin(alpha),
-        -0.1 * np.sqrt(p.gravity * p.locked_length) / 3.0,
+        rigid_leg_rate / np.sin(leg_angle),
+        -0.1 * np.sqrt(numpy_params.gravity * numpy_params.locked_length) / 3.0,
     )
-    angles_and_shares = zip(thetas, rate_shares, strict=True)
+    angles_and_shares = zip(touchdown_angles, rolling_rate_shares, strict=True)
     return np.stack(
         [
             np.stack([theta, rate_share * rolling_rate, leg_rate], -1)
@@ -116,30 +132,34 @@ def _make_section_states(
     )
 
 
-def stack_section_units(model: Any, values: np.ndarray, n_legs: int) -> np.ndarray:
-    """Return each wheel's own units of its section state, shape (wheels, section)."""
-    return np.stack(model.section_units(compute_wheel_units_of_rows(values, n_legs), n_legs), -1)
+def stack_section_units(model: Any, parameter_values: np.ndarray, n_legs: int) -> np.ndarray:
+    """Return the units of each wheel's section state, shape (wheels, section)."""
+    return np.stack(
+        model.section_units(compute_wheel_units_of_rows(parameter_values, n_legs), n_legs), -1
+    )
 
 
-def count_section_coordinates(finder: Any) -> int:
-    """Return the number of continuous entries of a section state; the others are codes."""
-    return int(finder.model.n_continuous(WheelParams(n_legs=finder.n_legs)))
+def count_section_coordinates(gait_finder: Any) -> int:
+    """Return the number of continuous components of a section state; the other components are
+    codes.
+    """
+    return int(gait_finder.model.n_continuous(WheelParams(n_legs=gait_finder.n_legs)))
 
 
-class WalkEnds(NamedTuple):
+class DistinctWalkEnds(NamedTuple):
     """Distinct ends of walks, in the order of the wheels. Each wheel has at least one end."""
 
-    wheel_index: np.ndarray  # (ends,)
+    wheel_indices: np.ndarray  # (ends,)
     section_states: np.ndarray  # (ends, section)
-    period_defect: np.ndarray  # (ends,); see `measure_period_defect`
+    period_defects: np.ndarray  # (ends,); see `measure_period_defects`
 
 
 def walk_to_gaits(
-    finder: Any,
-    values: np.ndarray,
+    gait_finder: Any,
+    parameter_values: np.ndarray,
     compute_starts: Callable[[WheelParams], np.ndarray],
-    options: GaitWalkOptions = GAIT_WALK_OPTIONS,
-) -> WalkEnds:
+    walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
+) -> DistinctWalkEnds:
     """Return the distinct ends of the walks of each wheel.
 
     Of walks that reach the same state, the one with the smallest period defect is returned. A walk
@@ -152,113 +172,149 @@ def walk_to_gaits(
         compute_starts: function that returns section states of shape (starts, wheels, 3).
         options: options of the walks.
     """
-    starts = compute_starts(_make_model_and_wheels(finder, values)[1])
-    n_wheels, n_coordinates = len(values), count_section_coordinates(finder)
-    wheel_index = np.tile(np.arange(n_wheels), len(starts))
-    walk_values, states = values[wheel_index], np.concatenate(starts)
-    if finder.model.batch_kernel == "legs":
-        states = np.array(embed_section_states(walk_values.T, states, finder.n_legs))
-    period_defect = np.full(len(wheel_index), np.inf)
-    is_duplicate = np.zeros(len(wheel_index), bool)
-    units = stack_section_units(finder.model, walk_values, finder.n_legs)
-    scale_coordinates = lambda states: (states / units)[:, :n_coordinates]
-    active_indices = np.arange(len(wheel_index))
-    for n_steps in options.round_steps:
-        end_states, outcome = _take_steps(
-            finder, walk_values[active_indices], states[active_indices], n_steps, options
+    start_section_states = compute_starts(_split_parameter_values(gait_finder, parameter_values)[1])
+    n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)
+    walk_wheel_indices = np.tile(np.arange(n_wheels), len(start_section_states))
+    values_by_walk, section_states = (
+        parameter_values[walk_wheel_indices],
+        np.concatenate(start_section_states),
+    )
+    if gait_finder.model.batch_kernel == "legs":
+        section_states = np.array(
+            embed_section_states(values_by_walk.T, section_states, gait_finder.n_legs)
         )
-        is_walking = outcome == Outcome.STEPPED
-        active_indices = active_indices[is_walking]
-        states[active_indices] = end_states[is_walking]
-        period_defect[active_indices] = measure_period_defect(
-            finder, walk_values[active_indices], states[active_indices], options
+    period_defects = np.full(len(walk_wheel_indices), np.inf)
+    is_walk_duplicate = np.zeros(len(walk_wheel_indices), bool)
+    section_units = stack_section_units(gait_finder.model, values_by_walk, gait_finder.n_legs)
+    scale_states = lambda section_states: (section_states / section_units)[:, :n_coordinates]
+    active_walks = np.arange(len(walk_wheel_indices))
+    for n_steps in walk_options.steps_by_round:
+        end_states, walk_outcomes = _walk_wheels(
+            gait_finder,
+            values_by_walk[active_walks],
+            section_states[active_walks],
+            n_steps,
+            walk_options,
         )
-        is_duplicate |= _find_duplicates(
-            scale_coordinates(states), period_defect, n_wheels, options.settled_defect, options
+        is_walking = walk_outcomes == Outcome.STEPPED
+        active_walks = active_walks[is_walking]
+        section_states[active_walks] = end_states[is_walking]
+        period_defects[active_walks] = measure_period_defects(
+            gait_finder, values_by_walk[active_walks], section_states[active_walks], walk_options
         )
-        is_unsettled = period_defect >= options.settled_defect
-        active_indices = active_indices[(is_unsettled & ~is_duplicate)[active_indices]]
-        if not len(active_indices):
+        is_walk_duplicate |= _find_duplicate_walks(
+            scale_states(section_states),
+            period_defects,
+            n_wheels,
+            walk_options.max_settled_defect,
+            walk_options,
+        )
+        has_not_settled = period_defects >= walk_options.max_settled_defect
+        active_walks = active_walks[(has_not_settled & ~is_walk_duplicate)[active_walks]]
+        if not len(active_walks):
             break
-    is_duplicate = _find_duplicates(
-        scale_coordinates(states), period_defect, n_wheels, options.start_defect, options
+    is_walk_duplicate = _find_duplicate_walks(
+        scale_states(section_states),
+        period_defects,
+        n_wheels,
+        walk_options.max_newton_start_defect,
+        walk_options,
     )
-    is_selected = ~is_duplicate & (period_defect < options.start_defect)
+    is_walk_selected = ~is_walk_duplicate & (period_defects < walk_options.max_newton_start_defect)
     # The first start is selected for a wheel without any usable walk.
-    is_selected[np.setdiff1d(np.arange(n_wheels), wheel_index[is_selected])] = True
-    selected_indices = np.flatnonzero(is_selected)
-    selected_indices = selected_indices[np.argsort(wheel_index[selected_indices], kind="stable")]
-    return WalkEnds(
-        wheel_index[selected_indices], states[selected_indices], period_defect[selected_indices]
+    is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
+    selected_walks = np.flatnonzero(is_walk_selected)
+    selected_walks = selected_walks[np.argsort(walk_wheel_indices[selected_walks], kind="stable")]
+    return DistinctWalkEnds(
+        walk_wheel_indices[selected_walks],
+        section_states[selected_walks],
+        period_defects[selected_walks],
     )
 
 
-def measure_period_defect(
-    finder: Any,
-    values: np.ndarray,
+def measure_period_defects(
+    gait_finder: Any,
+    parameter_values: np.ndarray,
     section_states: np.ndarray,
-    options: GaitWalkOptions = GAIT_WALK_OPTIONS,
+    walk_options: GaitWalkOptions = GAIT_WALK_OPTIONS,
 ) -> np.ndarray:
-    """Return the largest change of each section state over one period, in the wheel's own units.
+    """Return the largest change of each section state over one period, shape (wheels,).
 
-    The result has the shape (wheels,). It is infinite if a step fails.
+    Changes are in units of the wheel. A change is infinite if a step fails.
     """
-    end_states, outcome = _take_steps(finder, values, section_states, finder.period_n, options)
-    units = stack_section_units(finder.model, values, finder.n_legs)
-    distance = np.abs((end_states - section_states) / units)
-    distance = distance[:, : count_section_coordinates(finder)].max(-1)
-    return np.where(outcome == Outcome.STEPPED, distance, np.inf)
+    end_states, period_outcomes = _walk_wheels(
+        gait_finder, parameter_values, section_states, gait_finder.period_n, walk_options
+    )
+    section_units = stack_section_units(gait_finder.model, parameter_values, gait_finder.n_legs)
+    period_defects = np.abs((end_states - section_states) / section_units)
+    period_defects = period_defects[:, : count_section_coordinates(gait_finder)].max(-1)
+    return np.where(period_outcomes == Outcome.STEPPED, period_defects, np.inf)
 
 
-def _take_steps(
-    finder: Any, values: np.ndarray, states: np.ndarray, n_steps: int, options: GaitWalkOptions
+def _walk_wheels(
+    gait_finder: Any,
+    parameter_values: np.ndarray,
+    section_states: np.ndarray,
+    n_steps: int,
+    walk_options: GaitWalkOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section states after `n_steps` steps of each wheel, and the outcomes."""
-    model, params = _make_model_and_wheels(finder, values)
+    model, params = _split_parameter_values(gait_finder, parameter_values)
     step_options = StepOptions(
-        solver="Tsit5", rtol=options.step_tolerance, atol=options.step_tolerance
+        solver="Tsit5", rtol=walk_options.walk_step_tolerance, atol=walk_options.walk_step_tolerance
     )
     # The implicit solver of the stiffest wheels would take minutes for a walk.
-    walk = step_batch(params, states, n_steps, model=model, options=step_options, engine="lanes")
-    return np.asarray(walk.section_state), np.asarray(walk.outcome)
+    walk_result = step_batch(
+        params, section_states, n_steps, model=model, options=step_options, engine="lanes"
+    )
+    return np.asarray(walk_result.section_state), np.asarray(walk_result.outcome)
 
 
-def _make_model_and_wheels(finder: Any, values: np.ndarray) -> tuple[Any, WheelParams]:
-    """Return the model and the wheels of these values, whose first axis is over wheels."""
-    model, params = finder.model.from_values(tuple(jax.device_put(list(values.T))), finder.n_legs)
+def _split_parameter_values(
+    gait_finder: Any, parameter_values: np.ndarray
+) -> tuple[Any, WheelParams]:
+    """Return the model and the wheels of given parameter values, whose first axis is over
+    wheels.
+    """
+    model, params = gait_finder.model.from_values(
+        tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
+    )
     return model, params
 
 
-def _find_duplicates(
-    scaled_states: np.ndarray,
-    period_defect: np.ndarray,
+def _find_duplicate_walks(
+    scaled_walk_states: np.ndarray,
+    period_defects: np.ndarray,
     n_wheels: int,
-    settled_defect: float,
-    options: GaitWalkOptions,
+    max_settled_defect: float,
+    walk_options: GaitWalkOptions,
 ) -> np.ndarray:
     """Return which walks reach the same state as another walk of the same wheel with a smaller
     defect.
 
-    Two states are the same if their distance is within `merge_distance`. If the other walk has
-    settled to within `settled_defect`, the limit is three times the walk's own defect if that is
-    larger. The wheels are the last axis of all arrays, except that coordinates follow in the
-    states. The starts are the axis before the wheels.
+    Two states are the same if their distance is within `walk_merge_distance`. If the other walk has
+    settled to within `max_settled_defect`, three times the defect of the first walk is allowed if
+    that is larger. Axes are starts, wheels and, for states, coordinates.
     """
-    scaled_states, period_defect = (
-        scaled_states.reshape(-1, n_wheels, scaled_states.shape[-1]),
-        period_defect.reshape(-1, n_wheels),
+    scaled_walk_states, period_defects = (
+        scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1]),
+        period_defects.reshape(-1, n_wheels),
     )
-    start_index = np.arange(len(scaled_states))[:, None]
-    is_duplicate = np.zeros(period_defect.shape, bool)
-    for other_start in range(len(scaled_states)):
-        is_better = (period_defect[other_start] < period_defect) | (
-            (period_defect[other_start] == period_defect) & (other_start < start_index)
+    start_indices = np.arange(len(scaled_walk_states))[:, None]
+    is_walk_duplicate = np.zeros(period_defects.shape, bool)
+    for other_start in range(len(scaled_walk_states)):
+        has_smaller_defect = (period_defects[other_start] < period_defects) | (
+            (period_defects[other_start] == period_defects) & (other_start < start_indices)
         )
-        distance = np.abs(scaled_states - scaled_states[other_start]).max(-1)
-        is_near = distance <= np.where(
-            period_defect[other_start] < settled_defect,
-            np.maximum(options.merge_distance, 3.0 * period_defect),
-            options.merge_distance,
+        state_distances = np.abs(scaled_walk_states - scaled_walk_states[other_start]).max(-1)
+        is_same_state = state_distances <= np.where(
+            period_defects[other_start] < max_settled_defect,
+            np.maximum(walk_options.walk_merge_distance, 3.0 * period_defects),
+            walk_options.walk_merge_distance,
         )
-        is_duplicate |= is_better & is_near & (period_defect < options.start_defect)
-    return is_duplicate.ravel()
+        is_walk_duplicate |= (
+            has_smaller_defect
+            & is_same_state
+            & (period_defects < walk_options.max_newton_start_defect)
+        )
+    return is_walk_duplicate.ravel()

@@ -1,4 +1,4 @@
-"""Margins of the paper's model that searches along gaits keep positive, and their default least
+"""Margins that searches along gaits of the paper's model keep positive, with default least
 values.
 """
 
@@ -12,14 +12,15 @@ from vrw_jax.validation import check_type
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
 
-def gait_takeoff_acceleration(s: Symbols, sls1: PhasePoints) -> Elementwise:
-    """Return the rear foot's acceleration at the start of SLS-I of a gait, m/s^2; see
-    `dynamics`.
+def compute_takeoff_acceleration(s: Symbols, sls1: PhasePoints) -> Elementwise:
+    """Return the rear foot's acceleration at the start of SLS-I of a gait, m/s^2.
+
+    See `dynamics.takeoff_acceleration`.
     """
     return dynamics.takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
 
 
-MARGIN_NAMES: tuple[str, ...] = (
+KEPT_MARGIN_NAMES: tuple[str, ...] = (
     "fore_foot_force",
     "takeoff_acceleration",
     "clearance_sls1",
@@ -32,7 +33,8 @@ MARGIN_NAMES: tuple[str, ...] = (
     "lambda_2_plus",
     "lambda_4_plus",
 )
-"""Names of margins on forces, clearances and indicators that gaits of this model can keep."""
+"""Names of the margins on forces, clearances and indicators that gaits of the paper's model can
+keep."""
 
 DEFAULT_MARGIN_SHARE = 1e-3
 """Default least value of a margin, as a fraction of the wheel's weight, leg length or gravity."""
@@ -70,4 +72,6 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         "N s": mass * (gravity * length) ** 0.5,
         "1": 1.0,
     }
-    return {name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[name].unit] for name in MARGIN_NAMES}
+    return {
+        name: DEFAULT_MARGIN_SHARE * unit_scales[MEASURES[name].unit] for name in KEPT_MARGIN_NAMES
+    }

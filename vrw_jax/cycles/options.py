@@ -1,4 +1,4 @@
-"""Numerical options of the search for limit cycles, in one object."""
+"""Numerical options of the search for limit cycles."""
 
 import dataclasses
 
@@ -67,22 +67,25 @@ class CycleOptions:
                 "give three whole numbers of at least 1, as (10, 8, 3)."
             )
         mesh_intervals = tuple(
-            check_int(f"mesh_intervals[{i}]", count) for i, count in enumerate(self.mesh_intervals)
+            check_int(f"mesh_intervals[{i}]", interval_count)
+            for i, interval_count in enumerate(self.mesh_intervals)
         )
         object.__setattr__(self, "mesh_intervals", mesh_intervals)
 
-    def check_tolerances(self, dtype: np.dtype) -> None:
+    def check_tolerances(self, parameter_dtype: np.dtype) -> None:
         """Raise a ValueError for a tolerance that the number format cannot resolve.
 
         The parameters of a wheel in 64 bits count as 32 bits if `jax_enable_x64` is off, as in JAX.
         """
-        computed_dtype = jax.dtypes.canonicalize_dtype(dtype)
-        if self.tolerance < jnp.finfo(computed_dtype).eps:
+        jax_dtype = jax.dtypes.canonicalize_dtype(parameter_dtype)
+        if self.tolerance < jnp.finfo(jax_dtype).eps:
             dtype_statement = (
-                "the wheel holds" if computed_dtype == dtype else "jax_enable_x64 is off: JAX takes"
+                "the wheel holds"
+                if jax_dtype == parameter_dtype
+                else "jax_enable_x64 is off: JAX takes"
             )
             raise ValueError(
-                f"{dtype_statement} {computed_dtype.name} numbers, in which no limit cycle is "
+                f"{dtype_statement} {jax_dtype.name} numbers, in which no limit cycle is "
                 f"found to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
             )
 
@@ -93,7 +96,5 @@ class CycleOptions:
 
     @classmethod
     def tight(cls) -> "CycleOptions":
-        """Return options that are accurate to about 1e-12 in values and 1e-10 in first
-        derivatives.
-        """
+        """Return options with errors of about 1e-12 in values and 1e-10 in first derivatives."""
         return cls(mesh_intervals=(16, 20, 4), tolerance=1e-13)

@@ -18,11 +18,11 @@ from vrw_jax.cycles.finder import (
     BranchPoint,
     Gait,
     GaitMeasures,
-    Values,
-    measure_from_cycle,
-    measure_from_gait,
+    ParameterValues,
+    compute_value_and_tangents,
+    measure_on_cycle,
+    measure_on_gait,
     move_derivative_axis_first,
-    value_and_tangents,
 )
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import (
@@ -38,12 +38,11 @@ from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
-"""Lower limit of the tolerance of Newton's last correction. The step's own tolerance is another
-limit.
-"""
+"""Smallest tolerance of Newton's last correction. The tolerance is also at least that of the
+step."""
 
 
-def newton_tolerance(options: StepOptions) -> Scalar:
+def compute_newton_tolerance(options: StepOptions) -> Scalar:
     """Return the tolerance of Newton's last correction for these step options."""
     return jnp.maximum(MIN_NEWTON_TOLERANCE, options.rtol)
 
@@ -86,20 +85,22 @@ class ReturnMapCycle(AbstractCycle):
     def period_n(self) -> int:
         return self.steps.durations.shape[self.outcome.ndim]
 
-    def _squeeze_steps(self, tree: Any) -> Any:
+    def _drop_single_step_axis(self, tree: Any) -> Any:
         """Return the tree without the axis over steps if there is only one step."""
-        axis, is_single_step = self.outcome.ndim, self.period_n == 1
-        return jax.tree.map(lambda leaf: jnp.squeeze(leaf, axis) if is_single_step else leaf, tree)
+        step_axis, is_single_step = self.outcome.ndim, self.period_n == 1
+        return jax.tree.map(
+            lambda leaf: jnp.squeeze(leaf, step_axis) if is_single_step else leaf, tree
+        )
 
     @property
     def indicators(self) -> Any:
         """Return the indicators of each landing."""
-        return self._squeeze_steps(self.steps.indicators)
+        return self._drop_single_step_axis(self.steps.indicators)
 
     @property
     def margins(self) -> Any:
         """Return the margins of each step."""
-        return self._squeeze_steps(self.steps.margins)
+        return self._drop_single_step_axis(self.steps.margins)
 
     @property
     def step_ends(self) -> Array:
@@ -113,7 +114,7 @@ class ReturnMapCycle(AbstractCycle):
     def monodromy(self) -> Array:
         return self.monodromy_value
 
-    def model_rows(self) -> list[TextRow]:
+    def model_summary_rows(self) -> list[TextRow]:
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
 
 
@@ -124,64 +125,73 @@ def find_return_map_cycle(
     model: AbstractWheel,
     options: StepOptions,
     period_n: int,
-    uses_jvp_rule: bool,
+    uses_implicit_jvp: bool,
 ) -> ReturnMapCycle:
     """Return the cycle of a wheel, found by Newton's method on the model's return map.
 
-    `uses_jvp_rule` selects `solve_fixed_point_implicit`, because second derivatives of a step are
-    expensive with unilateral contact. The search then uses the same step as the result, so that
+    `uses_implicit_jvp` selects `solve_fixed_point_implicit`, because second derivatives of a step
+    are expensive with unilateral contact. The search then uses the same step as the result, so that
     only one program is compiled.
     """
-    take_step, solver = (
+    evaluate_step, find_fixed_point = (
         (model.take_step, solve_fixed_point_implicit)
-        if uses_jvp_rule
+        if uses_implicit_jvp
         else (model.advance, solve_fixed_point)
     )
-    units = jnp.stack(model.section_units(compute_wheel_units(params.symbols()), params.n_legs))
-    return_map = lambda section_state: (
-        take_step(params, section_state * units, options).section_state / units
+    section_units = jnp.stack(
+        model.section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
-    fixed_point = solver(
-        return_map, section_state / units, period_n=period_n, tolerance=newton_tolerance(options)
+    return_map = lambda section_state: (
+        evaluate_step(params, section_state * section_units, options).section_state / section_units
+    )
+    fixed_point = find_fixed_point(
+        return_map,
+        section_state / section_units,
+        period_n=period_n,
+        tolerance=compute_newton_tolerance(options),
     )
     fixed_point = fixed_point._replace(
-        x=fixed_point.x * units, jacobian=units[:, None] * fixed_point.jacobian / units
+        x=fixed_point.x * section_units,
+        jacobian=section_units[:, None] * fixed_point.jacobian / section_units,
     )
-    section_state, results = fixed_point.x, []
+    section_state, step_results = fixed_point.x, []
     for _ in range(period_n):
-        results.append(model.take_step(params, section_state, options))
-        section_state = results[-1].section_state
-    return make_cycle(
-        params, fixed_point, jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+        step_results.append(model.take_step(params, section_state, options))
+        section_state = step_results[-1].section_state
+    return make_return_map_cycle(
+        params, fixed_point, jax.tree.map(lambda *leaves: jnp.stack(leaves), *step_results)
     )
 
 
-def make_cycle(params: WheelParams, fixed_point: FixedPointResult, steps: Any) -> ReturnMapCycle:
+def make_return_map_cycle(
+    params: WheelParams, fixed_point: FixedPointResult, cycle_steps: Any
+) -> ReturnMapCycle:
     """Return the cycle of a fixed point whose steps have a leading axis."""
     # A step that fails returns zeros, which Newton's method may take for a fixed point.
-    is_valid = fixed_point.converged & jnp.all(steps.outcome == Outcome.STEPPED)
-    failure = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
-    mask = lambda leaf: jnp.where(is_valid, leaf, jnp.zeros_like(leaf))
-    steps = jax.tree.map(mask, steps)
+    is_gait_valid = fixed_point.converged & jnp.all(cycle_steps.outcome == Outcome.STEPPED)
+    failure_outcome = jnp.where(params.is_in_domain(), Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
+    zero_without_gait = lambda leaf: jnp.where(is_gait_valid, leaf, jnp.zeros_like(leaf))
+    cycle_steps = jax.tree.map(zero_without_gait, cycle_steps)
     return ReturnMapCycle(
-        mask(fixed_point.x),
-        *summarize_steps(steps),
-        steps=steps,
-        monodromy_value=mask(fixed_point.jacobian),
-        outcome=jnp.where(is_valid, Outcome.STEPPED, failure).astype(jnp.int32),
+        zero_without_gait(fixed_point.x),
+        *summarize_cycle_steps(cycle_steps),
+        steps=cycle_steps,
+        monodromy_value=zero_without_gait(fixed_point.jacobian),
+        outcome=jnp.where(is_gait_valid, Outcome.STEPPED, failure_outcome).astype(jnp.int32),
         residual=fixed_point.residual,
         n_iterations=fixed_point.n_iterations,
     )
 
 
-def summarize_steps(steps: Any) -> tuple[Array, Array, Array]:
-    """Return post-impact state, durations, s, and step lengths, m, of a cycle from its steps, on
-    a leading axis.
+def summarize_cycle_steps(cycle_steps: Any) -> tuple[Array, Array, Array]:
+    """Return post-impact state, durations, s, and step lengths, m, of a cycle from its steps.
+
+    The steps have a leading axis.
     """
-    durations, step_lengths = steps.durations, steps.step_length
+    durations, step_lengths = cycle_steps.durations, cycle_steps.step_length
     if len(durations) == 1:
         durations, step_lengths = durations[0], step_lengths[0]
-    return steps.post_impact[0], durations, step_lengths
+    return cycle_steps.post_impact[0], durations, step_lengths
 
 
 class AbstractReturnMapFinder(AbstractGaitFinder):
@@ -208,11 +218,11 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
     def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:
         arguments = prepare_search(self, params, guess)
-        return find_return_map_cycle(*arguments, self.period_n, uses_jvp_rule=False)
+        return find_return_map_cycle(*arguments, self.period_n, uses_implicit_jvp=False)
 
-    def initial_guess(self, values: Values) -> Array:
+    def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         """Return the last section state of a walk from the model's start."""
-        model, params = self.model.from_values(values, self.n_legs)
+        model, params = self.model.from_values(parameter_values, self.n_legs)
         return walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
 
     def precompile(self, params: WheelParams) -> None:
@@ -220,65 +230,89 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
 
 class ReturnMapFinder(AbstractReturnMapFinder):
-    """Finder for any model, with the derivatives of Newton's method."""
+    """Finder of the gaits of any model, with the derivatives of Newton's method."""
 
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
-        n
-        for n in CYCLE_MEASURE_FUNCTIONS
-        if n not in ("takeoff_acceleration", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
+        measure_name
+        for measure_name in CYCLE_MEASURE_FUNCTIONS
+        if measure_name
+        not in ("takeoff_acceleration", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         dict.fromkeys(
             (
                 *cycle_measures,
-                *(n for n in SHARED_STEP_MEASURE_NAMES if n in DIFFERENTIABLE_STEP_NAMES),
+                *(
+                    measure_name
+                    for measure_name in SHARED_STEP_MEASURE_NAMES
+                    if measure_name in DIFFERENTIABLE_STEP_NAMES
+                ),
             )
         )
     )
     default_measures: ClassVar[tuple[str, ...]] = tuple(
-        n for n in cycle_measures if n != "spectral_margin"
+        measure_name for measure_name in cycle_measures if measure_name != "spectral_margin"
     )
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
 
-    def measure_gait(self, values: Values, guess: Any, names: tuple[str, ...]) -> GaitMeasures:
-        if set(names) <= set(self.cycle_measures):
-            return measure_from_cycle(self, values, guess, names)
-        start = self.initial_guess(values) if guess is None else guess
-        return measure_from_gait(self.find_gait(values, start), type(self).read_measure, names)
+    def measure_gait(
+        self, parameter_values: ParameterValues, guess: Any, measure_names: tuple[str, ...]
+    ) -> GaitMeasures:
+        if set(measure_names) <= set(self.cycle_measures):
+            return measure_on_cycle(self, parameter_values, guess, measure_names)
+        start_state = self.make_initial_guess(parameter_values) if guess is None else guess
+        return measure_on_gait(
+            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
+        )
 
     @eqx.filter_jit
-    def find_gait(self, values: Values, guess: Array) -> Gait:
-        cycle, jacobian = value_and_jacobian(
-            lambda values: self.find_cycle_from_values(values, guess), values
+    def find_gait(self, parameter_values: ParameterValues, start_state: Array) -> Gait:
+        cycle, parameter_jacobian = value_and_jacobian(
+            lambda parameter_values: self.find_cycle_from_values(parameter_values, start_state),
+            parameter_values,
         )
-        d_cycle: Any = move_derivative_axis_first(jacobian)
+        cycle_derivatives: Any = move_derivative_axis_first(parameter_jacobian)
         step = jax.tree.map(lambda x: x[0], cycle.steps)
-        d_step = jax.tree.map(lambda x: x[:, 0], d_cycle.steps)
-        return make_gait(self.model, self.n_legs, cycle, step, d_cycle, d_step)
+        step_derivatives = jax.tree.map(lambda x: x[:, 0], cycle_derivatives.steps)
+        return make_return_map_gait(
+            self.model, self.n_legs, cycle, step, cycle_derivatives, step_derivatives
+        )
 
 
 def prepare_search(
-    finder: AbstractReturnMapFinder, params: WheelParams, guess: Any
+    gait_finder: AbstractReturnMapFinder, params: WheelParams, guess: Any
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return wheel, section state, model and options of a search near `guess`."""
-    start = guess.section_state if isinstance(guess, AbstractCycle) else guess
-    section_state = finder.model.default_start(params) if start is None else start
-    return validate_arguments(params, section_state, finder.model, finder.step_options)
+    guess_state = guess.section_state if isinstance(guess, AbstractCycle) else guess
+    section_state = gait_finder.model.default_start(params) if guess_state is None else guess_state
+    return validate_arguments(params, section_state, gait_finder.model, gait_finder.step_options)
 
 
-def make_gait(
-    model: AbstractWheel, n_legs: int, cycle: Any, step: Any, d_cycle: Any, d_step: Any
+def make_return_map_gait(
+    model: AbstractWheel,
+    n_legs: int,
+    cycle: Any,
+    step: Any,
+    cycle_derivatives: Any,
+    step_derivatives: Any,
 ) -> Gait:
     """Return a gait with the data that identify its branch.
 
-    With unilateral contact the order of events may change along a branch.
+    The active phases do not identify the branch, because with unilateral contact the order of
+    events may change along a branch.
     """
     n_coordinates = model.n_continuous(WheelParams(n_legs=n_legs))
     gait_coordinates = lambda cycle, step: jnp.concatenate(
         [cycle.section_state[:n_coordinates], step.durations]
     )
-    branch_point = value_and_tangents(gait_coordinates, (cycle, step), (d_cycle, d_step))
-    return_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
+    coordinates_and_derivatives = compute_value_and_tangents(
+        gait_coordinates, (cycle, step), (cycle_derivatives, step_derivatives)
+    )
+    return_map_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
     return Gait(
-        cycle, step, d_cycle, d_step, BranchPoint(*branch_point, jnp.ones(1), return_jacobian)
+        cycle,
+        step,
+        cycle_derivatives,
+        step_derivatives,
+        BranchPoint(*coordinates_and_derivatives, jnp.ones(1), return_map_jacobian),
     )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vrw_jax.cycles.finder_selection import Guess, check_guess, resolve_finder, resolve_model
+from vrw_jax.cycles.finder_selection import CycleGuess, check_guess, resolve_finder, resolve_model
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions
@@ -22,7 +22,7 @@ def sensitivities(
     params: WheelParams,
     *,
     measures: Sequence[str] | None = None,
-    guess: Guess | None = None,
+    guess: CycleGuess | None = None,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> xr.Dataset:
@@ -53,38 +53,43 @@ def sensitivities(
     """
     check_not_traced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
     model = resolve_model(params, model)
-    finder = resolve_finder(params, model, options)
-    names = finder.default_measures if measures is None else check_names("measures", measures)
-    unknown_names = sorted(set(names) - set(finder.differentiable_measures))
-    if unknown_names or not names:
+    gait_finder = resolve_finder(params, model, options)
+    measure_names = (
+        gait_finder.default_measures if measures is None else check_names("measures", measures)
+    )
+    unknown_names = sorted(set(measure_names) - set(gait_finder.differentiable_measures))
+    if unknown_names or not measure_names:
         raise ValueError(
             f"measures holds {', '.join(unknown_names) or 'nothing'}"
-            f"{suggest_name(unknown_names[0], finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
+            f"{suggest_name(unknown_names[0], gait_finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
             "but the measures of a cycle are "
-            f"{', '.join(finder.differentiable_measures)}: choose among these."
+            f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
-    values = finder.model.parameter_values(params)
-    result = finder.measure_gait(values, check_guess(guess), names)
-    if int(result.outcome) != Outcome.STEPPED:
-        outcome = Outcome(int(result.outcome))
-        raise ValueError(f"there is no gait to differentiate: {outcome.meaning}")
-    derivative, value = np.asarray(result.jacobian), np.asarray(result.values)
+    parameter_values = gait_finder.model.parameter_values(params)
+    gait_measures = gait_finder.measure_gait(parameter_values, check_guess(guess), measure_names)
+    if int(gait_measures.outcome) != Outcome.STEPPED:
+        failure_outcome = Outcome(int(gait_measures.outcome))
+        raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
+    derivatives, measure_values = (
+        np.asarray(gait_measures.parameter_jacobian),
+        np.asarray(gait_measures.measure_values),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        elasticity = derivative * np.asarray(values) / value[:, None]
-    axes, parameter_names = ("measure", "parameter"), finder.model.parameter_names
+        elasticities = derivatives * np.asarray(parameter_values) / measure_values[:, None]
+    table_axes, parameter_names = ("measure", "parameter"), gait_finder.model.parameter_names
     return xr.Dataset(
         {
-            "value": ("measure", value),
-            "derivative": (axes, derivative, {"long_name": "d(measure)/d(parameter)"}),
+            "value": ("measure", measure_values),
+            "derivative": (table_axes, derivatives, {"long_name": "d(measure)/d(parameter)"}),
             "elasticity": (
-                axes,
-                np.where(np.isfinite(elasticity), elasticity, np.nan),
+                table_axes,
+                np.where(np.isfinite(elasticities), elasticities, np.nan),
                 {"long_name": "relative change of measure per relative change of parameter"},
             ),
-            "measure_unit": ("measure", [MEASURES[name].unit for name in names]),
+            "measure_unit": ("measure", [MEASURES[name].unit for name in measure_names]),
             "parameter_unit": ("parameter", [MEASURES[name].unit for name in parameter_names]),
-            "parameter_value": ("parameter", np.asarray(values)),
+            "parameter_value": ("parameter", np.asarray(parameter_values)),
         },
-        coords={"measure": list(names), "parameter": list(parameter_names)},
-        attrs={"rung": finder.model.model_name},
+        coords={"measure": list(measure_names), "parameter": list(parameter_names)},
+        attrs={"rung": gait_finder.model.model_name},
     )

@@ -22,15 +22,13 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import ForwardFunction, StepOptions, enable_all_ad_modes
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
-N_REFINEMENTS = 3
-"""Number of Newton iterations with one Jacobian. It is chosen because each makes derivatives of
-one more order exact, and a gradient of the norm needs the second order.
-"""
+N_CHORD_ITERATIONS = 3
+"""Number of Newton iterations with one Jacobian. The value is chosen because each iteration makes
+derivatives of one more order exact. A gradient of the norm needs the second order."""
 
 
 class SlopeResponse(NamedTuple):
-    """Derivatives of a step's end state and measures with respect to its start and the slopes of
-    its two lines.
+    """Derivatives of a step's end state and measures by its start and the slopes of its two lines.
 
     With x[k] the start of step k and e[k] the deviation of the slope of line k, x[k+1] = A x[k] +
     B1 e[k] + B0 e[k+1] and y[k] = C x[k] + D1 e[k] + D0 e[k+1].
@@ -44,121 +42,137 @@ class SlopeResponse(NamedTuple):
     D0: Float[Array, " n_measures"]
 
     @classmethod
-    def from_jacobian(cls, jacobian: Array, n: int) -> "SlopeResponse":
-        """Return the response from the Jacobian of (end state, measures) with respect to (start,
-        slope, next slope).
+    def from_jacobian(cls, jacobian: Array, n_states: int) -> "SlopeResponse":
+        """Return the response from the Jacobian of (end state, measures).
+
+        The Jacobian is taken with respect to (start, slope, next slope).
         """
-        end, measures = jacobian[:n], jacobian[n:]
+        end_state_rows, measure_rows = jacobian[:n_states], jacobian[n_states:]
         return cls(
-            end[:, :n],
-            end[:, n],
-            end[:, n + 1],
-            measures[:, :n],
-            measures[:, n],
-            measures[:, n + 1],
+            end_state_rows[:, :n_states],
+            end_state_rows[:, n_states],
+            end_state_rows[:, n_states + 1],
+            measure_rows[:, :n_states],
+            measure_rows[:, n_states],
+            measure_rows[:, n_states + 1],
         )
 
-    def select(self, measure_indices: Sequence[int]) -> "SlopeResponse":
-        """Return the response with some of its measures."""
-        indices = jnp.asarray(measure_indices)
-        return self._replace(C=self.C[indices], D1=self.D1[indices], D0=self.D0[indices])
+    def select_measures(self, measure_indices: Sequence[int]) -> "SlopeResponse":
+        """Return the response with the measures of the given indices."""
+        index_array = jnp.asarray(measure_indices)
+        return self._replace(
+            C=self.C[index_array], D1=self.D1[index_array], D0=self.D0[index_array]
+        )
 
 
-class GaitSensitivityNorm(NamedTuple):
-    """Norm of each measure, and the parts whose squares add up to its square, in its unit per rad.
+class SensitivityNormParts(NamedTuple):
+    """Sensitivity norm of each measure and its parts, in the measure's unit per rad.
 
-    The parts are the response to the deviation of one line. They are that of the step that ends on
-    it and that of the step that begins on it, both with their sign, and that of all later steps
-    together.
+    The squares of the parts add up to the square of the norm. The parts are responses to the
+    deviation of one line. Two parts, with sign, belong to the step that ends on the line and the
+    step that begins on it. The third part belongs to all later steps together.
     """
 
-    norm: Float[Array, " n_measures"]
-    ending_step: Float[Array, " n_measures"]
-    beginning_step: Float[Array, " n_measures"]
-    later_steps: Float[Array, " n_measures"]
+    norms: Float[Array, " n_measures"]
+    ending_step_response: Float[Array, " n_measures"]
+    beginning_step_response: Float[Array, " n_measures"]
+    later_steps_response: Float[Array, " n_measures"]
 
 
-def compute_gait_sensitivity(response: SlopeResponse) -> GaitSensitivityNorm:
-    """Return the standard deviation of each measure over that of independent slopes.
+def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormParts:
+    """Return the standard deviation of each measure divided by that of independent slopes.
 
-    The response to one line is D0, then C B0 + D1, then C A^j b with b = A B0 + B1. The sum of the
-    squares of the last ones is C P C^T, where P = A P A^T + b b^T is a discrete Lyapunov equation.
-    The norm is infinite for a gait that is not stable.
+    The response to one line is D0, then C B0 + D1, then C A^j b with b = A B0 + B1. The squares of
+    C A^j b sum to C P C^T, where P solves the discrete Lyapunov equation P = A P A^T + b b^T. The
+    norm is infinite for a gait that is not stable.
     """
-    A, B1, B0, C, D1, D0 = response
+    A, B1, B0, C, D1, D0 = slope_response
     n = len(A)
     is_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
     A = jnp.where(is_stable, A, 0.0)
     b = A @ B0 + B1
-    equation = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
-    inverse = invert_by_elimination(lax.stop_gradient(equation))
+    lyapunov_matrix = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
+    approximate_inverse = invert_by_elimination(lax.stop_gradient(lyapunov_matrix))
     forcing_vector = jnp.outer(b, b).ravel()
-    covariance = inverse @ forcing_vector
-    for _ in range(N_REFINEMENTS):
-        covariance = covariance - inverse @ (equation @ covariance - forcing_vector)
+    covariance = approximate_inverse @ forcing_vector
+    for _ in range(N_CHORD_ITERATIONS):
+        covariance = covariance - approximate_inverse @ (
+            lyapunov_matrix @ covariance - forcing_vector
+        )
     P = covariance.reshape(n, n)
     later_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
-    beginning_step = C @ B0 + D1
-    sensitivity_norm = _root(D0**2 + beginning_step**2 + later_squared)
-    if_stable = lambda value: jnp.where(is_stable, value, jnp.inf)
-    return GaitSensitivityNorm(
-        if_stable(sensitivity_norm), D0, beginning_step, if_stable(_root(later_squared))
+    beginning_step_response = C @ B0 + D1
+    sensitivity_norm = _safe_square_root(D0**2 + beginning_step_response**2 + later_squared)
+    infinite_if_unstable = lambda value: jnp.where(is_stable, value, jnp.inf)
+    return SensitivityNormParts(
+        infinite_if_unstable(sensitivity_norm),
+        D0,
+        beginning_step_response,
+        infinite_if_unstable(_safe_square_root(later_squared)),
     )
 
 
 def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return the inverse of a matrix by Gauss-Jordan elimination with row exchanges.
 
-    LAPACK's batched solver takes threads of the pool on which XLA runs the program. Two programs at
-    a time, as a scan runs on two cores, then wait for each other and never end (jaxlib 0.10).
+    LAPACK's batched solver uses threads of the pool on which XLA runs the program. Two such
+    programs at a time, as in a scan on two cores, block each other for ever (jaxlib 0.10).
     """
     n = len(matrix)
-    augmented = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+    augmented_matrix = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
 
-    def eliminate_column(k: Array, augmented: Array) -> Array:
-        candidates = jnp.where(jnp.arange(n) >= k, jnp.abs(augmented[:, k]), -1.0)
-        pivot_index = jnp.argmax(candidates)
-        pivot_row, replaced_row = augmented[pivot_index], augmented[k]
-        augmented = augmented.at[pivot_index].set(replaced_row)
-        pivot_row = pivot_row / pivot_row[k]
-        eliminated = augmented - augmented[:, k, None] * pivot_row
-        return eliminated.at[k].set(pivot_row)
+    def eliminate_column(column_index: Array, augmented_matrix: Array) -> Array:
+        pivot_candidates = jnp.where(
+            jnp.arange(n) >= column_index, jnp.abs(augmented_matrix[:, column_index]), -1.0
+        )
+        pivot_index = jnp.argmax(pivot_candidates)
+        pivot_row, replaced_row = augmented_matrix[pivot_index], augmented_matrix[column_index]
+        augmented_matrix = augmented_matrix.at[pivot_index].set(replaced_row)
+        pivot_row = pivot_row / pivot_row[column_index]
+        eliminated_matrix = augmented_matrix - augmented_matrix[:, column_index, None] * pivot_row
+        return eliminated_matrix.at[column_index].set(pivot_row)
 
-    return lax.fori_loop(0, n, eliminate_column, augmented)[:, n:]
+    return lax.fori_loop(0, n, eliminate_column, augmented_matrix)[:, n:]
 
 
-def _root(squared_value: Array) -> Array:
+def _safe_square_root(squared_value: Array) -> Array:
     """Return the square root, with a zero derivative at zero and for negative round-off."""
     is_positive = squared_value > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, squared_value, 1.0)), 0.0)
 
 
-def step_slope_response(
+def compute_step_slope_response(
     model: AbstractWheel,
     params: WheelParams,
     section_state: Array,
-    names: Sequence[str],
+    measure_names: Sequence[str],
     options: StepOptions,
 ) -> SlopeResponse:
-    """Return the response of a model's own step from the section state of its gait.
+    """Return the response of a model's event-driven step from the section state of its gait.
 
-    Entries of the section state that are codes do not vary.
+    Components of the section state that are codes do not vary.
     """
-    n = model.n_continuous(params)
-    codes = section_state[n:]
+    n_states = model.n_continuous(params)
+    state_codes = section_state[n_states:]
 
-    def evaluate(inputs: Array) -> Array:
-        ground: Any = model.split_ground(eqx.tree_at(lambda p: p.slope, params, inputs[n:]), 1)
-        step_model, step_params = model.with_ground(
-            params, tuple(line_values[0] for line_values in ground)
+    def evaluate_step(state_and_slopes: Array) -> Array:
+        line_slopes: Any = model.split_ground(
+            eqx.tree_at(lambda p: p.slope, params, state_and_slopes[n_states:]), 1
         )
-        step = step_model.take_step(step_params, jnp.concatenate([inputs[:n], codes]), options)
-        measures = step.measures()
-        values = [jnp.ravel(measures[name]) for name in names]
-        return jnp.concatenate([step.section_state[:n], *values])
+        step_model, step_params = model.with_ground(
+            params, tuple(line_values[0] for line_values in line_slopes)
+        )
+        gait_step = step_model.take_step(
+            step_params, jnp.concatenate([state_and_slopes[:n_states], state_codes]), options
+        )
+        step_measures = gait_step.measures()
+        measure_values = [jnp.ravel(step_measures[name]) for name in measure_names]
+        return jnp.concatenate([gait_step.section_state[:n_states], *measure_values])
 
-    inputs = jnp.concatenate([section_state[:n], jnp.stack([params.slope, params.slope])])
-    return SlopeResponse.from_jacobian(jax.jacfwd(evaluate)(inputs), n)
+    state_and_slopes = jnp.concatenate(
+        [section_state[:n_states], jnp.stack([params.slope, params.slope])]
+    )
+    return SlopeResponse.from_jacobian(jax.jacfwd(evaluate_step)(state_and_slopes), n_states)
 
 
 COLLOCATION_RESPONSE_MEASURES = (
@@ -173,83 +187,123 @@ COLLOCATION_RESPONSE_MEASURES = (
 """Measures of a step that its durations and its first landing determine."""
 
 
-def collocation_slope_response(
+def compute_collocation_slope_response(
     system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> SlopeResponse:
-    """Return the response of the paper's step, with `COLLOCATION_RESPONSE_MEASURES`, from its
-    collocation.
+    """Return the response of the paper's step to slopes, from its collocation.
 
-    The state is (theta+, dtheta+) just after a landing, in the frame of the line under both feet.
-    The response is differentiable along the branch of gaits in every mode, up to second order.
+    Its measures are `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a
+    landing, in the frame of the line under both feet. The response is differentiable along the
+    branch of gaits in every mode, up to second order.
     """
-    solution, is_active = collocation_state.solution, collocation_state.phase_active[0]
-    gait_unknowns = lax.stop_gradient(
-        (solution.durations[0], *(a[0] for a in solution.accelerations))
+    collocation_solution, is_active = (
+        collocation_state.solution,
+        collocation_state.is_phase_active[0],
     )
-    compute_response = _make_collocation_response(system)
+    gait_unknowns = lax.stop_gradient(
+        (
+            collocation_solution.durations[0],
+            *(phase_accelerations[0] for phase_accelerations in collocation_solution.accelerations),
+        )
+    )
+    compute_response = _make_collocation_response_function(system)
     return compute_response(
-        parameters, solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
+        parameters, collocation_solution.section_state, lax.stop_gradient(is_active), *gait_unknowns
     )[0]
 
 
 @functools.cache
-def _make_collocation_response(system: CollocationSystem) -> ForwardFunction:
-    """Return the function that computes the response from parameters, section state and a step's
-    solution.
+def _make_collocation_response_function(system: CollocationSystem) -> ForwardFunction:
+    """Return the function that computes the slope response of a collocated step.
 
-    Durations and accelerations for other starts and slopes follow by Newton's method with the
-    Jacobian of the gait's own step.
+    Its arguments are parameters, section state and the solution of the step. Newton's method gives
+    durations and accelerations for other starts and slopes. It uses the Jacobian of the gait's
+    step.
     """
     slope_index = PARAMETER_NAMES.index("slope")
 
     def compute_response(
-        parameters: Array, section: Array, is_active: Array, *gait_unknowns: Array
+        parameters: Array, section_state: Array, is_phase_active: Array, *gait_unknowns: Array
     ) -> tuple:
-        unknowns_of_gait, unravel = ravel_pytree(gait_unknowns)
+        gait_unknown_vector, unflatten_unknowns = ravel_pytree(gait_unknowns)
 
-        def reconstruct(unknowns: Array, inputs: Array, parameters: Array) -> tuple:
-            durations, *accelerations = unravel(unknowns)
-            line_parameters = parameters.at[slope_index].set(inputs[2])
-            constants = (*system.compute_constants(*line_parameters), inputs[3] - inputs[2])
-            section, phase_points = reconstruct_step(
-                system.sequence,
-                system.meshes,
-                constants,
-                tuple(inputs[:2]),
+        def reconstruct_from_unknowns(
+            unknown_vector: Array, state_and_slopes: Array, parameters: Array
+        ) -> tuple:
+            durations, *accelerations = unflatten_unknowns(unknown_vector)
+            line_parameters = parameters.at[slope_index].set(state_and_slopes[2])
+            phase_constants = (
+                *system.compute_phase_constants(*line_parameters),
+                state_and_slopes[3] - state_and_slopes[2],
+            )
+            end_section_state, phase_points = reconstruct_step(
+                system.phase_sequence,
+                system.phase_meshes,
+                phase_constants,
+                tuple(state_and_slopes[:2]),
                 durations,
                 tuple(accelerations),
             )
-            return constants, section, phase_points
+            return phase_constants, end_section_state, phase_points
 
-        def residual(unknowns: Array, inputs: Array, parameters: Array) -> Array:
-            durations, *accelerations = unravel(unknowns)
-            constants, _, phase_points = reconstruct(unknowns, inputs, parameters)
-            residuals: list[Array] = []
-            for i, (phase, points) in enumerate(
-                zip(system.sequence.phases, phase_points, strict=True)
+        def evaluate_residual(
+            unknown_vector: Array, state_and_slopes: Array, parameters: Array
+        ) -> Array:
+            durations, *accelerations = unflatten_unknowns(unknown_vector)
+            phase_constants, _, phase_points = reconstruct_from_unknowns(
+                unknown_vector, state_and_slopes, parameters
+            )
+            residual_parts: list[Array] = []
+            for phase_index, (phase, points_of_phase) in enumerate(
+                zip(system.phase_sequence.phases, phase_points, strict=True)
             ):
-                node_accelerations = accelerations[i].reshape(-1, phase.n_coordinates).T
-                residuals += phase.residual(constants, points.nodes, tuple(node_accelerations))
-                event = phase.event(constants, points.end)
-                residuals.append(jnp.where(is_active[i] > 0.5, event, durations[i])[None])
-            return jnp.concatenate(residuals)
+                node_accelerations = accelerations[phase_index].reshape(-1, phase.n_coordinates).T
+                residual_parts += phase.residual(
+                    phase_constants, points_of_phase.nodes, tuple(node_accelerations)
+                )
+                event_value = phase.event(phase_constants, points_of_phase.end)
+                residual_parts.append(
+                    jnp.where(
+                        is_phase_active[phase_index] > 0.5, event_value, durations[phase_index]
+                    )[None]
+                )
+            return jnp.concatenate(residual_parts)
 
-        inputs = jnp.concatenate([section, jnp.full(2, parameters[slope_index])])
-        jacobian = jax.jacfwd(residual)(unknowns_of_gait, *lax.stop_gradient((inputs, parameters)))
-        inverse_jacobian = invert_by_elimination(jacobian)
+        state_and_slopes = jnp.concatenate([section_state, jnp.full(2, parameters[slope_index])])
+        residual_jacobian = jax.jacfwd(evaluate_residual)(
+            gait_unknown_vector, *lax.stop_gradient((state_and_slopes, parameters))
+        )
+        inverse_jacobian = invert_by_elimination(residual_jacobian)
 
-        def evaluate(inputs: Array) -> Array:
-            def refine(unknowns: Array, _: None) -> tuple[Array, None]:
-                correction = inverse_jacobian @ residual(unknowns, inputs, parameters)
-                return unknowns - correction, None
+        def evaluate_outputs(state_and_slopes: Array) -> Array:
+            def refine_unknowns(unknown_vector: Array, _: None) -> tuple[Array, None]:
+                newton_correction = inverse_jacobian @ evaluate_residual(
+                    unknown_vector, state_and_slopes, parameters
+                )
+                return unknown_vector - newton_correction, None
 
-            unknowns, _ = lax.scan(refine, unknowns_of_gait, length=N_REFINEMENTS)
-            _, end, phase_points = reconstruct(unknowns, inputs, parameters)
-            durations, (length,) = unravel(unknowns)[0], phase_points[0].start.held_constants
+            unknown_vector, _ = lax.scan(
+                refine_unknowns, gait_unknown_vector, length=N_CHORD_ITERATIONS
+            )
+            _, end_section_state, phase_points = reconstruct_from_unknowns(
+                unknown_vector, state_and_slopes, parameters
+            )
+            durations, (step_length,) = (
+                unflatten_unknowns(unknown_vector)[0],
+                phase_points[0].start.held_constants,
+            )
             period = jnp.sum(durations)
-            values = durations[0] / period, period, length / period, length, *durations
-            return jnp.stack([*end, *values])
+            measure_values = (
+                durations[0] / period,
+                period,
+                step_length / period,
+                step_length,
+                *durations,
+            )
+            return jnp.stack([*end_section_state, *measure_values])
 
-        return SlopeResponse.from_jacobian(jax.jacfwd(evaluate)(inputs), len(section)), ()
+        return SlopeResponse.from_jacobian(
+            jax.jacfwd(evaluate_outputs)(state_and_slopes), len(section_state)
+        ), ()
 
     return enable_all_ad_modes(compute_response)

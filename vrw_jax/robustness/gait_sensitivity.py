@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.continuation import floquet
 from vrw_jax.cycles import (
+    CycleGuess,
     CycleOptions,
-    Guess,
-    compute_gait_sensitivity,
+    compute_sensitivity_norms,
     limit_cycle,
     resolve_finder,
     resolve_model,
@@ -96,7 +96,7 @@ def gait_sensitivity(
     measures: str | Sequence[str],
     *,
     model: ModelLike | None = None,
-    guess: Guess | None = None,
+    guess: CycleGuess | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> GaitSensitivity:
     """Return the gait sensitivity norm of each measure of a step.
@@ -152,8 +152,8 @@ def gait_sensitivity(
             "this wheel has no gait whose sensitivity could be computed: "
             f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
         )
-    sensitivity_norms = compute_gait_sensitivity(
-        cycle_finder.slope_response(params, limit_cycle_result, measure_names)
+    sensitivity_norms = compute_sensitivity_norms(
+        cycle_finder.compute_slope_response(params, limit_cycle_result, measure_names)
     )
     zero_without_gait = lambda value: jnp.where(
         limit_cycle_result.outcome == Outcome.STEPPED, value, 0.0
@@ -162,10 +162,10 @@ def gait_sensitivity(
         lax.stop_gradient(limit_cycle_result.monodromy_value)
     )
     return GaitSensitivity(
-        norm=zero_without_gait(sensitivity_norms.norm),
-        ending_step=zero_without_gait(sensitivity_norms.ending_step),
-        beginning_step=zero_without_gait(sensitivity_norms.beginning_step),
-        later_steps=zero_without_gait(sensitivity_norms.later_steps),
+        norm=zero_without_gait(sensitivity_norms.norms),
+        ending_step=zero_without_gait(sensitivity_norms.ending_step_response),
+        beginning_step=zero_without_gait(sensitivity_norms.beginning_step_response),
+        later_steps=zero_without_gait(sensitivity_norms.later_steps_response),
         spectral_radius=zero_without_gait(spectral_radius),
         outcome=limit_cycle_result.outcome,
         measures=measure_names,

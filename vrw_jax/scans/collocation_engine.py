@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome, make_finder
+from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step, make_finder
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
@@ -161,7 +161,9 @@ class CollocationEngine:
             step_outcome, step_state, step_measures = programs.evaluate_step(
                 values, section_state, options
             )
-            confirmed_outcome = confirm_outcome(outcome, section_state, step_outcome, step_state)
+            confirmed_outcome = confirm_outcome_by_step(
+                outcome, section_state, step_outcome, step_state
+            )
             measures = cycle_measures | step_measures
         finally:
             self._free_programs.put(programs)

@@ -64,7 +64,9 @@ class UnilateralEngine:
         )
 
         finder: Any = make_finder(model, base.n_legs, step_options=options)
-        self._finder = dataclasses.replace(finder, batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,))
+        self._finder = dataclasses.replace(
+            finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
+        )
         read_measure = type(finder).read_measure
         self._measure_reader, self._derivatives = (
             MeasureReader(read_measure, measure_names),

@@ -280,7 +280,7 @@ class TuneProblem:
         parameters = jnp.asarray(self.denormalize(normalized_parameters))
         neighbor_evaluation = None if neighbor is None else neighbor.evaluation
         guess = (
-            self.finder.initial_guess(parameters)
+            self.finder.make_initial_guess(parameters)
             if neighbor_evaluation is None
             else neighbor_evaluation.gait.cycle.warm_start
         )
@@ -350,7 +350,7 @@ class TuneProblem:
         parameters = jnp.asarray(
             [self.denormalize(parameter_row) for parameter_row in normalized_parameters]
         )
-        guesses = self.finder.initial_guesses(parameters)
+        guesses = self.finder.make_initial_guesses(parameters)
         guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
         gait = self.finder.find_gaits(parameters, guess)
         return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
