@@ -23,7 +23,7 @@ import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax.branches.special_point_curves import (
-    DEFAULT_BOUNDS,
+    DEFAULT_PARAMETER_BOUNDS,
     ParameterBounds,
     continue_special_points,
 )
@@ -146,7 +146,9 @@ def main() -> None:
     random, fine = np.random.default_rng(19), vrw.CycleOptions.tight().refine_mesh().refine_mesh()
     for second in SECOND_PARAMETERS:
         for curve in continue_special_points(SPECIAL_POINT_NAMES, ("damping", second), cycle):
-            rows.append(judge_curve(curve, DEFAULT_BOUNDS, N_POINTS_PER_CURVE, random, fine))
+            rows.append(
+                judge_curve(curve, DEFAULT_PARAMETER_BOUNDS, N_POINTS_PER_CURVE, random, fine)
+            )
             print(rows[-1], flush=True)
             tables.write_named_rows(folder / "both_sides.csv", rows)
 

@@ -13,7 +13,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.timing import measure_cpu_seconds, use_one_core
 from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveTracer
-from vrw_jax.branches.special_point_map import find_seeds_on_middle_lines
+from vrw_jax.branches.special_point_map import find_seeds_on_parallel_lines
 
 BOX = {"damping": (4.0, 240.0), "stiffness": (350.0, 700.0)}
 
@@ -27,7 +27,7 @@ def main() -> None:
     tracer = CurveTracer(
         (first, second), box, model, DEFAULT_CURVE_OPTIONS, vrw.StepOptions.tight()
     )
-    begin = lambda: find_seeds_on_middle_lines(tracer, vrw.WheelParams())
+    begin = lambda: find_seeds_on_parallel_lines(tracer, vrw.WheelParams())
     seeds = begin()
     curves = [one.curve for one in tracer.trace_curves(seeds, ())]
     n = sum(len(curve.values) for curve in curves)

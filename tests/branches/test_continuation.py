@@ -10,7 +10,7 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.branches.branch_location import continue_and_locate
+from vrw_jax.branches.branch_location import continue_and_locate_points
 from vrw_jax.branches.continuation import MapContinuation
 from vrw_jax.cli.reports import write_branch
 from vrw_jax.continuation.arclength import (
@@ -73,7 +73,9 @@ def test_a_branch_linearized_outside_of_compiled_programs_is_the_same():
         given = jnp.zeros(1), np.array([-0.5, 1.0])
         run = MapContinuation(options_used, vrw.ArclengthOptions(max_ds=0.1), *given)
         begin = jnp.array([[-1.0, -2.0, 0.0]]), jnp.array([1.0])
-        (strand,) = continue_and_locate(run, *begin, np.array([True]), lambda owner, point: None)
+        (strand,) = continue_and_locate_points(
+            run, *begin, np.array([True]), lambda owner, point: None
+        )
         return strand
 
     inside = FixedPointProblem(evaluate_stretched_map)

@@ -11,7 +11,7 @@ import pytest
 
 import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
-from vrw_jax.branches.branch_location import continue_and_locate
+from vrw_jax.branches.branch_location import continue_and_locate_points
 from vrw_jax.branches.continuation import MapContinuation
 from vrw_jax.branches.special_point_curves import continue_special_points
 from vrw_jax.continuation.arclength import ArclengthOptions, ContinuationStatus
@@ -54,7 +54,7 @@ def trace_curve(function, quantity, z, p, bounds, seconds, second):
     lead = lambda x: jnp.asarray(x, float)[None]
     start = TestFunctionPoint(lead(z), lead(share))
     run = MapContinuation(level, CURVE_OPTIONS, jnp.zeros(1), np.array(bounds))
-    (strand,) = continue_and_locate(
+    (strand,) = continue_and_locate_points(
         run, start, lead(p), np.array([True]), lambda owner, point: None
     )
     second = level.second_parameter(jax.tree.map(jnp.asarray, strand.points.z))

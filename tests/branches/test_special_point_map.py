@@ -7,7 +7,7 @@ import xarray as xr
 import vrw_jax as vrw
 from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
-    find_sign_changes,
+    find_sign_changes_in_scan,
     find_unexplained_changes,
 )
 from vrw_jax.measures import MARGIN_MEASURES
@@ -39,8 +39,8 @@ def make_line(name, c, k):
 def test_only_the_curve_of_the_same_quantity_explains_a_sign_change():
     zero = 50.0 + (K - 400.0) / 3.0
     scan = make_scan({"friction_rear": C[:, None] - zero})
-    changes = find_sign_changes(scan, MAP_PARAMETERS)
-    assert {change.name for change in changes} == {"friction_rear"}
+    changes = find_sign_changes_in_scan(scan, MAP_PARAMETERS)
+    assert {change.quantity_name for change in changes} == {"friction_rear"}
     for change in changes:  # linear: interpolation between two samples is exact
         i, j = change.cell_position
         assert 50.0 + 10.0 * i == pytest.approx(50.0 + 25.0 * j / 3.0, abs=1e-9)
@@ -58,14 +58,18 @@ def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
     outcome[6:8, 4:] = vrw.Outcome.STEPPED
     scan = make_scan({}, outcome)
     result_by_name = {name: [] for name in ("gait", "mesh_too_coarse")}
-    for change in find_sign_changes(scan, MAP_PARAMETERS):
-        result_by_name[change.name].append(change.sample)
+    for change in find_sign_changes_in_scan(scan, MAP_PARAMETERS):
+        result_by_name[change.quantity_name].append(change.sample_indices)
     assert set(result_by_name["gait"]) == {(5, j) for j in range(4)} | {(6, 4), (7, 4)}
     assert set(result_by_name["mesh_too_coarse"]) == {(7, j) for j in range(4, len(K))}
     fold = make_line("fold", np.full(2, 105.0), np.array([400.0, 500.0]))
-    left_part = find_unexplained_changes(find_sign_changes(scan, MAP_PARAMETERS), [fold], scan)
-    assert {change.name for change in left_part} == {"gait", "mesh_too_coarse"}
-    assert {change.sample for change in left_part if change.name == "gait"} == {(7, 4)}
+    left_part = find_unexplained_changes(
+        find_sign_changes_in_scan(scan, MAP_PARAMETERS), [fold], scan
+    )
+    assert {change.quantity_name for change in left_part} == {"gait", "mesh_too_coarse"}
+    assert {change.sample_indices for change in left_part if change.quantity_name == "gait"} == {
+        (7, 4)
+    }
 
 
 @pytest.mark.slow

@@ -5,6 +5,6 @@ from vrw_jax.branches.continuation import continue_branch, continue_branches, co
 from vrw_jax.branches.special_point_curves import continue_special_point
 from vrw_jax.branches.special_point_map import (
     SPECIAL_POINT_MEASURES,
-    UnexplainedChange,
+    ScanSignChange,
     trace_special_points,
 )

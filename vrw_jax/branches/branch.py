@@ -16,8 +16,9 @@ from vrw_jax.printing import format_html_table
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome
 
-MAX_PRINTED_POINTS = 20
-"""Largest number of special points that are printed, chosen so that a branch fits on a screen."""
+MAX_PRINTED_SPECIAL_POINTS = 20
+"""Largest number of special points that are printed. The value is chosen so that a branch fits on a
+screen."""
 
 
 class FixedPoint(NamedTuple):
@@ -51,11 +52,11 @@ class SpecialPoint:
     indicator or margin `name` is zero), "order_of_contacts_changes" (the branch continues with a
     kink or a jump) or "lost" (the order of events changes, as `name` describes).
 
-    - `value`: value of the parameter;
+    - `value`: value of the parameter at the special point;
     - `point`: fixed point beside the special point, on the side that belongs to the branch;
-    - `ends_branch`: whether the branch ends there;
-    - `find_cycle`: function that finds the gait there, for the property `cycle`;
-    - `n_multipliers`: number of multipliers that cross the unit circle there, 0 for other kinds.
+    - `ends_branch`: whether the branch ends at the special point;
+    - `find_cycle`: function that finds the gait at the special point, for the property `cycle`;
+    - `n_multipliers`: number of multipliers that cross the unit circle, 0 for other kinds.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -78,12 +79,12 @@ class SpecialPoint:
         return self.point if self.find_cycle is None else self.find_cycle()
 
     def __str__(self) -> str:
-        name = "" if self.name == self.kind else f" {self.name}"
+        name_text = "" if self.name == self.kind else f" {self.name}"
         end_text = ", ends the branch" if self.ends_branch else ""
-        is_named_by_kind = 2 if self.kind == "neimark_sacker" else 1
-        if self.n_multipliers > is_named_by_kind:
-            name += f" of {self.n_multipliers} multipliers at once"
-        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name}{end_text}"
+        expected_multiplier_count = 2 if self.kind == "neimark_sacker" else 1
+        if self.n_multipliers > expected_multiplier_count:
+            name_text += f" of {self.n_multipliers} multipliers at once"
+        return f"{self.value:.9g}: {self.kind.replace('_', ' ')}{name_text}{end_text}"
 
     def __repr__(self) -> str:
         return f"SpecialPoint at {self}"
@@ -94,8 +95,8 @@ class Branch:
     """Gaits along one parameter and their special points, both in the order of the branch.
 
     - `parameter`: name of the parameter;
-    - `dataset`: measures over the dimension `point`. The parameter is a coordinate on it, which
-      reverses at folds;
+    - `dataset`: measures over the dimension `point`, with the parameter as coordinate. The
+      parameter reverses at folds;
     - `special_points`: bifurcations, border collisions and ends;
     - `ends`: reasons why the branch ends at its first and its last point;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait to start from.
@@ -130,7 +131,7 @@ class Branch:
 
     @property
     def ending(self) -> str:
-        """Return why the branch ends at its first and at its last point, as one text."""
+        """Return the reasons why the branch ends at its first and its last point, as one text."""
         if not self.values.size:
             return self.outcome.meaning
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
@@ -138,31 +139,37 @@ class Branch:
     def __str__(self) -> str:
         if not self.values.size:
             return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
-        has_unit = self.parameter in MEASURES
-        parameter_unit = f" {MEASURES[self.parameter].display_unit}".rstrip() if has_unit else ""
+        has_known_unit = self.parameter in MEASURES
+        parameter_unit = (
+            f" {MEASURES[self.parameter].display_unit}".rstrip() if has_known_unit else ""
+        )
         is_stable = self.stable
-        lines = [
+        text_lines = [
             f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
             f"{self.values[-1]:.6g}{parameter_unit}, {int(is_stable.sum())} stable, "
             f"{int((~is_stable).sum())} not.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
             f"  {len(self.special_points)} special points" + (":" if self.special_points else "."),
-            *(f"    {special_point}" for special_point in self.special_points[:MAX_PRINTED_POINTS]),
+            *(
+                f"    {special_point}"
+                for special_point in self.special_points[:MAX_PRINTED_SPECIAL_POINTS]
+            ),
         ]
-        if len(self.special_points) > MAX_PRINTED_POINTS:
-            lines.append(
-                f"    and {len(self.special_points) - MAX_PRINTED_POINTS} more, in .special_points"
+        if len(self.special_points) > MAX_PRINTED_SPECIAL_POINTS:
+            text_lines.append(
+                f"    and {len(self.special_points) - MAX_PRINTED_SPECIAL_POINTS} more, "
+                "in .special_points"
             )
-        return "\n".join(lines)
+        return "\n".join(text_lines)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        ends = ("", "ends the branch")
+        end_texts = ("", "ends the branch")
         return format_html_table(
             str(self).split("\n  ")[0],
-            ((f"{p.value:.9g}", p.kind.replace("_", " "), p.name, ends[p.ends_branch])
+            ((f"{p.value:.9g}", p.kind.replace("_", " "), p.name, end_texts[p.ends_branch])
              for p in self.special_points),
             (self.parameter, "kind", "name", ""),
         )  # fmt: skip
@@ -177,19 +184,19 @@ class Codim2Point:
     ends_curve: bool  # whether the curve ends at this point
 
     def __str__(self) -> str:
-        ends = ", ends the curve" if self.ends_curve else ""
-        return f"({self.values[0]:.9g}, {self.values[1]:.9g}): meets {self.name}{ends}"
+        end_text = ", ends the curve" if self.ends_curve else ""
+        return f"({self.values[0]:.9g}, {self.values[1]:.9g}): meets {self.name}{end_text}"
 
 
 @dataclass(frozen=True, repr=False)
 class SpecialPointCurve:
-    """Curve of a special point in two parameters, its points in order along the dimension `point`.
+    """Curve of a special point in two parameters, with points in order along the dimension `point`.
 
     - `name`: name of the special point;
     - `parameters`: names of the two parameters;
     - `dataset`: durations, spectral radius and section state along the curve;
-    - `codim2_points`: points at which it meets other special points;
-    - `ends`: reasons why it ends at its first and its last point, equal for a closed curve.
+    - `codim2_points`: points at which the curve meets other special points;
+    - `ends`: reasons why the curve ends at its first and its last point, equal for a closed curve.
 
     Examples:
         >>> cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
@@ -211,18 +218,19 @@ class SpecialPointCurve:
 
     @property
     def ending(self) -> str:
-        """Return why the curve ends at its first and at its last point, as one text."""
+        """Return the reasons why the curve ends at its first and its last point, as one text."""
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
         first_name, second_name = self.parameters
-        lines = [
+        text_lines = [
             f"Curve of {self.name} over {first_name} and {second_name}: {len(self.values)} points."
         ]
-        for end, point_text in zip((0, -1), self.ends, strict=True):
-            lines.append(
-                f"  at ({self.values[end][0]:.6g}, {self.values[end][1]:.6g}): {point_text}"
-            )
-        return "\n".join([*lines, *(f"    {point}" for point in self.codim2_points)])
+        for end_index, end_reason in zip((0, -1), self.ends, strict=True):
+            first_value, second_value = self.values[end_index]
+            text_lines.append(f"  at ({first_value:.6g}, {second_value:.6g}): {end_reason}")
+        return "\n".join(
+            [*text_lines, *(f"    {codim2_point}" for codim2_point in self.codim2_points)]
+        )
 
     __repr__ = __str__

@@ -1,6 +1,4 @@
-"""Starts of branches for each model: the gaits from which branches are continued, and their
-wheels.
-"""
+"""Starts of branches for each model: the first gaits and their wheels."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.branch_location import CycleFactory
+from vrw_jax.branches.branch_location import MakeCycleFinder
 from vrw_jax.branches.continuation_problems import (
     AbstractGaitProblem,
     BranchWheel,
@@ -35,7 +33,7 @@ from vrw_jax.wheel import WheelParams
 
 
 class BranchRequest(NamedTuple):
-    """Request for branches of a batch of wheels."""
+    """Request for the branches of a batch of wheels along one parameter."""
 
     params: WheelParams  # parameters with one leading axis over wheels
     model: AbstractWheel
@@ -44,160 +42,201 @@ class BranchRequest(NamedTuple):
     period_n: int
     cycle_options: CycleOptions | None
     step_options: StepOptions
-    reads_force_peaks: bool = False  # whether its points have the measures of the gait's force
+    measures_force_peaks: bool = False  # whether its points have the measures of the gait's force
 
 
 class BranchStart(NamedTuple):
-    """Data from which a continuation starts."""
+    """Gaits, wheels and equations from which a continuation starts."""
 
     problem: AbstractGaitProblem
     wheels: BranchWheel
-    unknowns: Any
-    outcomes: np.ndarray  # outcomes of the first gaits
-    make_cycle: CycleFactory
-    cycle: Any = None  # the first gaits
+    start_unknowns: Any
+    start_outcomes: np.ndarray  # outcomes of the first gaits
+    make_cycle_finder: MakeCycleFinder
+    start_cycles: Any = None  # the first gaits
     # options with a finer mesh; None for a problem without a mesh
-    finer_options: CycleOptions | None = None
+    finer_cycle_options: CycleOptions | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class FindLimitCycle:
+class LimitCycleFinder:
     """Function without arguments that finds the gait at a special point; it can be pickled.
 
     - `finder`, `model`: finder and model of the branch;
-    - `name`: name of the continued parameter;
-    - `wheel`, `guess`: the wheel, and its gait at the start of the branch;
+    - `parameter_name`: name of the continued parameter;
+    - `start_params`, `start_cycle`: wheel and gait at the start of the branch;
     - `z`, `p`: solution and value of the parameter beside the special point.
     """
 
     finder: Any
     model: AbstractWheel
-    name: str
-    wheel: WheelParams
-    guess: LimitCycle
+    parameter_name: str
+    start_params: WheelParams
+    start_cycle: LimitCycle
     z: CollocationSolution
     p: Any
 
     def __call__(self) -> LimitCycle:
         """Return the gait at the special point."""
-        wheel, guess = jax.device_put((self.wheel, self.guess))
-        collocation_state = guess.collocation_state._replace(
+        params, guess_cycle = jax.device_put((self.start_params, self.start_cycle))
+        collocation_state = guess_cycle.collocation_state._replace(
             solution=jax.tree.map(jnp.asarray, self.z)
         )
-        guess = dataclasses.replace(
-            guess, collocation_state=collocation_state, system=self.finder.system
+        guess_cycle = dataclasses.replace(
+            guess_cycle, collocation_state=collocation_state, system=self.finder.system
         )
-        _, wheel = self.model.with_parameter(wheel, self.name, jnp.asarray(self.p))
-        cycle: LimitCycle = self.finder.find_cycle(wheel, guess)
+        _, params = self.model.with_parameter(params, self.parameter_name, jnp.asarray(self.p))
+        cycle: LimitCycle = self.finder.find_cycle(params, guess_cycle)
         return cycle
 
 
-def start_from_collocation(request: BranchRequest, cycle: Any) -> BranchStart:
+def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
     """Return the starts of branches from limit cycles by collocation, given or found."""
-    params, name, period_n = request.params, request.parameter_name, request.period_n
-    options = CycleOptions.tight() if request.cycle_options is None else request.cycle_options
-    # The start does not need the mesh or the accuracy of the branch.
-    start_cycle = cycle
+    params, parameter_name, period_n = (
+        branch_request.params,
+        branch_request.parameter_name,
+        branch_request.period_n,
+    )
+    cycle_options = (
+        CycleOptions.tight()
+        if branch_request.cycle_options is None
+        else branch_request.cycle_options
+    )
+    # The start may have a coarser mesh and larger errors than the branch.
+    start_cycle = given_cycle
     if start_cycle is None:
-        start_cycle = limit_cycles(params, period_n=period_n, model=request.model)
+        start_cycle = limit_cycles(params, period_n=period_n, model=branch_request.model)
     if not isinstance(start_cycle, LimitCycle):
         raise TypeError(
             f"cycle is a {type(start_cycle).__name__}, but the paper's branch starts from a "
             "LimitCycle: give vrw.limit_cycle(params)."
         )
-    finder: Any = make_finder(
-        request.model, params.n_legs, period_n=period_n, cycle_options=options
+    gait_finder: Any = make_finder(
+        branch_request.model, params.n_legs, period_n=period_n, cycle_options=cycle_options
     )
-    system = finder.system
+    collocation_system = gait_finder.system
 
-    def make_cycle(wheel_index: int, point: ContinuationPoint) -> FindLimitCycle:
-        guess, wheel = take_rows((start_cycle, params), wheel_index)
-        return FindLimitCycle(finder, request.model, name, wheel, guess, point.z, point.p)
+    def make_cycle_finder(wheel_index: int, branch_point: ContinuationPoint) -> LimitCycleFinder:
+        start_cycle_of_wheel, start_params = take_rows((start_cycle, params), wheel_index)
+        return LimitCycleFinder(
+            gait_finder,
+            branch_request.model,
+            parameter_name,
+            start_params,
+            start_cycle_of_wheel,
+            branch_point.z,
+            branch_point.p,
+        )
 
     return BranchStart(
         CollocationProblem(
-            system=system,
-            parameter_name=name,
-            additional_quantities=None,
-            reads_force_peaks=request.reads_force_peaks,
+            system=collocation_system,
+            parameter_name=parameter_name,
+            compute_additional_quantities=None,
+            measures_force_peaks=branch_request.measures_force_peaks,
         ),
         BranchWheel(params, start_cycle.collocation_state.is_phase_active),
-        jax.vmap(lambda solution: transfer_solution_to_mesh(start_cycle.system, system, solution))(
-            start_cycle.collocation_state.solution
-        ),
+        jax.vmap(
+            lambda solution: transfer_solution_to_mesh(
+                start_cycle.system, collocation_system, solution
+            )
+        )(start_cycle.collocation_state.solution),
         np.asarray(start_cycle.outcome),
-        make_cycle,
+        make_cycle_finder,
         start_cycle,
-        options.refine_mesh(),
+        cycle_options.refine_mesh(),
     )
 
 
-def start_from_walks(request: BranchRequest, cycle: Any) -> BranchStart:
-    """Return the starts of branches from fixed points of the model's step, given or at the ends
-    of walks.
+def start_branches_from_walks(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
+    """Return the starts of branches from fixed points of the model's step.
+
+    The fixed points are given, or they are the last states of walks.
     """
-    params, model, options = request.params, request.model, request.step_options
+    params, model, step_options = (
+        branch_request.params,
+        branch_request.model,
+        branch_request.step_options,
+    )
 
     def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
-        model_at_p, wheel = model.with_parameter(params, request.parameter_name, p)
-        walk = walk_toward_gait(model_at_p, wheel, options)
-        return walk.outcome, walk.steps.section_state[-1]
+        model_at_p, params_at_p = model.with_parameter(params, branch_request.parameter_name, p)
+        walk_result = walk_toward_gait(model_at_p, params_at_p, step_options)
+        return walk_result.outcome, walk_result.steps.section_state[-1]
 
-    if cycle is None:
-        outcomes, section_states = jax.vmap(walk_to_gait)(params, request.parameter_values)
+    if given_cycle is None:
+        outcomes, section_states = jax.vmap(walk_to_gait)(params, branch_request.parameter_values)
     else:
-        outcomes, section_states = cycle.outcome, cycle.section_state
-    problem = ReturnMapProblem(
+        outcomes, section_states = given_cycle.outcome, given_cycle.section_state
+    return_map_problem = ReturnMapProblem(
         model=model,
-        options=options,
-        parameter_name=request.parameter_name,
-        period_n=request.period_n,
+        step_options=step_options,
+        parameter_name=branch_request.parameter_name,
+        period_n=branch_request.period_n,
         n_coordinates=model.n_continuous(params),
     )
-    phase_active = jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    is_phase_active = jnp.ones(
+        (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
+    )
     return BranchStart(
-        problem,
-        BranchWheel(params, phase_active),
+        return_map_problem,
+        BranchWheel(params, is_phase_active),
         section_states,
         np.asarray(outcomes),
-        lambda wheel_index, point: None,
+        lambda wheel_index, branch_point: None,
     )
 
 
-def start_from_unilateral_gaits(request: BranchRequest, cycle: Any) -> BranchStart:
-    """Return the starts of branches from gaits with unilateral contact, given or the slowest
-    attracting gait.
+def start_branches_from_contact_gaits(
+    branch_request: BranchRequest, start_cycle: Any
+) -> BranchStart:
+    """Return the starts of branches from gaits with unilateral contact.
+
+    The gaits are given, or they are the slowest attracting gaits.
     """
-    params, options = request.params, request.step_options
-    model: Any = request.model
-    finder: Any = make_finder(model, params.n_legs, step_options=options, period_n=request.period_n)
-    if not finder.is_multistable:  # This model has no batched engine.
-        return start_from_walks(request, cycle)
-    wheels = BranchWheel(
-        params, jnp.ones((*request.parameter_values.shape, 1, 1), request.parameter_values.dtype)
+    params, step_options = branch_request.params, branch_request.step_options
+    model: Any = branch_request.model
+    gait_finder: Any = make_finder(
+        model, params.n_legs, step_options=step_options, period_n=branch_request.period_n
     )
-    problem = GroundProblem(
+    if not gait_finder.is_multistable:  # This model has no batched engine.
+        return start_branches_from_walks(branch_request, start_cycle)
+    wheels = BranchWheel(
+        params,
+        jnp.ones(
+            (*branch_request.parameter_values.shape, 1, 1), branch_request.parameter_values.dtype
+        ),
+    )
+    ground_problem = GroundProblem(
         model=model,
-        options=options,
-        parameter_name=request.parameter_name,
-        period_n=request.period_n,
+        step_options=step_options,
+        parameter_name=branch_request.parameter_name,
+        period_n=branch_request.period_n,
         n_coordinates=model.n_continuous(params),
         n_legs=params.n_legs,
     )
-    values = problem.parameter_values(wheels, request.parameter_values)
-    if cycle is None:
-        cycle = finder.find_cycles_near(values, finder.make_initial_guesses(values))
+    parameter_values = ground_problem.stack_parameter_values(
+        wheels, branch_request.parameter_values
+    )
+    if start_cycle is None:
+        start_cycle = gait_finder.find_cycles_near(
+            parameter_values, gait_finder.make_initial_guesses(parameter_values)
+        )
 
-    outcomes = np.asarray(cycle.outcome)
+    outcomes = np.asarray(start_cycle.outcome)
     return BranchStart(
-        problem, wheels, cycle.section_state, outcomes, lambda wheel_index, point: None
+        ground_problem,
+        wheels,
+        start_cycle.section_state,
+        outcomes,
+        lambda wheel_index, branch_point: None,
     )
 
 
-START_FUNCTIONS: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] = {
-    GaitMethod.COLLOCATION: start_from_collocation,
-    GaitMethod.CONTACT_WALKS: start_from_unilateral_gaits,
-    GaitMethod.RETURN_MAP: start_from_walks,
-    GaitMethod.SELECTION: start_from_walks,
+START_FUNCTION_BY_METHOD: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] = {
+    GaitMethod.COLLOCATION: start_branches_from_collocation,
+    GaitMethod.CONTACT_WALKS: start_branches_from_contact_gaits,
+    GaitMethod.RETURN_MAP: start_branches_from_walks,
+    GaitMethod.SELECTION: start_branches_from_walks,
 }
-"""Functions that return the starts of branches, by gait method."""
+"""Function that returns the starts of branches, by the gait method of the model."""

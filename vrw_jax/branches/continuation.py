@@ -20,14 +20,14 @@ from jaxtyping import Array
 
 from vrw_jax.branches.branch import Branch
 from vrw_jax.branches.branch_location import (
-    ADMISSIBLE_COLUMN,
+    ADMISSIBILITY_COLUMN,
     AbstractContinuation,
     BranchData,
-    QuantityTable,
-    continue_and_locate,
+    PointQuantities,
+    continue_and_locate_points,
 )
-from vrw_jax.branches.branch_starts import START_FUNCTIONS, BranchRequest
-from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN, BranchWheel
+from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
+from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
 from vrw_jax.continuation import (
     ArclengthOptions,
     ContinuationPoint,
@@ -76,13 +76,14 @@ INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the order of events changes and the branch ends."""
 
-SECOND_PEAK_NAME = "second_peak_rate"
-"""Measure of the gait's force whose zero is the special point at which a second peak appears."""
+SECOND_PEAK_RATE_NAME = "second_peak_rate"
+"""Name of the measure of the gait's force whose zero is the special point at which a second peak
+appears."""
 
 DIFFERENTIATION_HINT = "differentiate vrw.limit_cycle"
 """Advice in the error for a caller who differentiates a branch."""
 
-COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
+COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of an end at which the mesh is too coarse, so that the gaits do not repeat in a walk."""
 
 
@@ -90,16 +91,16 @@ COARSE_MESH_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 class GaitBranchOptions:
     """Options of the continuation of gaits.
 
-    - `max_jump_change`: largest relative change of period and step length at a jump of the section
-      state within a branch, chosen because a change of the order of two impacts changes both by
-      1e-4;
-    - `max_mesh_error`: estimate of the mesh error above which a finer mesh is used;
-    - `max_refinements`: largest number of refinements of the mesh.
+    - `max_measure_change_at_jump`: largest relative change of period and step length at a jump of
+      the section state within a branch, chosen because a change of the order of two impacts changes
+      both by 1e-4;
+    - `max_unrefined_mesh_error`: estimate of the mesh error above which a finer mesh is used;
+    - `max_mesh_refinements`: largest number of refinements of the mesh.
     """
 
-    max_jump_change: float = 0.01
-    max_mesh_error: float = 1e-8
-    max_refinements: int = 3
+    max_measure_change_at_jump: float = 0.01
+    max_unrefined_mesh_error: float = 1e-8
+    max_mesh_refinements: int = 3
 
 
 GAIT_BRANCH_OPTIONS = GaitBranchOptions()
@@ -108,75 +109,86 @@ GAIT_BRANCH_OPTIONS = GaitBranchOptions()
 
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits; a gait is admissible if its event-driven step repeats."""
+    """Continuation of gaits. A gait is admissible if its event-driven step repeats."""
 
     model: AbstractWheel
     step_options: StepOptions
     n_legs: int
     gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS
 
-    ending_quantities: ClassVar[tuple[str, ...]] = (
+    branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
-        FRICTION_SURPLUS_COLUMN,
+        FRICTION_SURPLUS_COLUMN_NAME,
     )
     margin_names: ClassVar[tuple[str, ...]] = (
         *INDICATOR_NAMES,
         *MARGIN_MEASURES,
-        SECOND_PEAK_NAME,
+        SECOND_PEAK_RATE_NAME,
     )
-    linear_substitutes: ClassVar[Mapping[str, str]] = {"clearance_sls1": "takeoff_acceleration"}
-    """Names of margins that vanish as a cube, with the quantity that vanishes linearly at the
+    linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
+        "clearance_sls1": "takeoff_acceleration"
+    }
+    """Names of margins that vanish as a cube, each with the quantity that vanishes linearly at the
     same point. A foot that takes off less steeply descends less deeply, until it rises immediately.
-    A solver cannot resolve the shallowest descents, but the linear quantity changes its sign.
-    """
+    A solver cannot resolve the shallowest descents, but the linear quantity changes its sign."""
 
-    def evaluate_points(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantityTable:
-        """Return the table of measures, with a column for each leg if a margin has one value per
-        leg.
+    def evaluate_point_quantities(
+        self, wheels: BranchWheel, points: ContinuationPoint
+    ) -> PointQuantities:
+        """Return the table of measures.
+
+        A margin with one value per leg gets a column for each leg.
         """
-        problem: Any = self.problem
-        measure_gaits = functools.partial(problem.measure_points, self.model, self.step_options)
-        table = self.map_batched(measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points)
-        for name, margin in MARGIN_MEASURES.items():
-            if margin.dimension and name in table:
-                legs = enumerate(range(3, self.n_legs + 1))
-                table |= {
-                    f"{name}[{leg}]": table[name][:, leg_position] for leg_position, leg in legs
+        gait_problem: Any = self.problem
+        measure_gaits = functools.partial(gait_problem.measure_gaits, self.model, self.step_options)
+        quantity_table = self.map_over_rows(
+            measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
+        )
+        for name, margin_measure in MARGIN_MEASURES.items():
+            if margin_measure.dimension and name in quantity_table:
+                leg_positions = enumerate(range(3, self.n_legs + 1))
+                quantity_table |= {
+                    f"{name}[{leg}]": quantity_table[name][:, leg_position]
+                    for leg_position, leg in leg_positions
                 }
-        return table
+        return quantity_table
 
-    def is_admissible(self, table: QuantityTable) -> np.ndarray:
+    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
         return (table["outcome"] == Outcome.STEPPED) & (
             table["closure"] <= STATE_AGREEMENT_TOLERANCE
         )
 
-    def is_same_gait(self, table_before: QuantityTable, table_after: QuantityTable) -> np.ndarray:
-        """Return whether period and step length are about equal before and after a jump, for
-        each row.
+    def is_same_gait(
+        self, table_before: PointQuantities, table_after: PointQuantities
+    ) -> np.ndarray:
+        """Return whether period and step length are about equal before and after a jump, for each
+        point.
         """
         is_similar = super().is_same_gait(table_before, table_after)
         for name in ("period", "step_length"):
-            max_change = self.gait_options.max_jump_change * np.abs(table_before[name])
-            is_similar &= np.abs(table_after[name] - table_before[name]) <= max_change
+            max_measure_change = self.gait_options.max_measure_change_at_jump * np.abs(
+                table_before[name]
+            )
+            is_similar &= np.abs(table_after[name] - table_before[name]) <= max_measure_change
         return is_similar
 
-    def describe_end(self, name: str, value: float) -> str:
-        if name != FRICTION_SURPLUS_COLUMN:
-            return super().describe_end(name, value)
+    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
+        if end_name != FRICTION_SURPLUS_COLUMN_NAME:
+            return super().describe_branch_end(end_name, parameter_value)
         return (
-            f"At {value:.9g} the friction coefficient is the tangent of the slope: with less no "
-            "contact carries the weight along the slope, and no gait repeats."
+            f"At {parameter_value:.9g} the friction coefficient is the tangent of the slope: "
+            "with less no contact carries the weight along the slope, and no gait repeats."
         )
 
-    def name_end(self, table: QuantityTable, row_index: int) -> str:
+    def name_branch_end(self, table: PointQuantities, row_index: int) -> str:
         outcome = Outcome(int(table["outcome"][row_index]))
         if outcome != Outcome.STEPPED:
             return outcome.name.lower()
-        return COARSE_MESH_NAME if "mesh_error" in table else ADMISSIBLE_COLUMN
+        return COARSE_MESH_END_NAME if "mesh_error" in table else ADMISSIBILITY_COLUMN
 
-    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
-        return COARSE_MESH_NAME in ends or bool(
-            np.max(table.get("mesh_error", 0.0)) > self.gait_options.max_mesh_error
+    def is_mesh_limited(self, table: PointQuantities, end_names: tuple[str, ...]) -> bool:
+        return COARSE_MESH_END_NAME in end_names or bool(
+            np.max(table.get("mesh_error", 0.0)) > self.gait_options.max_unrefined_mesh_error
         )
 
 
@@ -307,17 +319,20 @@ def continue_branches(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
             "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
         )
-    (lower, upper), options = check_range("bounds", bounds), _check_arclength_options(options)
+    (lower_bound, upper_bound), options = (
+        check_range("bounds", bounds),
+        _check_arclength_options(options),
+    )
     has_collocation = model.capabilities.gait_method == GaitMethod.COLLOCATION
     if check_bool("force_peaks", force_peaks) and not has_collocation:
         raise ValueError(
             f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
             "the force: take vrw.force_peaks(vrw.simulate(...)) of its gaits."
         )
-    finder = make_finder(
+    gait_finder = make_finder(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
     )
-    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
     if len(batch_shape) != 1:
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
@@ -325,18 +340,20 @@ def continue_branches(
     start_values = jnp.broadcast_to(
         getattr(model if name == FRICTION_NAME else params, name), batch_shape
     )
-    parameter_values = jnp.clip(start_values, lower, upper)
+    parameter_values = jnp.clip(start_values, lower_bound, upper_bound)
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
-    request = BranchRequest(
+    branch_request = BranchRequest(
         params, model, name, parameter_values, period_n, cycle_options, step_options, force_peaks
     )
-    outcomes, branch_data = _continue_from_starts(request, cycle, options, np.array([lower, upper]))
-    take_wheel = lambda wheel_index: jax.tree.map(lambda leaf: leaf[wheel_index], params)
+    outcomes, branch_data = _continue_gait_branches(
+        branch_request, cycle, options, np.array([lower_bound, upper_bound])
+    )
+    take_wheel_params = lambda wheel_index: jax.tree.map(lambda leaf: leaf[wheel_index], params)
     return tuple(
-        _label_branch(
+        _label_gait_branch(
             single_branch_data,
-            take_wheel(wheel_index),
+            take_wheel_params(wheel_index),
             name,
             model,
             step_options,
@@ -346,55 +363,57 @@ def continue_branches(
     )
 
 
-def _continue_from_starts(
-    request: BranchRequest,
-    cycle: Any,
-    options: ArclengthOptions,
-    bounds: np.ndarray,
+def _continue_gait_branches(
+    branch_request: BranchRequest,
+    start_cycle: Any,
+    arclength_options: ArclengthOptions,
+    parameter_bounds: np.ndarray,
     gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
     """Return the outcomes of the starts, and the data of the branches from them.
 
     The mesh is that of the cycle options. Without options the mesh is as fine as the branches need.
     """
-    refines_mesh = request.cycle_options is None
-    for refinement in range(1 + gait_options.max_refinements):
-        branch_start = START_FUNCTIONS[request.model.capabilities.gait_method](request, cycle)
+    can_refine_mesh = branch_request.cycle_options is None
+    for refinement_index in range(1 + gait_options.max_mesh_refinements):
+        branch_start = START_FUNCTION_BY_METHOD[branch_request.model.capabilities.gait_method](
+            branch_request, start_cycle
+        )
         continuation = GaitContinuation(
             branch_start.problem,
-            options,
+            arclength_options,
             branch_start.wheels,
-            bounds,
-            request.model,
-            request.step_options,
-            request.params.n_legs,
+            parameter_bounds,
+            branch_request.model,
+            branch_request.step_options,
+            branch_request.params.n_legs,
             gait_options,
         )
-        has_start = branch_start.outcomes == Outcome.STEPPED
-        is_finest = (
-            not refines_mesh
-            or branch_start.finer_options is None
-            or refinement == gait_options.max_refinements
+        has_start = branch_start.start_outcomes == Outcome.STEPPED
+        is_finest_mesh = (
+            not can_refine_mesh
+            or branch_start.finer_cycle_options is None
+            or refinement_index == gait_options.max_mesh_refinements
         )
-        branch_data = continue_and_locate(
+        branch_data_by_wheel = continue_and_locate_points(
             continuation,
-            branch_start.unknowns,
-            request.parameter_values,
+            branch_start.start_unknowns,
+            branch_request.parameter_values,
             has_start,
-            branch_start.make_cycle,
-            is_finest,
+            branch_start.make_cycle_finder,
+            is_finest_mesh,
         )
-        if is_finest or not any(
+        if is_finest_mesh or not any(
             single_branch_data is not None and single_branch_data.is_mesh_limited
-            for single_branch_data in branch_data
+            for single_branch_data in branch_data_by_wheel
         ):
             break
-        request = request._replace(cycle_options=branch_start.finer_options)
-        cycle = branch_start.cycle
-    return branch_start.outcomes, branch_data
+        branch_request = branch_request._replace(cycle_options=branch_start.finer_cycle_options)
+        start_cycle = branch_start.start_cycles
+    return branch_start.start_outcomes, branch_data_by_wheel
 
 
-OMITTED_MEASURES = ("outcome", "solver_steps")
+MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
 """Measures of the checking step that are not in the dataset of a branch."""
 
 
@@ -405,76 +424,98 @@ def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptio
     return ArclengthOptions() if options is None else options
 
 
-def _label_branch(
+def _label_gait_branch(
     branch_data: BranchData | None,
     params: WheelParams,
-    name: str,
+    parameter_name: str,
     model: AbstractWheel,
-    options: StepOptions,
-    outcome: int,
+    step_options: StepOptions,
+    start_outcome: int,
 ) -> Branch:
-    """Return the labeled branch of one wheel; `outcome` is that of its start."""
-    start_wheel = provenance(params, model, options)
-    start_wheel.pop(f"parameter_{name}", None)
-    attrs = {"title": f"Branch of limit cycles along {name}"} | start_wheel
+    """Return the labeled branch of one wheel; `start_outcome` is the outcome of its start."""
+    start_provenance = provenance(params, model, step_options)
+    start_provenance.pop(f"parameter_{parameter_name}", None)
+    branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
     if branch_data is None:
-        branch_outcome = Outcome(outcome)
+        branch_outcome = Outcome(start_outcome)
         branch_outcome = (
             Outcome.NO_CYCLE_FOUND if branch_outcome == Outcome.STEPPED else branch_outcome
         )
-        empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=attrs)
-        return Branch(name, empty_dataset, (), ("", ""), branch_outcome)
+        empty_dataset = xr.Dataset(
+            coords={parameter_name: ("point", np.zeros(0))}, attrs=branch_attrs
+        )
+        return Branch(parameter_name, empty_dataset, (), ("", ""), branch_outcome)
     measure_names = (
-        name
-        for name in STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
-        if name not in OMITTED_MEASURES
+        parameter_name
+        for parameter_name in STEP_MEASURES
+        | MARGIN_MEASURES
+        | UNILATERAL_STEP_MEASURES
+        | FORCE_PEAK_MEASURES
+        if parameter_name not in MEASURES_OUTSIDE_BRANCHES
     )
-    variables = make_variables(
+    branch_variables = make_variables(
         {
-            variable_name: branch_data.table[variable_name]
+            variable_name: branch_data.quantity_table[variable_name]
             for variable_name in measure_names
-            if variable_name in branch_data.table
+            if variable_name in branch_data.quantity_table
         },
         "point",
     )
-    variables["section_state"] = xr.Variable(
+    branch_variables["section_state"] = xr.Variable(
         ("point", "component"),
-        branch_data.table["section_state"],
+        branch_data.quantity_table["section_state"],
         {"long_name": "section state just before touchdown"},
     )
-    variables["closure"] = xr.Variable(
+    branch_variables["closure"] = xr.Variable(
         "point",
-        branch_data.table["closure"],
+        branch_data.quantity_table["closure"],
         {"units": "1", "long_name": "miss of the section state after one event-driven period"},
     )
     component_names = ["theta", "dtheta", "dL1"]
-    if branch_data.table["section_state"].shape[-1] != len(component_names):
-        legs = range(1, params.n_legs + 1)
-        leg_names = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in legs]
+    if branch_data.quantity_table["section_state"].shape[-1] != len(component_names):
+        leg_numbers = range(1, params.n_legs + 1)
+        leg_names = [
+            f"{parameter_name}{leg}"
+            for parameter_name in ("L", "dL", "code")
+            for leg in leg_numbers
+        ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
-    labels = {
-        name: xr.Variable("point", branch_data.points.p, measure_attrs(name)),
+    branch_coordinates = {
+        parameter_name: xr.Variable("point", branch_data.points.p, measure_attrs(parameter_name)),
         "component": component_names,
         "leg": locked_leg_coordinate(params.n_legs),
     }
     dataset = xr.Dataset(
-        variables | _stability_variables(np.asarray(branch_data.points.jacobian)), labels, attrs
+        branch_variables | _make_stability_variables(np.asarray(branch_data.points.jacobian)),
+        branch_coordinates,
+        branch_attrs,
     )
-    return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)
+    return Branch(
+        parameter_name,
+        dataset,
+        branch_data.special_points,
+        branch_data.end_reasons,
+        Outcome.STEPPED,
+    )
 
 
-def _stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
+def _make_stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
     """Return labeled variables of multipliers and stability measures along the branch."""
-    values = np.asarray(floquet_multipliers(jnp.asarray(jacobians)))
-    spectral_radius = np.max(np.abs(values), -1)
-    names = {"multiplier_real": values.real, "multiplier_imag": values.imag}
+    multiplier_values = np.asarray(floquet_multipliers(jnp.asarray(jacobians)))
+    spectral_radius = np.max(np.abs(multiplier_values), -1)
+    multiplier_parts = {
+        "multiplier_real": multiplier_values.real,
+        "multiplier_imag": multiplier_values.imag,
+    }
     return {
         **{
             variable_name: xr.Variable(
-                ("point", "multiplier"), part_values, {"units": "1", "long_name": long_name}
+                ("point", "multiplier"), multiplier_part, {"units": "1", "long_name": long_name}
             )
-            for (variable_name, part_values), long_name in zip(
-                names.items(), ("real part of a multiplier", "imaginary part"), strict=True
+            for (variable_name, multiplier_part), long_name in zip(
+                multiplier_parts.items(),
+                ("real part of a multiplier", "imaginary part"),
+                strict=True,
             )
         },
         "spectral_radius": xr.Variable(
@@ -487,16 +528,16 @@ def _stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
 
 
 class MapContinuation(AbstractContinuation):
-    """Continuation of fixed points of any map."""
+    """Continuation of the fixed points of any map."""
 
-    def evaluate_points(self, wheels: Any, points: ContinuationPoint) -> QuantityTable:
+    def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> PointQuantities:
         return {
-            "x": self.map_batched(
+            "x": self.map_over_rows(
                 jax.vmap(self.problem.section_state), batch_sizes.POINT_BATCH_SIZE, points.z
             )
         }
 
-    def is_admissible(self, table: QuantityTable) -> np.ndarray:
+    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
         return np.asarray(np.isfinite(table["x"]).all(-1))
 
 
@@ -539,18 +580,21 @@ def continue_map(
     """
     check_callable("function", function, "of constants, x and p")
     check_not_traced("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
-    lower, upper = check_range("bounds", bounds)
-    if not lower <= check_real("p", p) <= upper:
+    lower_bound, upper_bound = check_range("bounds", bounds)
+    if not lower_bound <= check_real("p", p) <= upper_bound:
         raise ValueError(
-            f"p is {p:g}, but the branch must start within its bounds: give one in [{lower:g}, "
-            f"{upper:g}]."
+            f"p is {p:g}, but the branch must start within its bounds: give one in "
+            f"[{lower_bound:g}, {upper_bound:g}]."
         )
     options, x = _check_arclength_options(options), check_reals("x", x)
     add_batch_axis = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, float)[None], tree)
     continuation = MapContinuation(
-        FixedPointProblem(function), options, add_batch_axis(constants), np.array([lower, upper])
+        FixedPointProblem(function),
+        options,
+        add_batch_axis(constants),
+        np.array([lower_bound, upper_bound]),
     )
-    (branch_data,) = continue_and_locate(
+    (branch_data,) = continue_and_locate_points(
         continuation,
         add_batch_axis(x),
         add_batch_axis(p),
@@ -561,9 +605,11 @@ def continue_map(
         empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
         return Branch(name, empty_dataset, (), ("", ""), Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
-        {"x": (("point", "component"), branch_data.table["x"])}
-        | _stability_variables(np.asarray(branch_data.points.jacobian)),
+        {"x": (("point", "component"), branch_data.quantity_table["x"])}
+        | _make_stability_variables(np.asarray(branch_data.points.jacobian)),
         {name: ("point", branch_data.points.p)},
         {"title": f"Branch of fixed points along {name}"},
     )
-    return Branch(name, dataset, branch_data.special_points, branch_data.ends, Outcome.STEPPED)
+    return Branch(
+        name, dataset, branch_data.special_points, branch_data.end_reasons, Outcome.STEPPED
+    )

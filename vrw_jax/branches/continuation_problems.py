@@ -51,14 +51,13 @@ from vrw_jax.wheel import (
     wheel_from_parameters,
 )
 
-FRICTION_SURPLUS_COLUMN = "friction_above_slope"
-"""Name of the column of the friction coefficient minus the smallest one with a gait, which is
-the tangent of the slope.
-"""
+FRICTION_SURPLUS_COLUMN_NAME = "friction_above_slope"
+"""Name of the quantity that is the friction coefficient minus the smallest one with a gait, which
+is the tangent of the slope."""
 
 MIN_FRICTION_SURPLUS = 1e-9
-"""Smallest surplus of friction over the slope's tangent, as a fraction of it. It is chosen
-because at the tangent itself gaits of every speed repeat, up to the round-off of friction.
+"""Smallest surplus of friction over the slope's tangent, as a fraction of the tangent. The value is
+chosen because at the tangent itself gaits of every speed repeat, up to the round-off of friction.
 """
 
 
@@ -66,7 +65,7 @@ class BranchWheel(NamedTuple):
     """Wheel whose gaits are continued, at any value of the continued parameter."""
 
     params: WheelParams
-    phase_active: Float[Array, "n n_phases"]  # 1 if the phase takes place in the cycle, else 0
+    is_phase_active: Float[Array, "n n_phases"]  # 1 if the phase takes place in the cycle, else 0
 
 
 class AbstractGaitProblem(AbstractContinuationProblem):
@@ -80,7 +79,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         """Return the number of steps after which the gait repeats."""
 
     @abc.abstractmethod
-    def read_state(
+    def read_gait_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state before the first landing, and continued quantities by name.
@@ -89,53 +88,55 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         """
 
     @eqx.filter_jit
-    def measure_points(
+    def measure_gaits(
         self,
         model: AbstractWheel,
-        options: StepOptions,
+        step_options: StepOptions,
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
         """Return all measures of the gaits at many points by name, from event-driven steps."""
 
         def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
-            section_state, continued_quantities = self.read_state(wheel, z, p)
+            section_state, continued_quantities = self.read_gait_state(wheel, z, p)
             model_at_point, params = model.with_parameter(wheel.params, self.parameter_name, p)
-            measures = measure_gait(model_at_point, params, section_state, options, self.n_steps)
-            return measures | continued_quantities | {"section_state": section_state}
+            gait_measures = measure_gait(
+                model_at_point, params, section_state, step_options, self.n_steps
+            )
+            return gait_measures | continued_quantities | {"section_state": section_state}
 
         return jax.vmap(measure_point)(wheels, points.z, points.p)
 
 
 class CollocationProblem(AbstractGaitProblem):
-    """Continuation problem of limit cycles by collocation; z is a `CollocationSolution`.
+    """Continuation problem of limit cycles by collocation, with a `CollocationSolution` z.
 
     Beyond the zero of an indicator the solution continues, but the event-driven step rejects it as
-    a gait. `additional_quantities` is a function of the phase points of the first step and of z.
-    With `reads_force_peaks` the points also have the measures of the gait's force.
+    a gait. `compute_additional_quantities` is a function of the phase points of the first step and
+    of z. With `measures_force_peaks` the points also have the measures of the gait's force.
     """
 
     system: CollocationSystem = eqx.field(static=True)
     parameter_name: str = eqx.field(static=True)
-    additional_quantities: Callable | None = eqx.field(static=True)
-    reads_force_peaks: bool = eqx.field(static=True, default=False)
+    compute_additional_quantities: Callable | None = eqx.field(static=True)
+    measures_force_peaks: bool = eqx.field(static=True, default=False)
 
     @property
     def n_steps(self) -> int:
         return self.system.period_n
 
-    def _parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
-        """Return the wheel's parameters with the continued one at p."""
+    def _stack_parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
+        """Return the wheel's parameters with the continued parameter at p."""
         return stack_parameters(
             eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
         )
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
-        linearize = linearize_with_quantities(
+        linearize_trial = make_trial_linearizer(
             self.system, (PARAMETER_NAMES.index(self.parameter_name),)
         )
-        correction, tangents, monodromy, *_ = linearize(
-            self._parameters_at(wheel, p), wheel.phase_active, z
+        correction, tangents, monodromy, *_ = linearize_trial(
+            self._stack_parameters_at(wheel, p), wheel.is_phase_active, z
         )
         return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
 
@@ -146,91 +147,105 @@ class CollocationProblem(AbstractGaitProblem):
         return unbatch(compute_correction_norm)(z, correction)
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
-        """Return whether the durations are positive; the event-driven step checks all other
-        conditions.
-        """
-        return jnp.all((z.durations > 0.0) | (wheel.phase_active < 0.5))
+        """Return whether the durations are positive.
 
-    def read_state(
+        The event-driven step checks all other conditions.
+        """
+        return jnp.all((z.durations > 0.0) | (wheel.is_phase_active < 0.5))
+
+    def read_gait_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state, and quantities that continue beyond a special point, by name.
 
-        These are the shortest duration of each phase over the steps, s, and `takeoff_acceleration`,
-        the rear foot's acceleration at take-off, m/s^2, least over the steps.
+        The quantities are the shortest duration of each phase over the steps, s, and
+        `takeoff_acceleration`, m/s^2. The latter is the rear foot's acceleration at take-off, least
+        over the steps.
         """
-        parameters = self._parameters_at(wheel, p)
-        s = wheel_from_parameters(parameters, self.system.n_legs).symbols()
-        _, steps = self.system.evaluate_phase_points(parameters, z)
-        takeoff_accelerations = [compute_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]
-        step_end, min_durations = steps[-1][-1].end, jnp.min(z.durations, 0)
+        parameters = self._stack_parameters_at(wheel, p)
+        wheel_symbols = wheel_from_parameters(parameters, self.system.n_legs).symbols()
+        _, phase_points_by_step = self.system.evaluate_phase_points(parameters, z)
+        takeoff_accelerations = [
+            compute_takeoff_acceleration(wheel_symbols, sls1) for _, sls1, _ in phase_points_by_step
+        ]
+        last_end_point, min_durations = phase_points_by_step[-1][-1].end, jnp.min(z.durations, 0)
         solution_with_lane = jax.tree.map(lambda x: x[..., None], z)
         mesh_error = estimate_mesh_error(
             self.system.phase_sequence, self.system.phase_meshes, solution_with_lane
         )[0]
         continued_quantities = {
-            "duration_dls": jnp.where(wheel.phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
+            "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
             "duration_sls1": min_durations[1],
             "duration_sls2": min_durations[2],
             "takeoff_acceleration": jnp.min(jnp.stack(takeoff_accelerations)),
             "mesh_error": mesh_error,
         }
-        if self.additional_quantities is not None:
-            continued_quantities |= self.additional_quantities(s, steps[0], z)
-        if self.reads_force_peaks:
+        if self.compute_additional_quantities is not None:
+            continued_quantities |= self.compute_additional_quantities(
+                wheel_symbols, phase_points_by_step[0], z
+            )
+        if self.measures_force_peaks:
             continued_quantities |= compute_force_peaks(self.system, parameters, z)
-        return jnp.stack([step_end.q[0], *step_end.v]), continued_quantities
+        return jnp.stack([last_end_point.q[0], *last_end_point.v]), continued_quantities
 
 
-QuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
-"""Function of the system, parameters, `phase_active` and solution that returns quantities of
-collocated gaits over lanes.
-"""
+ComputeGaitQuantities = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
+"""Function of the system, parameters, `is_phase_active` and solution that returns quantities of
+collocated gaits over lanes."""
 
 
-def linearize_with_quantities(
+def make_trial_linearizer(
     system: CollocationSystem,
     parameter_indices: tuple[int, ...],
-    compute_quantities: QuantityFunction | None = None,
+    compute_quantities: ComputeGaitQuantities | None = None,
 ) -> Any:
-    """Return a function that linearizes one wheel's trial solution, and its quantities if they are
-    given.
+    """Return a function that linearizes one wheel's trial solution.
 
-    Its arguments are (parameters, phase_active, solution), and `jax.vmap` can map it over wheels.
-    It returns the correction, the tangents of the parameters and the monodromy matrix. With
-    `compute_quantities` it also returns these quantities, and their derivatives along the
-    correction and each tangent.
+    Its arguments are (parameters, is_phase_active, solution), and `jax.vmap` can map it over
+    wheels. The function returns the correction, the tangents of the parameters and the monodromy
+    matrix. With `compute_quantities` it also returns these quantities, and their derivatives along
+    the correction and each tangent.
     """
 
-    def linearize_trial(parameters: Array, phase_active: Array, z: CollocationSolution) -> tuple:
+    def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
         collocation_state = CollocationState(
-            z, phase_active, *init_search_flags(system, z.section_state)
+            z, is_phase_active, *init_search_flags(system, z.section_state)
         )
-        linearized_pass = system.linearize_at(parameters, collocation_state, parameter_indices)
-        newton_data = (
-            linearized_pass.correction,
-            linearized_pass.tangents,
-            linearized_pass.monodromy,
+        cycle_linearization = system.linearize_at(parameters, collocation_state, parameter_indices)
+        newton_results = (
+            cycle_linearization.correction,
+            cycle_linearization.tangents,
+            cycle_linearization.monodromy,
         )
         if compute_quantities is None:
-            return newton_data
-        identity_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[list(parameter_indices)]
-        parameter_tangents = np.concatenate([np.zeros_like(identity_rows[:1]), identity_rows])[
+            return newton_results
+        parameter_rows = np.eye(parameters.shape[0], dtype=parameters.dtype)[
+            list(parameter_indices)
+        ]
+        parameter_tangents = np.concatenate([np.zeros_like(parameter_rows[:1]), parameter_rows])[
             :, :, None
         ]
-        with_correction_first = lambda a, b: jnp.concatenate([a[None], b])
-        tangents = jax.tree.map(
-            with_correction_first, linearized_pass.correction, linearized_pass.tangents
+        prepend_correction = lambda a, b: jnp.concatenate([a[None], b])
+        solution_tangents = jax.tree.map(
+            prepend_correction, cycle_linearization.correction, cycle_linearization.tangents
         )
-        directions = (
+        tangent_directions = (
             jnp.broadcast_to(parameter_tangents, (len(parameter_tangents), *parameters.shape)),
-            tangents,
+            solution_tangents,
         )
-        evaluate = lambda parameters, z: compute_quantities(system, parameters, phase_active, z)
-        tangent_along = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
-        return *newton_data, evaluate(parameters, z), lax.map(tangent_along, directions)
+        evaluate_quantities = lambda parameters, z: compute_quantities(
+            system, parameters, is_phase_active, z
+        )
+        compute_quantity_tangent = lambda tangent_direction: jax.jvp(
+            evaluate_quantities, (parameters, z), tangent_direction
+        )[1]
+        return (
+            *newton_results,
+            evaluate_quantities(parameters, z),
+            lax.map(compute_quantity_tangent, tangent_directions),
+        )
 
-    make_output_template = lambda parameters, phase_active, z: (
+    make_output_template = lambda parameters, is_phase_active, z: (
         z,
         z,
         *(parameters,) * (1 if compute_quantities is None else 3),
@@ -249,9 +264,9 @@ def linearize_with_quantities(
 class AbstractReturnMapProblem(AbstractGaitProblem):
     """Continuation problem of fixed points of the return map over `period_n` steps.
 
-    z is the section state. Its last entries are codes (see `AbstractWheel.n_continuous`), which are
-    those of the image in the last iteration. Newton's method ends only if the codes of both are
-    equal.
+    z is the section state. Its last components are codes (see `AbstractWheel.n_continuous`), which
+    are those of the image in the last iteration. Newton's method ends only if the codes of state
+    and image are equal.
     """
 
     period_n: eqx.AbstractVar[int]
@@ -265,17 +280,17 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
         return z[: self.n_coordinates]
 
     def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
-        return interpolate_states(left, right, fraction, self.n_coordinates)
+        return interpolate_section_states(left, right, fraction, self.n_coordinates)
 
     def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
         """Return whether the codes of both points are equal."""
         return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
 
-    def read_state(
+    def read_gait_state(
         self, wheel: BranchWheel, z: Unknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state without other quantities, all of which are measures of the
-        step.
+        """Return the section state without continued quantities, because all quantities are
+        measures of the step.
         """
         return z, {}
 
@@ -284,7 +299,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
     """Continuation problem of a model whose steps JAX differentiates."""
 
     model: AbstractWheel
-    options: StepOptions
+    step_options: StepOptions
     parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
@@ -293,8 +308,10 @@ class ReturnMapProblem(AbstractReturnMapProblem):
         """Return the section state after `period_n` steps; NaN if one of them fails."""
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         for _ in range(self.period_n):
-            advance = model.advance(params, z, self.options)
-            z = jnp.where(advance.outcome == Outcome.STEPPED, advance.section_state, jnp.nan)
+            advance_result = model.advance(params, z, self.step_options)
+            z = jnp.where(
+                advance_result.outcome == Outcome.STEPPED, advance_result.section_state, jnp.nan
+            )
         return z
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
@@ -306,7 +323,7 @@ class GroundProblem(AbstractReturnMapProblem):
     """Continuation problem with unilateral contact, by batches of steps."""
 
     model: UnilateralWheel
-    options: StepOptions
+    step_options: StepOptions
     parameter_name: str = eqx.field(static=True)
     period_n: int = eqx.field(static=True)
     n_coordinates: int = eqx.field(static=True)
@@ -315,8 +332,8 @@ class GroundProblem(AbstractReturnMapProblem):
     is_traceable: ClassVar[bool] = False
     has_kinks: ClassVar[bool] = True
 
-    def parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return the model's parameter values of many wheels, with the continued parameter at p."""
+    def stack_parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
+        """Return the parameter values of many wheels, with the continued parameter at p."""
 
         def select_values(wheel: BranchWheel, p: Array) -> Array:
             model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -324,52 +341,66 @@ class GroundProblem(AbstractReturnMapProblem):
 
         return jax.vmap(select_values)(wheels, p)
 
-    def _period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
+    def _make_period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
         """Return the map of many wheels over one period."""
-        values = np.asarray(self.parameter_values(wheels, p))
-        return PeriodMap(self.model, self.n_legs, self.period_n, values)
+        parameter_values = np.asarray(self.stack_parameter_values(wheels, p))
+        return PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
 
     def linearize(self, wheel: BranchWheel, z: Unknowns, p: Array) -> NewtonStep:
         """Return the Newton steps of many wheels."""
         section_states, n_coordinates = np.asarray(z), self.n_coordinates
-        is_continued = np.asarray(self.model.parameter_names) == self.parameter_name
-        period = self._period_map(wheel, p).evaluate_period(
-            self.options, section_states, is_continued
+        is_continued_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
+        period_evaluation = self._make_period_map(wheel, p).evaluate_period(
+            self.step_options, section_states, is_continued_parameter
         )
-        nan_if_invalid = np.where(period.is_complete, 0.0, np.nan)[:, None]
-        defect = period.end_states - section_states + nan_if_invalid
-        return_jacobian = period.return_map_jacobian[:, :n_coordinates, :n_coordinates]
-        parameter_jacobian = period.parameter_jacobian[:, :n_coordinates, is_continued]
-        right_sides = np.concatenate([defect[:, :n_coordinates, None], parameter_jacobian], -1)
-        solutions = solve_linear_systems(np.eye(n_coordinates) - return_jacobian, right_sides)
-        code_changes = defect[:, n_coordinates:]
-        correction = np.concatenate([solutions[..., 0], code_changes], 1)
-        tangent = np.concatenate([solutions[..., 1], 0.0 * code_changes], 1)
-        return NewtonStep(correction, tangent, jnp.asarray(return_jacobian))
+        nan_if_incomplete = np.where(period_evaluation.is_complete, 0.0, np.nan)[:, None]
+        period_defects = period_evaluation.end_states - section_states + nan_if_incomplete
+        return_map_jacobian = period_evaluation.return_map_jacobian[
+            :, :n_coordinates, :n_coordinates
+        ]
+        parameter_jacobian = period_evaluation.parameter_jacobian[
+            :, :n_coordinates, is_continued_parameter
+        ]
+        right_sides = np.concatenate(
+            [period_defects[:, :n_coordinates, None], parameter_jacobian], -1
+        )
+        linear_solutions = solve_linear_systems(
+            np.eye(n_coordinates) - return_map_jacobian, right_sides
+        )
+        code_changes = period_defects[:, n_coordinates:]
+        newton_corrections = np.concatenate([linear_solutions[..., 0], code_changes], 1)
+        parameter_tangents = np.concatenate([linear_solutions[..., 1], 0.0 * code_changes], 1)
+        return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
-    def measure_points(
+    def measure_gaits(
         self,
         model: AbstractWheel,
-        options: StepOptions,
+        step_options: StepOptions,
         wheels: BranchWheel,
         points: ContinuationPoint,
     ) -> dict[str, Array]:
-        period = self._period_map(wheels, points.p).evaluate_period(
-            options, np.asarray(points.z), False, False
+        period_evaluation = self._make_period_map(wheels, points.p).evaluate_period(
+            step_options, np.asarray(points.z), False, False
         )
         additional_columns = {
             "section_state": jnp.asarray(points.z),
-            CONTACT_ORDER_COLUMN: hash_contact_orders(period.period_steps, self.n_legs),
-            FRICTION_SURPLUS_COLUMN: np.asarray(jax.vmap(self._friction_surplus)(wheels, points.p)),
+            CONTACT_ORDER_COLUMN: compute_contact_order_numbers(
+                period_evaluation.period_steps, self.n_legs
+            ),
+            FRICTION_SURPLUS_COLUMN_NAME: np.asarray(
+                jax.vmap(self._compute_friction_surplus)(wheels, points.p)
+            ),
         }
-        return _measure_periods(period.period_steps, points.z) | additional_columns
+        return (
+            _combine_period_measures(period_evaluation.period_steps, points.z) | additional_columns
+        )
 
-    def _friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
+    def _compute_friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
         """Return the friction coefficient minus the smallest one with a gait.
 
         Over a period the ground's tangential impulse equals that of the weight along the slope.
-        Friction limits it to a multiple of the normal impulse, so no gait repeats without a
-        surplus.
+        Friction limits the tangential impulse to a multiple of the normal impulse, so no gait
+        repeats without a surplus.
         """
         model: Any
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
@@ -377,59 +408,71 @@ class GroundProblem(AbstractReturnMapProblem):
 
     def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether friction can balance the weight along the slope."""
-        return jnp.all(jnp.isfinite(z)) & (self._friction_surplus(wheel, p) > 0.0)
+        return jnp.all(jnp.isfinite(z)) & (self._compute_friction_surplus(wheel, p) > 0.0)
 
 
-def hash_contact_orders(steps: Any, n_legs: int) -> np.ndarray:
+def compute_contact_order_numbers(period_steps: Any, n_legs: int) -> np.ndarray:
     """Return a number for each of many periods that identifies its order of contacts.
 
     The number is a checksum of the modes that occur, the counts of events and the final contact
     modes.
     """
-    occurring_modes = np.asarray(steps.mode_durations) > 0.0
-    codes = np.asarray(steps.section_state)[..., -n_legs:]
-    counts = np.stack([np.asarray(steps.events), np.asarray(steps.impacts)], -1)
+    has_mode_occurred = np.asarray(period_steps.mode_durations) > 0.0
+    contact_codes = np.asarray(period_steps.section_state)[..., -n_legs:]
+    event_counts = np.stack([np.asarray(period_steps.events), np.asarray(period_steps.impacts)], -1)
     integer_arrays = [
-        x.reshape(len(x), -1).astype(np.int64) for x in (occurring_modes, codes, counts)
+        x.reshape(len(x), -1).astype(np.int64)
+        for x in (has_mode_occurred, contact_codes, event_counts)
     ]
     order_numbers = [
-        zlib.crc32(period_row.tobytes()) for period_row in np.concatenate(integer_arrays, 1)
+        zlib.crc32(period_integers.tobytes())
+        for period_integers in np.concatenate(integer_arrays, 1)
     ]
     return np.array(order_numbers, float)
 
 
 @jax.jit
 @jax.vmap
-def _measure_periods(steps: AbstractStep, section_states: AnySectionState) -> dict[str, Array]:
-    """Return the measures of many periods that begin at these section states."""
+def _combine_period_measures(
+    step_results: AbstractStep, section_states: AnySectionState
+) -> dict[str, Array]:
+    """Return the measures of many periods that begin at the given section states."""
     return combine_step_measures(
-        steps.section_state[-1], jax.vmap(lambda s: s.measures())(steps), section_states
+        step_results.section_state[-1],
+        jax.vmap(lambda step_result: step_result.measures())(step_results),
+        section_states,
     )
 
 
-def interpolate_states(left: Array, right: Array, fraction: Scalar, n_coordinates: int) -> Array:
+def interpolate_section_states(
+    left_state: Array, right_state: Array, state_fraction: Scalar, n_coordinates: int
+) -> Array:
     """Return a section state between two others, with the codes of the nearer one."""
-    codes = jnp.where(fraction < 0.5, left, right)[n_coordinates:]
-    return jnp.concatenate([(left + fraction * (right - left))[:n_coordinates], codes])
+    nearer_codes = jnp.where(state_fraction < 0.5, left_state, right_state)[n_coordinates:]
+    return jnp.concatenate(
+        [(left_state + state_fraction * (right_state - left_state))[:n_coordinates], nearer_codes]
+    )
 
 
 def measure_gait(
     model: AbstractWheel,
     params: WheelParams,
     section_state: AnySectionState,
-    options: StepOptions,
+    step_options: StepOptions,
     period_n: int,
 ) -> dict[str, Array]:
-    """Return all measures of one period of a gait that starts at its section state, with `closure`.
+    """Return all measures of one period of a gait from its section state, with `closure`.
 
     Indicators and margins are minima over the steps; durations and energies are sums. The section
-    state is that of the last step, the post-impact state that of the first. `outcome` is that of
-    the first step that fails. `closure` is the change of the section state over the period.
+    state is that of the last step, the post-impact state that of the first step. `outcome` is that
+    of the first step that fails. `closure` is the change of the section state over the period.
     """
 
-    def measure_next_step(x: AnySectionState, _: None) -> tuple[AnySectionState, dict[str, Array]]:
-        result = model.take_step(params, x, options)
-        return result.section_state, result.measures()
+    def measure_next_step(
+        section_state: AnySectionState, _: None
+    ) -> tuple[AnySectionState, dict[str, Array]]:
+        step_result = model.take_step(params, section_state, step_options)
+        return step_result.section_state, step_result.measures()
 
     end_state, step_measures = lax.scan(measure_next_step, section_state, None, length=period_n)
     return combine_step_measures(end_state, step_measures, section_state)
@@ -441,21 +484,23 @@ def combine_step_measures(
     """Return the result of `measure_gait` from the measures of each step and the final section
     state.
     """
-    measures = {}
-    for name, values in step_measures.items():
-        if name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or name.startswith("lambda_"):
-            measures[name] = jnp.min(values, 0)
-        elif name.endswith("_touchdown"):
-            measures[name] = values[-1]
-        elif name.endswith("_post_impact"):
-            measures[name] = values[0]
-        elif name == "outcome":
-            measures[name] = values[jnp.argmax(values != Outcome.STEPPED)]
-        elif MEASURES[name].is_ratio:
-            measures[name] = jnp.mean(values, 0)
+    period_measures = {}
+    for measure_name, step_values in step_measures.items():
+        if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(
+            "lambda_"
+        ):
+            period_measures[measure_name] = jnp.min(step_values, 0)
+        elif measure_name.endswith("_touchdown"):
+            period_measures[measure_name] = step_values[-1]
+        elif measure_name.endswith("_post_impact"):
+            period_measures[measure_name] = step_values[0]
+        elif measure_name == "outcome":
+            period_measures[measure_name] = step_values[jnp.argmax(step_values != Outcome.STEPPED)]
+        elif MEASURES[measure_name].is_ratio:
+            period_measures[measure_name] = jnp.mean(step_values, 0)
         else:
-            measures[name] = jnp.sum(values, 0)
-    period = jnp.where(measures["period"] > 0.0, measures["period"], 1.0)
-    measures["dls_fraction"] = measures["duration_dls"] / period
-    measures["speed"] = measures["step_length"] / period
-    return measures | {"closure": jnp.max(jnp.abs(end_state - section_state))}
+            period_measures[measure_name] = jnp.sum(step_values, 0)
+    positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)
+    period_measures["dls_fraction"] = period_measures["duration_dls"] / positive_period
+    period_measures["speed"] = period_measures["step_length"] / positive_period
+    return period_measures | {"closure": jnp.max(jnp.abs(end_state - section_state))}

@@ -17,8 +17,8 @@ from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
-    QuantityTable,
-    continue_and_locate,
+    PointQuantities,
+    continue_and_locate_points,
 )
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
@@ -30,12 +30,12 @@ from vrw_jax.branches.continuation_problems import BranchWheel
 from vrw_jax.branches.gait_test_functions import (
     CONTINUED_QUANTITIES,
     DISCONTINUOUS_QUANTITIES,
-    DLS_VANISHES,
-    FORCE_FALL_NAME,
-    LINEAR_SUBSTITUTES,
+    DLS_VANISHING_NAME,
+    INITIAL_FORCE_FALL_NAME,
+    LINEAR_MARGIN_SUBSTITUTES,
     GaitTestFunction,
-    TestFunctionArgs,
-    find_quantity_group,
+    TestFunctionWheel,
+    find_test_quantity_group,
     locate_jump_onset,
     select_test_quantity,
 )
@@ -55,42 +55,43 @@ from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
 
-EDGE_COLUMN = "edge of the box"
-"""Name of the column that is zero if the second parameter is at an end of its range."""
+RANGE_EDGE_COLUMN = "edge of the box"
+"""Name of the quantity that is zero if the second parameter is at an end of its range."""
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
-"""Default options of curves, with a short first step because some curves are short."""
+"""Default options of curves. The first step is short because some curves are short."""
 
 
 @dataclass(frozen=True)
-class TracingOptions:
-    """Options of the tracing of curves; lengths are arc lengths of curves.
+class CurveTracingOptions:
+    """Options of the tracing of curves. Lengths are arc lengths of curves.
 
-    - `same_curve_distance`: largest distance of a point from a curve that contains it;
-    - `overrun_distance`: distance from a point of codimension two at which the continuation of the
-      other curve starts;
-    - `codim2_tolerance`: tolerance of Newton's last step to a point of codimension two, relative to
-      the values of the parameters;
-    - `max_zero_duration`: duration of double support that counts as zero, s. It is chosen above
-      round-off because the duration is ill-conditioned there;
-    - `duration_guess`: first guess of a nonzero duration of double support, s.
+    - `same_curve_distance`: largest distance of a point from a curve that contains the point;
+    - `codim2_overrun_distance`: distance from a point of codimension two at which the continuation
+      of the other curve starts;
+    - `relative_codim2_tolerance`: tolerance of Newton's last step to a point of codimension two,
+      relative to the values of the parameters;
+    - `max_zero_dls_duration`: duration of double support that counts as zero, s. It is chosen above
+      round-off because the duration is ill-conditioned near zero;
+    - `dls_duration_guess`: first guess of a nonzero duration of double support, s.
     """
 
     same_curve_distance: float = 2e-3
-    overrun_distance: float = 3e-3
-    codim2_tolerance: float = 1e-9
-    max_zero_duration: float = 1e-4
-    duration_guess: float = 0.1
+    codim2_overrun_distance: float = 3e-3
+    relative_codim2_tolerance: float = 1e-9
+    max_zero_dls_duration: float = 1e-4
+    dls_duration_guess: float = 0.1
 
 
-TRACING_OPTIONS = TracingOptions()
+CURVE_TRACING_OPTIONS = CurveTracingOptions()
 """Options of the tracing of all curves."""
 
 
 @dataclass(frozen=True)
 class CurveContinuation(AbstractContinuation):
-    """Continuation of special points, which are evaluated like gaits except for the quantity
-    that vanishes.
+    """Continuation of special points.
+
+    Their quantities are those of gaits, except for the quantity that vanishes.
     """
 
     problem: TestFunctionCurve
@@ -98,49 +99,73 @@ class CurveContinuation(AbstractContinuation):
     special_point_names: tuple[str, ...]  # name of the special point of each wheel
     gait_continuation: GaitContinuation  # continuation of gaits along the first parameter
 
-    ending_quantities: ClassVar[tuple[str, ...]] = (
+    branch_ending_quantities: ClassVar[tuple[str, ...]] = (
         *BRANCH_ENDING_QUANTITIES,
-        EDGE_COLUMN,
-        FORCE_FALL_NAME,
+        RANGE_EDGE_COLUMN,
+        INITIAL_FORCE_FALL_NAME,
     )
     margin_names: ClassVar[tuple[str, ...]] = GaitContinuation.margin_names
-    linear_substitutes: ClassVar[Mapping[str, str]] = LINEAR_SUBSTITUTES
+    linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
 
-    def evaluate_points(self, wheels: TestFunctionArgs, points: ContinuationPoint) -> QuantityTable:
-        z, fraction = points.z
-        (lower, upper), fraction = self.problem.bounds, np.asarray(fraction)
-        second_values = lower + (upper - lower) * fraction
-        get_second_parameter = lambda params: getattr(params, self.second_parameter)
-        gait_wheels = wheels.gait._replace(
-            params=eqx.tree_at(get_second_parameter, wheels.gait.params, second_values)
+    def evaluate_point_quantities(
+        self, wheels: TestFunctionWheel, points: ContinuationPoint
+    ) -> PointQuantities:
+        z, second_fractions = points.z
+        (lower_bound, upper_bound), second_fractions = (
+            self.problem.bounds,
+            np.asarray(second_fractions),
         )
-        table = self.gait_continuation.evaluate_points(gait_wheels, points._replace(z=z))
+        second_values = lower_bound + (upper_bound - lower_bound) * second_fractions
+        get_second_parameter = lambda params: getattr(params, self.second_parameter)
+        gait_wheels = wheels.branch_wheel._replace(
+            params=eqx.tree_at(get_second_parameter, wheels.branch_wheel.params, second_values)
+        )
+        quantity_table = self.gait_continuation.evaluate_point_quantities(
+            gait_wheels, points._replace(z=z)
+        )
         # Without double support the rear foot's force must not be positive.
-        rear_force_sign = np.where(wheels.gait.phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
+        rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
         curve_quantities = {
-            "lambda_4_plus": rear_force_sign * table["lambda_4_plus"],
+            "lambda_4_plus": rear_force_sign * quantity_table["lambda_4_plus"],
             "second": second_values,
         }
-        return table | curve_quantities | {EDGE_COLUMN: np.minimum(fraction, 1.0 - fraction)}
-
-    def mask_undefined(self, table: QuantityTable, wheel_indices: np.ndarray) -> QuantityTable:
-        """Return the table with NaN for quantities that are zero or undefined on a whole curve."""
-        names_of_points = np.array(self.special_point_names)[wheel_indices]
-        is_dls_vanishing = names_of_points == DLS_VANISHES
-        is_discontinuous = np.isin(names_of_points, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHES))
-        step_names = {name for name in table if name.partition("[")[0] in MARGIN_MEASURES} - set(
-            CONTINUED_QUANTITIES
+        return (
+            quantity_table
+            | curve_quantities
+            | {RANGE_EDGE_COLUMN: np.minimum(second_fractions, 1.0 - second_fractions)}
         )
-        masks = {name: names_of_points == name for name in {*self.special_point_names} & {*table}}
-        masks |= {
-            substitute: names_of_points == name for name, substitute in LINEAR_SUBSTITUTES.items()
+
+    def mask_undefined_quantities(
+        self, table: PointQuantities, wheel_indices: np.ndarray
+    ) -> PointQuantities:
+        """Return the table with NaN for quantities that are zero or undefined on a whole curve."""
+        point_names = np.array(self.special_point_names)[wheel_indices]
+        is_dls_vanishing = point_names == DLS_VANISHING_NAME
+        is_discontinuous = np.isin(point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME))
+        step_measure_names = {
+            name for name in table if name.partition("[")[0] in MARGIN_MEASURES
+        } - set(CONTINUED_QUANTITIES)
+        is_undefined_by_name = {
+            name: point_names == name for name in {*self.special_point_names} & {*table}
         }
-        masks |= {name: is_discontinuous | masks.get(name, False) for name in step_names}
-        rear_force_mask = masks.get("lambda_4_plus", False) | is_dls_vanishing
-        masks |= {"lambda_4_plus": rear_force_mask, FORCE_FALL_NAME: ~is_dls_vanishing}
+        is_undefined_by_name |= {
+            substitute: point_names == name
+            for name, substitute in LINEAR_MARGIN_SUBSTITUTES.items()
+        }
+        is_undefined_by_name |= {
+            name: is_discontinuous | is_undefined_by_name.get(name, False)
+            for name in step_measure_names
+        }
+        is_rear_force_undefined = (
+            is_undefined_by_name.get("lambda_4_plus", False) | is_dls_vanishing
+        )
+        is_undefined_by_name |= {
+            "lambda_4_plus": is_rear_force_undefined,
+            INITIAL_FORCE_FALL_NAME: ~is_dls_vanishing,
+        }
         table = table | {
             name: np.where(mask if table[name].ndim == 1 else mask[:, None], np.nan, table[name])
-            for name, mask in masks.items()
+            for name, mask in is_undefined_by_name.items()
         }
         outcomes = np.where(is_discontinuous, Outcome.STEPPED, table["outcome"])
         return table | {
@@ -148,51 +173,53 @@ class CurveContinuation(AbstractContinuation):
             "closure": np.where(is_discontinuous, 0.0, table["closure"]),
         }
 
-    def is_admissible(self, table: QuantityTable) -> np.ndarray:
-        is_positive = np.all([~(table[name] <= 0.0) for name in self.ending_quantities], axis=0)
-        return is_positive & self.gait_continuation.is_admissible(table)
+    def are_points_admissible(self, table: PointQuantities) -> np.ndarray:
+        is_positive = np.all(
+            [~(table[name] <= 0.0) for name in self.branch_ending_quantities], axis=0
+        )
+        return is_positive & self.gait_continuation.are_points_admissible(table)
 
-    def is_mesh_limited(self, table: QuantityTable, ends: tuple[str, ...]) -> bool:
-        return self.gait_continuation.is_mesh_limited(table, ends)
+    def is_mesh_limited(self, table: PointQuantities, end_names: tuple[str, ...]) -> bool:
+        return self.gait_continuation.is_mesh_limited(table, end_names)
 
-    def name_end(self, table: QuantityTable, row_index: int) -> str:
-        return self.gait_continuation.name_end(table, row_index)
+    def name_branch_end(self, table: PointQuantities, row_index: int) -> str:
+        return self.gait_continuation.name_branch_end(table, row_index)
 
 
 class CurveSeed(NamedTuple):
     """Point on or near a curve of special points, from which the curve is continued."""
 
-    name: str
+    special_point_name: str
     parameter_values: tuple[float, float]  # values of the two parameters
-    system: CollocationSystem
-    gait: BranchWheel
+    collocation_system: CollocationSystem
+    branch_wheel: BranchWheel
     z: CollocationSolution
 
 
 class TracedCurve(NamedTuple):
     """Traced curve, with seeds at the special points that it meets."""
 
-    curve: SpecialPointCurve
+    special_point_curve: SpecialPointCurve
     # section states and both parameters as fractions of their ranges, (point, coordinate)
-    vertices: np.ndarray
-    new_seeds: tuple[CurveSeed, ...]
+    scaled_vertices: np.ndarray
+    meeting_seeds: tuple[CurveSeed, ...]
 
 
 class CurveTracer(NamedTuple):
     """Tracer of curves of special points within the ranges of two parameters."""
 
-    parameters: tuple[str, str]
+    parameter_names: tuple[str, str]
     parameter_ranges: np.ndarray  # bounds of each parameter, (parameter, 2)
     model: ViscoelasticWheel
-    options: ArclengthOptions
+    arclength_options: ArclengthOptions
     step_options: StepOptions
-    on_stage: Callable[[str], None] | None = None
-    tracing_options: TracingOptions = TRACING_OPTIONS
+    report_stage_to: Callable[[str], None] | None = None
+    tracing_options: CurveTracingOptions = CURVE_TRACING_OPTIONS
 
     def report_stage(self, stage: str) -> None:
-        """Call `on_stage`, if it is given, with a description of the next stage."""
-        if self.on_stage is not None:
-            self.on_stage(stage)
+        """Call `report_stage_to`, if it is given, with a description of the next stage."""
+        if self.report_stage_to is not None:
+            self.report_stage_to(stage)
 
     def with_parameters(self, params: WheelParams, values: Mapping[str, float]) -> WheelParams:
         """Return the wheel with other values of some parameters."""
@@ -200,32 +227,39 @@ class CurveTracer(NamedTuple):
             params = self.model.with_parameter(params, name, jnp.asarray(value))[1]
         return params
 
-    def parameter_fractions(self, values: np.ndarray) -> np.ndarray:
+    def compute_parameter_fractions(self, values: np.ndarray) -> np.ndarray:
         """Return both parameters, on the last axis, as fractions of their ranges."""
         return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
-    def find_seeds(self, axis: int, params: WheelParams) -> list[CurveSeed]:
-        """Return seeds at the special points on branches of the wheels along the parameter of
-        index `axis`.
-        """
-        name, seeds = self.parameters[axis], []
-        lower_bound, upper_bound = self.parameter_ranges[axis]
-        self.report_stage(f"following {len(params.damping)} branches along {name}")
-        for branch in continue_branches(params, name, (lower_bound, upper_bound), model=self.model):
+    def find_seeds(self, parameter_index: int, params: WheelParams) -> list[CurveSeed]:
+        """Return seeds at the special points on branches of the wheels along one parameter."""
+        parameter_name, curve_seeds = self.parameter_names[parameter_index], []
+        lower_bound, upper_bound = self.parameter_ranges[parameter_index]
+        self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
+        for branch in continue_branches(
+            params, parameter_name, (lower_bound, upper_bound), model=self.model
+        ):
             for special_point in branch.special_points:
-                if can_continue(special_point.name):
-                    seeds.append(self._make_seed(special_point))
-        return seeds
+                if can_continue_special_point(special_point.name):
+                    curve_seeds.append(self._make_seed(special_point))
+        return curve_seeds
 
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
         """Return the seed at a special point of a branch."""
         cycle = special_point.cycle
         params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
-        first_value, second_value = (float(getattr(params, name)) for name in self.parameters)
-        gait = BranchWheel(params, cycle.collocation_state.is_phase_active)
+        first_value, second_value = (
+            float(getattr(params, special_point_name))
+            for special_point_name in self.parameter_names
+        )
+        branch_wheel = BranchWheel(params, cycle.collocation_state.is_phase_active)
         z = cycle.collocation_state.solution
-        name = name_special_point(special_point.name, gait, z, self.tracing_options)
-        return CurveSeed(name, (first_value, second_value), cycle.system, gait, z)
+        special_point_name = rename_special_point(
+            special_point.name, branch_wheel, z, self.tracing_options
+        )
+        return CurveSeed(
+            special_point_name, (first_value, second_value), cycle.system, branch_wheel, z
+        )
 
     def trace_curves(
         self, seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
@@ -237,12 +271,18 @@ class CurveTracer(NamedTuple):
             for seed in seeds
             if not any(self._is_on_curve(seed, curve) for curve in known_curves)
         ]
-        quantity_groups = {find_quantity_group(seed.name, seed.system.n_legs) for seed in new_seeds}
+        quantity_groups = {
+            find_test_quantity_group(seed.special_point_name, seed.collocation_system.n_legs)
+            for seed in new_seeds
+        }
         for quantity_group in sorted(quantity_groups):
             remaining_seeds = [
-                s
-                for s in new_seeds
-                if find_quantity_group(s.name, s.system.n_legs) == quantity_group
+                curve_seed
+                for curve_seed in new_seeds
+                if find_test_quantity_group(
+                    curve_seed.special_point_name, curve_seed.collocation_system.n_legs
+                )
+                == quantity_group
             ]
             while remaining_seeds:
                 batch_seeds: list[CurveSeed] = []
@@ -250,14 +290,15 @@ class CurveTracer(NamedTuple):
                 # curve.
                 for seed in remaining_seeds:
                     if (
-                        seed.name not in {s.name for s in batch_seeds}
+                        seed.special_point_name
+                        not in {curve_seed.special_point_name for curve_seed in batch_seeds}
                         and len(batch_seeds) < batch_sizes.CURVE_BATCH_SIZE
                     ):
                         batch_seeds.append(seed)
                 accepted_curves: list[TracedCurve] = []
                 for curve in self._trace_batch(quantity_group, batch_seeds):
                     if not any(
-                        self.is_same_curve(curve, other_curve)
+                        self.are_same_curve(curve, other_curve)
                         for other_curve in (*known_curves, *new_curves, *accepted_curves)
                     ):
                         accepted_curves.append(curve)
@@ -273,22 +314,25 @@ class CurveTracer(NamedTuple):
     def _is_on_curve(self, seed: CurveSeed, curve: TracedCurve) -> bool:
         """Return whether a seed is on a curve of the same special point."""
         seed_point = np.append(
-            seed.z.section_state, self.parameter_fractions(np.array(seed.parameter_values))
+            seed.z.section_state, self.compute_parameter_fractions(np.array(seed.parameter_values))
         )
-        has_same_name = seed.name == curve.curve.name
+        has_same_name = seed.special_point_name == curve.special_point_curve.name
         max_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
-            distance_to_polyline(seed_point[None], curve.vertices)[0] < max_distance
+            compute_distances_to_polyline(seed_point[None], curve.scaled_vertices)[0] < max_distance
         )
 
-    def is_same_curve(self, curve: TracedCurve, other_curve: TracedCurve) -> bool:
-        """Return whether each point of a curve is on the other curve, and both have the same
-        name.
+    def are_same_curve(self, curve: TracedCurve, other_curve: TracedCurve) -> bool:
+        """Return whether two curves have the same name, and all points of the first are on the
+        second.
         """
-        has_same_name = curve.curve.name == other_curve.curve.name
+        has_same_name = curve.special_point_curve.name == other_curve.special_point_curve.name
         max_distance = self.tracing_options.same_curve_distance
         return has_same_name and bool(
-            np.max(distance_to_polyline(curve.vertices, other_curve.vertices)) < max_distance
+            np.max(
+                compute_distances_to_polyline(curve.scaled_vertices, other_curve.scaled_vertices)
+            )
+            < max_distance
         )
 
     def _trace_batch(
@@ -296,109 +340,125 @@ class CurveTracer(NamedTuple):
     ) -> list[TracedCurve]:
         """Return a curve through each seed that has one, on a sufficiently fine mesh."""
         curves: list[TracedCurve] = []
-        names = ", ".join(sorted({seed.name for seed in seeds}))
-        self.report_stage(f"following special points: {names}")
-        max_refinements = GAIT_BRANCH_OPTIONS.max_refinements
-        for refinement in range(1 + max_refinements):
-            is_finest = refinement == max_refinements
-            branches = self._continue_batch(quantity_group, seeds, is_finest)
+        special_point_names = ", ".join(sorted({seed.special_point_name for seed in seeds}))
+        self.report_stage(f"following special points: {special_point_names}")
+        max_mesh_refinements = GAIT_BRANCH_OPTIONS.max_mesh_refinements
+        for refinement_index in range(1 + max_mesh_refinements):
+            is_finest_mesh = refinement_index == max_mesh_refinements
+            branches = self._continue_batch(quantity_group, seeds, is_finest_mesh)
             mesh_limited_seeds = []
-            for seed, (branch, system) in zip(seeds, branches, strict=True):
-                if branch is not None and branch.is_mesh_limited and not is_finest:
-                    options = system.cycle_options.refine_mesh()
+            for seed, (branch_data, collocation_system) in zip(seeds, branches, strict=True):
+                if branch_data is not None and branch_data.is_mesh_limited and not is_finest_mesh:
+                    options = collocation_system.cycle_options.refine_mesh()
                     mesh_limited_seeds.append(
-                        self._transfer_seed(seed, system._replace(cycle_options=options))
+                        self._transfer_seed(
+                            seed, collocation_system._replace(cycle_options=options)
+                        )
                     )
-                elif branch is not None:
-                    curves.append(self._label_traced(seed._replace(system=system), branch))
+                elif branch_data is not None:
+                    curves.append(
+                        self._label_traced(
+                            seed._replace(collocation_system=collocation_system), branch_data
+                        )
+                    )
             if not mesh_limited_seeds:
                 break
             seeds = mesh_limited_seeds
         return curves
 
     @staticmethod
-    def _transfer_seed(seed: CurveSeed, system: CollocationSystem) -> CurveSeed:
+    def _transfer_seed(seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
         """Return the seed transferred to the mesh of `system`."""
-        if seed.system == system:
+        if seed.collocation_system == collocation_system:
             return seed
         return seed._replace(
-            system=system, z=transfer_solution_to_mesh(seed.system, system, seed.z)
+            collocation_system=collocation_system,
+            z=transfer_solution_to_mesh(seed.collocation_system, collocation_system, seed.z),
         )
 
     def _continue_batch(
-        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed], is_finest: bool
+        self, quantity_group: tuple[str, ...], seeds: list[CurveSeed], is_finest_mesh: bool
     ) -> list[tuple[BranchData | None, CollocationSystem]]:
-        """Return the data of a curve through each seed, with the system of the finest mesh among
-        the seeds.
+        """Return the data of a curve through each seed, and the collocation system of the data.
+
+        The system has the finest mesh among the seeds.
         """
-        system = max(
-            (seed.system for seed in seeds), key=lambda system: system.cycle_options.mesh_intervals
+        collocation_system = max(
+            (seed.collocation_system for seed in seeds),
+            key=lambda collocation_system: collocation_system.cycle_options.mesh_intervals,
         )
-        seeds = [self._transfer_seed(seed, system) for seed in seeds]
+        seeds = [self._transfer_seed(seed, collocation_system) for seed in seeds]
         padded_seeds = [*seeds, *seeds[-1:] * (-len(seeds) % batch_sizes.CURVE_BATCH_SIZE)]
         test_function = GaitTestFunction(
-            system, self.parameters, quantity_group, self.model, self.step_options
+            collocation_system, self.parameter_names, quantity_group, self.model, self.step_options
         )
         stack_trees = lambda *trees: jax.tree.map(lambda *x: np.stack(x), *trees)
         quantity_names = [
-            select_test_quantity(seed.name, bool(seed.gait.phase_active[0, 0] > 0.5))
+            select_test_quantity(
+                seed.special_point_name, bool(seed.branch_wheel.is_phase_active[0, 0] > 0.5)
+            )
             for seed in padded_seeds
         ]
         quantity_indices = [jnp.asarray(quantity_group.index(name)) for name in quantity_names]
-        wheels = stack_trees(
+        test_function_arguments = stack_trees(
             *(
-                TestFunctionArgs(seed.gait, quantity_index)
+                TestFunctionWheel(seed.branch_wheel, quantity_index)
                 for seed, quantity_index in zip(padded_seeds, quantity_indices, strict=True)
             )
         )
-        lower, upper = map(float, self.parameter_ranges[1])
-        second_fraction = lambda seed: jnp.asarray(
-            (seed.parameter_values[1] - lower) / (upper - lower)
+        lower_bound, upper_bound = map(float, self.parameter_ranges[1])
+        compute_second_fraction = lambda seed: jnp.asarray(
+            (seed.parameter_values[1] - lower_bound) / (upper_bound - lower_bound)
         )
         z = stack_trees(
-            *(TestFunctionPoint(seed.z, second_fraction(seed)) for seed in padded_seeds)
+            *(TestFunctionPoint(seed.z, compute_second_fraction(seed)) for seed in padded_seeds)
         )
         gait_continuation = GaitContinuation(
             test_function.gait_problem,
-            self.options,
-            wheels.gait,
+            self.arclength_options,
+            test_function_arguments.branch_wheel,
             self.parameter_ranges[0],
             self.model,
             self.step_options,
-            system.n_legs,
+            collocation_system.n_legs,
         )
         continuation = CurveContinuation(
-            TestFunctionCurve(test_function, (lower, upper)),
-            self.options,
-            wheels,
+            TestFunctionCurve(test_function, (lower_bound, upper_bound)),
+            self.arclength_options,
+            test_function_arguments,
             self.parameter_ranges[0],
-            self.parameters[1],
-            tuple(seed.name for seed in padded_seeds),
+            self.parameter_names[1],
+            tuple(seed.special_point_name for seed in padded_seeds),
             gait_continuation,
         )
         first_values = jnp.asarray([seed.parameter_values[0] for seed in padded_seeds])
-        is_requested = np.arange(len(padded_seeds)) < len(seeds)
-        branches = continue_and_locate(
+        is_seed_requested = np.arange(len(padded_seeds)) < len(seeds)
+        branch_data_by_seed = continue_and_locate_points(
             continuation,
             z,
             first_values,
-            is_requested,
+            is_seed_requested,
             lambda wheel_index, point: lambda: point,
-            is_finest,
+            is_finest_mesh,
         )
-        return [(branch, system) for branch in branches[: len(seeds)]]
+        return [(branch, collocation_system) for branch in branch_data_by_seed[: len(seeds)]]
 
-    def _label_traced(self, seed: CurveSeed, branch: BranchData) -> TracedCurve:
+    def _label_traced(self, seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
         """Return the labeled curve from its data, with seeds at the special points that it
         meets.
         """
-        values = np.stack([branch.points.p, branch.table["second"]], -1)
-        vertices = np.column_stack(
-            [branch.points.z.z.section_state, self.parameter_fractions(values)]
+        parameter_points = np.stack(
+            [branch_data.points.p, branch_data.quantity_table["second"]], -1
         )
-        codim2_points, new_seeds, end_reasons = [], [], branch.ends
-        for special_point in branch.special_points:
-            if special_point.name == EDGE_COLUMN:
+        scaled_vertices = np.column_stack(
+            [
+                branch_data.points.z.z.section_state,
+                self.compute_parameter_fractions(parameter_points),
+            ]
+        )
+        codim2_points, new_seeds, end_reasons = [], [], branch_data.end_reasons
+        for special_point in branch_data.special_points:
+            if special_point.name == RANGE_EDGE_COLUMN:
                 continue
             point_beside = special_point.cycle
             meeting_values = (
@@ -408,14 +468,22 @@ class CurveTracer(NamedTuple):
                     + np.ptp(self.parameter_ranges[1]) * point_beside.z.fraction
                 ),
             )
-            name = name_special_point(
-                special_point.name, seed.gait, point_beside.z.z, self.tracing_options
+            special_point_name = rename_special_point(
+                special_point.name, seed.branch_wheel, point_beside.z.z, self.tracing_options
             )
-            if {name, seed.name} == {"lambda_4_plus", DLS_VANISHES}:
+            if {special_point_name, seed.special_point_name} == {
+                "lambda_4_plus",
+                DLS_VANISHING_NAME,
+            }:
                 meeting_values = self._locate_jump_onset(seed, point_beside.z.z, meeting_values)
                 new_seeds.append(
                     self._seed_beyond_meeting(
-                        name, seed, vertices, values, branch.points.z.z, meeting_values
+                        special_point_name,
+                        seed,
+                        scaled_vertices,
+                        parameter_points,
+                        branch_data.points.z.z,
+                        meeting_values,
                     )
                 )
                 text_replacement = f"{special_point.value:.9g}", f"{meeting_values[0]:.9g}"
@@ -423,120 +491,168 @@ class CurveTracer(NamedTuple):
                     end_reasons[0].replace(*text_replacement),
                     end_reasons[1].replace(*text_replacement),
                 )
-            elif can_continue(name):
+            elif can_continue_special_point(special_point_name):
                 seed_values = float(point_beside.p), meeting_values[1]
                 new_seeds.append(
-                    CurveSeed(name, seed_values, seed.system, seed.gait, point_beside.z.z)
+                    CurveSeed(
+                        special_point_name,
+                        seed_values,
+                        seed.collocation_system,
+                        seed.branch_wheel,
+                        point_beside.z.z,
+                    )
                 )
-            codim2_points.append(Codim2Point(name, meeting_values, special_point.ends_branch))
-        curve = self._label_curve(seed, branch._replace(ends=end_reasons), tuple(codim2_points))
-        return TracedCurve(curve, vertices, tuple(new_seeds))
+            codim2_points.append(
+                Codim2Point(special_point_name, meeting_values, special_point.ends_branch)
+            )
+        special_point_curve = self._label_curve(
+            seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
+        )
+        return TracedCurve(special_point_curve, scaled_vertices, tuple(new_seeds))
 
     def _locate_jump_onset(
         self, seed: CurveSeed, z: CollocationSolution, start_values: Any
     ) -> tuple[float, float]:
-        """Return both parameters at the onset of the jump, or `start_values` if it is not found."""
+        """Return both parameters at the onset of the jump, or `start_values` if the onset is not
+        found.
+        """
         test_function = GaitTestFunction(
-            seed.system, self.parameters, CONTINUED_QUANTITIES, self.model, self.step_options
+            seed.collocation_system,
+            self.parameter_names,
+            CONTINUED_QUANTITIES,
+            self.model,
+            self.step_options,
         )
         onset_values, last_change = locate_jump_onset(
-            test_function, seed.gait, jax.device_put(z), jnp.asarray(start_values)
+            test_function, seed.branch_wheel, jax.device_put(z), jnp.asarray(start_values)
         )
-        is_found = last_change < self.tracing_options.codim2_tolerance
-        first_value, second_value = onset_values if is_found else start_values
+        is_onset_found = last_change < self.tracing_options.relative_codim2_tolerance
+        first_value, second_value = onset_values if is_onset_found else start_values
         return float(first_value), float(second_value)
 
     def _seed_beyond_meeting(
         self,
-        name: str,
+        special_point_name: str,
         seed: CurveSeed,
-        vertices: np.ndarray,
-        values: np.ndarray,
+        scaled_vertices: np.ndarray,
+        parameter_points: np.ndarray,
         z: CollocationSolution,
         meeting_values: Any,
     ) -> CurveSeed:
         """Return a seed beyond the point at which the rear foot's force starts to rise or fall.
 
-        The force is zero along the curve. Both curves cross there and continue in the same
+        The force is zero along the curve. Both curves cross at that point and continue in the same
         direction. `meeting_values` are both parameters at the crossing.
         """
         starts_at_meeting = (
-            abs(values[0] - meeting_values).max() < abs(values[-1] - meeting_values).max()
+            abs(parameter_points[0] - meeting_values).max()
+            < abs(parameter_points[-1] - meeting_values).max()
         )
-        direction = 1 if starts_at_meeting else -1
-        vertices, values = vertices[::direction], values[::direction]
-        z = jax.tree.map(lambda x: x[::direction], z)
-        overrun_distance = self.tracing_options.overrun_distance
-        distances = np.linalg.norm(vertices - vertices[0], axis=1)
+        order_sign = 1 if starts_at_meeting else -1
+        scaled_vertices, parameter_points = (
+            scaled_vertices[::order_sign],
+            parameter_points[::order_sign],
+        )
+        z = jax.tree.map(lambda x: x[::order_sign], z)
+        overrun_distance = self.tracing_options.codim2_overrun_distance
+        distances = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
         point_index = int(np.argmax(distances >= min(overrun_distance, distances[-1])))
-        extrapolate = lambda x: (
+        extrapolate_from_meeting = lambda x: (
             x[0] + overrun_distance / distances[point_index] * (x[0] - x[point_index])
         )
-        z = jax.tree.map(lambda x: jnp.asarray(extrapolate(x)), z)
-        first_value, second_value = extrapolate(values)
-        dls_duration = 0.0 if name == DLS_VANISHES else self.tracing_options.duration_guess
+        z = jax.tree.map(lambda x: jnp.asarray(extrapolate_from_meeting(x)), z)
+        first_value, second_value = extrapolate_from_meeting(parameter_points)
+        dls_duration = (
+            0.0
+            if special_point_name == DLS_VANISHING_NAME
+            else self.tracing_options.dls_duration_guess
+        )
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
-        return CurveSeed(name, (first_value, second_value), seed.system, seed.gait, z)
+        return CurveSeed(
+            special_point_name,
+            (first_value, second_value),
+            seed.collocation_system,
+            seed.branch_wheel,
+            z,
+        )
 
     def _label_curve(
-        self, seed: CurveSeed, branch: BranchData, codim2_points: tuple[Codim2Point, ...]
+        self, seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
         """Return the labeled curve from its data."""
-        spectral_radius = np.abs(np.linalg.eigvals(np.asarray(branch.points.jacobian))).max(-1)
-        table = branch.table | {"spectral_radius": spectral_radius}
+        spectral_radius = np.abs(np.linalg.eigvals(np.asarray(branch_data.points.jacobian))).max(-1)
+        quantity_table = branch_data.quantity_table | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-        variables: dict[str, Any] = {
-            column_name: ("point", table[column_name], measure_attrs(column_name))
+        curve_variables: dict[str, Any] = {
+            column_name: ("point", quantity_table[column_name], measure_attrs(column_name))
             for column_name in column_names
         }
-        variables["mesh_error"] = ("point", table["mesh_error"])
-        variables["section_state"] = (("point", "component"), table["section_state"])
-        values = np.asarray(branch.points.p), table["second"]
-        labels = {
+        curve_variables["mesh_error"] = ("point", quantity_table["mesh_error"])
+        curve_variables["section_state"] = (("point", "component"), quantity_table["section_state"])
+        parameter_values = np.asarray(branch_data.points.p), quantity_table["second"]
+        curve_coordinates = {
             parameter: ("point", value, measure_attrs(parameter))
-            for parameter, value in zip(self.parameters, values, strict=True)
+            for parameter, value in zip(self.parameter_names, parameter_values, strict=True)
         }
-        start_wheel = provenance(seed.gait.params, self.model, self.step_options)
-        title = {"title": f"Curve of {seed.name} over {' and '.join(self.parameters)}"}
-        dataset = xr.Dataset(variables, labels, title | start_wheel)
-        return SpecialPointCurve(seed.name, self.parameters, dataset, codim2_points, branch.ends)
+        start_wheel = provenance(seed.branch_wheel.params, self.model, self.step_options)
+        title = {
+            "title": f"Curve of {seed.special_point_name} over {' and '.join(self.parameter_names)}"
+        }
+        dataset = xr.Dataset(curve_variables, curve_coordinates, title | start_wheel)
+        return SpecialPointCurve(
+            seed.special_point_name,
+            self.parameter_names,
+            dataset,
+            codim2_points,
+            branch_data.end_reasons,
+        )
 
 
-def distance_to_polyline(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return the distance of each point from a polyline, whose vertices are rows of `vertices`,
-    shape (points,).
+def compute_distances_to_polyline(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return the distance of each point from a polyline, shape (points,).
+
+    The vertices of the polyline are rows of `vertices`.
     """
     segment_starts, segment_vectors = vertices[:-1], np.diff(vertices, axis=0)
     squared_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
-    offsets = points[:, None] - segment_starts
-    fractions = np.clip(np.sum(offsets * segment_vectors, 2) / squared_lengths, 0.0, 1.0)
-    distances = np.linalg.norm(offsets - fractions[..., None] * segment_vectors, axis=2)
-    return np.min(distances, axis=1, initial=np.inf)
+    start_offsets = points[:, None] - segment_starts
+    segment_fractions = np.clip(
+        np.sum(start_offsets * segment_vectors, 2) / squared_lengths, 0.0, 1.0
+    )
+    segment_distances = np.linalg.norm(
+        start_offsets - segment_fractions[..., None] * segment_vectors, axis=2
+    )
+    return np.min(segment_distances, axis=1, initial=np.inf)
 
 
-def name_special_point(
-    name: str,
-    gait: BranchWheel,
+def rename_special_point(
+    special_point_name: str,
+    branch_wheel: BranchWheel,
     z: CollocationSolution,
-    options: TracingOptions = TRACING_OPTIONS,
+    tracing_options: CurveTracingOptions = CURVE_TRACING_OPTIONS,
 ) -> str:
-    """Return the name of a special point of a curve or branch, given its gait."""
-    if name == BRANCH_POINT_KIND:  # A curve of folds need not turn back at its special points.
+    """Return the name under which a special point of a curve or branch is continued, given its
+    gait.
+    """
+    if (
+        special_point_name == BRANCH_POINT_KIND
+    ):  # A curve of folds need not turn back at its special points.
         return "fold"
     if (
-        name not in ("lambda_4_plus", DLS_VANISHES, FORCE_FALL_NAME)
-        or gait.phase_active[0, 0] < 0.5
+        special_point_name not in ("lambda_4_plus", DLS_VANISHING_NAME, INITIAL_FORCE_FALL_NAME)
+        or branch_wheel.is_phase_active[0, 0] < 0.5
     ):
-        return name
-    dls_vanishes = name != FORCE_FALL_NAME and z.durations[0, 0] < options.max_zero_duration
-    return DLS_VANISHES if dls_vanishes else "lambda_4_plus"
+        return special_point_name
+    dls_vanishes = (
+        special_point_name != INITIAL_FORCE_FALL_NAME
+        and z.durations[0, 0] < tracing_options.max_zero_dls_duration
+    )
+    return DLS_VANISHING_NAME if dls_vanishes else "lambda_4_plus"
 
 
-def can_continue(name: str) -> bool:
-    """Return whether the special point of this name can be continued as a curve by
-    `GaitTestFunction`.
-    """
+def can_continue_special_point(special_point_name: str) -> bool:
+    """Return whether `GaitTestFunction` can continue the special point of this name as a curve."""
     return (
-        name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHES)
-        or name.partition("[")[0] in MARGIN_MEASURES
+        special_point_name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        or special_point_name.partition("[")[0] in MARGIN_MEASURES
     )

@@ -18,7 +18,7 @@ from vrw_jax.branches.continuation import INDICATOR_NAMES, GaitContinuation
 from vrw_jax.branches.continuation_problems import (
     BranchWheel,
     CollocationProblem,
-    linearize_with_quantities,
+    make_trial_linearizer,
     measure_gait,
 )
 from vrw_jax.collocation import CollocationSolution, PhasePoints
@@ -49,34 +49,31 @@ from vrw_jax.wheel import (
     wheel_from_parameters,
 )
 
-LINEAR_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_substitutes
-"""Names of margins that vanish as a cube, with the quantity that vanishes linearly at the same
-point.
-"""
+LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
+"""Names of margins that vanish as a cube, each with the quantity that vanishes linearly at the same
+point."""
 
 DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
-"""Quantities at whose zeros the step is discontinuous, so that its measures are not defined."""
+"""Quantities at whose zeros the step is discontinuous, so that measures of the step are not
+defined."""
 
-DLS_VANISHES = "duration_dls"
-"""Name of the special point at which the duration of double support is zero. There the rear
+DLS_VANISHING_NAME = "duration_dls"
+"""Name of the special point at which the duration of double support is zero. At this point the rear
 foot's force is zero and falls. At the zero of `lambda_4_plus` the force is zero and rises, and the
-step jumps.
-"""
+step jumps."""
 
-FORCE_FALL_NAME = "fall of the rear foot's force at first"
-"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHES`; the curve ends at the
-rate's zero.
-"""
+INITIAL_FORCE_FALL_NAME = "fall of the rear foot's force at first"
+"""Name of a rate in N/s that is positive on the curve of `DLS_VANISHING_NAME`. The curve ends at
+the zero of the rate."""
 
 MEAN_FORCE_FALL_NAME = "its mean fall in double support"
 """Name of a rate in N/s that is zero on the curve of `lambda_4_plus`. On the curve of
-`DLS_VANISHES`, which otherwise satisfies the same equations, it is not zero.
-"""
+`DLS_VANISHING_NAME`, which otherwise satisfies the same equations, the rate is not zero."""
 
 CONTINUED_QUANTITIES = (
     *DISCONTINUOUS_QUANTITIES,
-    *LINEAR_SUBSTITUTES.values(),
-    FORCE_FALL_NAME,
+    *LINEAR_MARGIN_SUBSTITUTES.values(),
+    INITIAL_FORCE_FALL_NAME,
     MEAN_FORCE_FALL_NAME,
 )
 """Quantities of the collocated gait itself, which are also defined beyond the special point."""
@@ -87,26 +84,29 @@ class TestFunctionOptions:
     """Options of the test functions of gaits.
 
     - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
-    - `duration_roundoff`: round-off of a duration that is zero along a whole curve, s;
-    - `relative_difference`: finite difference of section state and relative parameters, for
+    - `max_duration_roundoff`: round-off of a duration that is zero along a whole curve, s;
+    - `relative_difference_step`: finite difference of section state and relative parameters, for
       derivatives of the quantities of a step.
     """
 
     n_codim2_iterations: int = 8
-    duration_roundoff: float = 1e-9
-    relative_difference: float = 1e-6
+    max_duration_roundoff: float = 1e-9
+    relative_difference_step: float = 1e-6
 
 
 def select_test_quantity(name: str, has_double_support: bool) -> str:
-    """Return the name of the quantity whose zero is the special point, for gaits with or without
-    double support.
+    """Return the name of the quantity whose zero is the special point.
+
+    The name depends on whether the gait has double support.
     """
     if name == "lambda_4_plus" and has_double_support:
         return MEAN_FORCE_FALL_NAME
-    return "lambda_4_plus" if name == DLS_VANISHES else LINEAR_SUBSTITUTES.get(name, name)
+    return (
+        "lambda_4_plus" if name == DLS_VANISHING_NAME else LINEAR_MARGIN_SUBSTITUTES.get(name, name)
+    )
 
 
-def find_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
+def find_test_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
     """Return the names of the quantities that are evaluated together with that of a special
     point.
     """
@@ -128,68 +128,77 @@ def find_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
     )
 
 
-class TestFunctionArgs(NamedTuple):
-    """Wheel on a curve of special points, and the index of the quantity that vanishes there."""
+class TestFunctionWheel(NamedTuple):
+    """Wheel on a curve of special points, and the index of the quantity that vanishes on it."""
 
-    gait: BranchWheel
+    branch_wheel: BranchWheel
     quantity_index: Array
 
 
 class GaitTestFunction(AbstractTestFunction):
-    """One of `quantities` of collocated gaits as a test function over two parameters."""
+    """Test function over two parameters: one of several quantities of collocated gaits."""
 
     system: CollocationSystem = eqx.field(static=True)
     parameter_names: tuple[str, str] = eqx.field(static=True)
-    quantities: tuple[str, ...] = eqx.field(static=True)  # names of the quantities of one group
+    quantity_names: tuple[str, ...] = eqx.field(static=True)  # names of the quantities of one group
     model: ViscoelasticWheel
     step_options: StepOptions
-    options: TestFunctionOptions = eqx.field(static=True, default=TestFunctionOptions())
+    test_function_options: TestFunctionOptions = eqx.field(
+        static=True, default=TestFunctionOptions()
+    )
 
     def linearize(
-        self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array
+        self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array
     ) -> TestFunctionNewtonStep:
-        gait = wheel.gait
+        branch_wheel = wheel.branch_wheel
         parameter_indices = tuple(PARAMETER_NAMES.index(name) for name in self.parameter_names)
-        linearize = linearize_with_quantities(
-            self.system, parameter_indices, QUANTITY_FUNCTIONS.get(self.quantities)
+        linearize_trial = make_trial_linearizer(
+            self.system, parameter_indices, QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names)
         )
-        arguments = stack_parameters(self.with_parameters(gait, p).params), gait.phase_active, z
-        correction, tangents, monodromy, *quantity_data = linearize(*arguments)
+        trial_arguments = (
+            stack_parameters(self.with_parameters(branch_wheel, p).params),
+            branch_wheel.is_phase_active,
+            z,
+        )
+        correction, tangents, monodromy, *quantity_data = linearize_trial(*trial_arguments)
         first_tangent, second_tangent = (
             jax.tree.map(lambda x, i=i: x[i], tangents) for i in range(2)
         )
         if quantity_data:
-            value, parameter_gradient = quantity_data
-            if self.quantities == BIFURCATION_NAMES:
-                apply_margin_jacobian = lambda d: jax.jvp(
-                    offset_bifurcation_margins, (value,), (d,)
+            quantity_values, parameter_gradients = quantity_data
+            if self.quantity_names == BIFURCATION_NAMES:
+                apply_margin_jacobian = lambda quantity_tangent: jax.jvp(
+                    offset_bifurcation_margins, (quantity_values,), (quantity_tangent,)
                 )
-                value, parameter_gradient = jax.vmap(apply_margin_jacobian, out_axes=(None, 0))(
-                    parameter_gradient
-                )
-            value, parameter_gradient = value + parameter_gradient[0], parameter_gradient[1:]
+                quantity_values, parameter_gradients = jax.vmap(
+                    apply_margin_jacobian, out_axes=(None, 0)
+                )(parameter_gradients)
+            quantity_values, parameter_gradients = (
+                quantity_values + parameter_gradients[0],
+                parameter_gradients[1:],
+            )
         else:
-            value, parameter_gradient = self._differentiate_steps(
-                gait, z, p, correction, (first_tangent, second_tangent)
+            quantity_values, parameter_gradients = self._differentiate_steps(
+                branch_wheel, z, p, correction, (first_tangent, second_tangent)
             )
         return TestFunctionNewtonStep(
             correction,
             (first_tangent, second_tangent),
             monodromy,
-            value[wheel.quantity_index],
-            parameter_gradient[:, wheel.quantity_index],
+            quantity_values[wheel.quantity_index],
+            parameter_gradients[:, wheel.quantity_index],
         )
 
     def _differentiate_steps(
         self,
-        gait: BranchWheel,
+        branch_wheel: BranchWheel,
         z: CollocationSolution,
         p: Array,
         correction: CollocationSolution,
         tangents: tuple,
     ) -> tuple[Array, Array]:
-        """Return the step's quantities of the corrected gait, and their derivatives with respect to
-        both parameters.
+        """Return the step's quantities of the corrected gait, and their derivatives by both
+        parameters.
 
         Newton's method needs the derivatives to a few digits. Finite differences of steps cost less
         than derivatives of the step, and use the same machine code. Near a fold the tangents grow
@@ -203,38 +212,44 @@ class GaitTestFunction(AbstractTestFunction):
                 for parameter_index, tangent in enumerate(tangents)
             ]
         )
-        basis, triangular_factor = jnp.linalg.qr(
+        orthonormal_basis, triangular_factor = jnp.linalg.qr(
             jnp.concatenate([scaled_tangents, jnp.eye(2, dtype=p.dtype)], 1).T
         )
         basis_coefficients = p[:, None] * jnp.linalg.inv(triangular_factor)
-        correction_coordinates = basis[:-2].T @ self.section_state(correction)
+        correction_coordinates = orthonormal_basis[:-2].T @ self.section_state(correction)
 
-        def measure_at_offset(offset: Array) -> Array:
-            parameter_change = basis_coefficients @ (offset - correction_coordinates)
-            displace_entry = lambda x, correction_entry, first_tangent, second_tangent: (
+        def measure_at_offset(basis_offset: Array) -> Array:
+            parameter_change = basis_coefficients @ (basis_offset - correction_coordinates)
+            displace_leaf = lambda x, correction_leaf, first_tangent, second_tangent: (
                 x
-                + correction_entry
+                + correction_leaf
                 + parameter_change[0] * first_tangent
                 + parameter_change[1] * second_tangent
             )
             return self.measure_step(
-                gait, jax.tree.map(displace_entry, z, correction, *tangents), p + parameter_change
+                branch_wheel,
+                jax.tree.map(displace_leaf, z, correction, *tangents),
+                p + parameter_change,
             )
 
-        difference = self.options.relative_difference
-        quantities_at_offsets = jax.vmap(measure_at_offset)(difference * jnp.eye(3, 2, -1, p.dtype))
-        quantity_gradients = (quantities_at_offsets[1:] - quantities_at_offsets[0]) / difference
+        difference_step = self.test_function_options.relative_difference_step
+        quantities_at_offsets = jax.vmap(measure_at_offset)(
+            difference_step * jnp.eye(3, 2, -1, p.dtype)
+        )
+        quantity_gradients = (
+            quantities_at_offsets[1:] - quantities_at_offsets[0]
+        ) / difference_step
         parameter_gradient = triangular_factor.T @ quantity_gradients / p[:, None]
         return quantities_at_offsets[
             0
         ] + correction_coordinates @ quantity_gradients, parameter_gradient
 
-    def with_parameters(self, gait: BranchWheel, p: Array) -> BranchWheel:
+    def with_parameters(self, branch_wheel: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with both parameters at p."""
-        params = gait.params
-        for name, value in zip(self.parameter_names, p, strict=True):
-            params = self.model.with_parameter(params, name, value)[1]
-        return gait._replace(params=params)
+        params = branch_wheel.params
+        for name, parameter_value in zip(self.parameter_names, p, strict=True):
+            params = self.model.with_parameter(params, name, parameter_value)[1]
+        return branch_wheel._replace(params=params)
 
     @property
     def gait_problem(self) -> CollocationProblem:
@@ -242,21 +257,27 @@ class GaitTestFunction(AbstractTestFunction):
         return CollocationProblem(
             system=self.system,
             parameter_name=self.parameter_names[0],
-            additional_quantities=_compute_continued_quantities,
+            compute_additional_quantities=_compute_continued_quantities,
         )
 
-    def measure_step(self, gait: BranchWheel, z: CollocationSolution, p: Array) -> Array:
+    def measure_step(self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array) -> Array:
         """Return the quantities of an event-driven step from the gait, in the order of
-        `quantities`.
+        `quantity_names`.
         """
-        params = self.with_parameters(gait, p).params
-        section_state = self.gait_problem.read_state(gait._replace(params=params), z, p[0])[0]
-        measures = measure_gait(self.model, params, section_state, self.step_options, 1)
+        params = self.with_parameters(branch_wheel, p).params
+        section_state = self.gait_problem.read_gait_state(
+            branch_wheel._replace(params=params), z, p[0]
+        )[0]
+        gait_measures = measure_gait(self.model, params, section_state, self.step_options, 1)
         measures_and_legs = [
-            (measures[name.partition("[")[0]], name.partition("[")[2]) for name in self.quantities
+            (gait_measures[name.partition("[")[0]], name.partition("[")[2])
+            for name in self.quantity_names
         ]
         return jnp.stack(
-            [measure[int(leg[:-1]) - 3] if leg else measure for measure, leg in measures_and_legs]
+            [
+                measure_value[int(leg_suffix[:-1]) - 3] if leg_suffix else measure_value
+                for measure_value, leg_suffix in measures_and_legs
+            ]
         )
 
     def section_state(self, z: CollocationSolution) -> SectionVector:
@@ -265,111 +286,122 @@ class GaitTestFunction(AbstractTestFunction):
     def correction_norm(self, z: CollocationSolution, correction: CollocationSolution) -> Scalar:
         return unbatch(compute_correction_norm)(z, correction)
 
-    def is_admissible(self, wheel: TestFunctionArgs, z: CollocationSolution, p: Array) -> Array:
-        is_nonnegative = z.durations > -self.options.duration_roundoff
-        return jnp.all(is_nonnegative | (wheel.gait.phase_active < 0.5))
+    def is_admissible(self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array) -> Array:
+        is_nonnegative = z.durations > -self.test_function_options.max_duration_roundoff
+        return jnp.all(is_nonnegative | (wheel.branch_wheel.is_phase_active < 0.5))
 
 
 @eqx.filter_jit
 def locate_jump_onset(
-    test_function: GaitTestFunction, gait: BranchWheel, z: CollocationSolution, p: Array
+    test_function: GaitTestFunction, branch_wheel: BranchWheel, z: CollocationSolution, p: Array
 ) -> tuple[Array, Array]:
-    """Return the parameters at which `DLS_VANISHES` meets `lambda_4_plus`, and their last relative
-    change.
+    """Return the parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
 
-    The search starts from a gait and parameters near that point. The equations of both curves are
-    singular if double support has zero duration. The equations of the same gait without double
-    support are regular, and the rear foot's force and its rate are both zero there.
+    The second result is the last relative change of the parameters. The search starts from a gait
+    and parameters near that point. The equations of both curves are singular if double support has
+    zero duration. The equations of the same gait without double support are regular, and the rear
+    foot's force and its rate are both zero.
     """
-    gait = gait._replace(phase_active=gait.phase_active.at[0, 0].set(0.0))
+    branch_wheel = branch_wheel._replace(
+        is_phase_active=branch_wheel.is_phase_active.at[0, 0].set(0.0)
+    )
     z = z._replace(durations=z.durations.at[0, 0].set(0.0))
     quantity_indices = [
-        jnp.asarray(CONTINUED_QUANTITIES.index(name)) for name in ("lambda_4_plus", FORCE_FALL_NAME)
+        jnp.asarray(CONTINUED_QUANTITIES.index(name))
+        for name in ("lambda_4_plus", INITIAL_FORCE_FALL_NAME)
     ]
 
     def take_newton_step(solution_and_parameters: tuple, _: None) -> tuple[tuple, Array]:
         z, p = solution_and_parameters
-        force, force_fall = (
-            test_function.linearize(TestFunctionArgs(gait, index), z, p)
-            for index in quantity_indices
+        force_step, force_fall_step = (
+            test_function.linearize(TestFunctionWheel(branch_wheel, quantity_index), z, p)
+            for quantity_index in quantity_indices
         )
-        gradients = jnp.stack([force.parameter_gradient, force_fall.parameter_gradient])
-        parameter_change = -jnp.linalg.solve(gradients, jnp.stack([force.value, force_fall.value]))
-        displace_entry = lambda x, correction_entry, first_tangent, second_tangent: (
+        quantity_gradients = jnp.stack(
+            [force_step.parameter_gradient, force_fall_step.parameter_gradient]
+        )
+        parameter_change = -jnp.linalg.solve(
+            quantity_gradients, jnp.stack([force_step.value, force_fall_step.value])
+        )
+        displace_leaf = lambda x, correction_leaf, first_tangent, second_tangent: (
             x
-            + correction_entry
+            + correction_leaf
             + parameter_change[0] * first_tangent
             + parameter_change[1] * second_tangent
         )
         return (
-            jax.tree.map(displace_entry, z, force.correction, *force.tangents),
+            jax.tree.map(displace_leaf, z, force_step.correction, *force_step.tangents),
             p + parameter_change,
         ), parameter_change / p
 
     (_, p), relative_changes = lax.scan(
-        take_newton_step, (z, p), None, length=test_function.options.n_codim2_iterations
+        take_newton_step,
+        (z, p),
+        None,
+        length=test_function.test_function_options.n_codim2_iterations,
     )
     return p, jnp.max(jnp.abs(relative_changes[-1]))
 
 
-def _continued_quantities(
-    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+def _stack_continued_quantities(
+    system: CollocationSystem, parameters: Array, is_phase_active: Array, z: CollocationSolution
 ) -> Array:
     """Return the `CONTINUED_QUANTITIES` of a collocated gait, in their order."""
-    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    wheel_symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
     (phase_points,) = system.evaluate_phase_points(parameters, z)[1]
-    return jnp.stack(list(_compute_continued_quantities(s, phase_points, z).values()))
+    return jnp.stack(list(_compute_continued_quantities(wheel_symbols, phase_points, z).values()))
 
 
 def _compute_continued_quantities(
-    s: Symbols, phase_points: Any, z: CollocationSolution
+    wheel_symbols: Symbols, phase_points: Any, z: CollocationSolution
 ) -> dict[str, Array]:
     """Return the `CONTINUED_QUANTITIES` of a step by name, from the points of its phases."""
     dls, sls1, sls2 = phase_points
-    landing = transitions.land(s, sls2.end.q[0], *sls2.end.v)
-    fore_force, rear_force = transitions.landing_forces(s, landing)
+    landing = transitions.land(wheel_symbols, sls2.end.q[0], *sls2.end.v)
+    fore_force, rear_force = transitions.landing_forces(wheel_symbols, landing)
     dls_duration, *other_durations = z.durations[0]
-    forces = landing.rear_impulse.normal, fore_force.normal, rear_force.normal
-    values = (
-        *forces,
+    landing_forces = landing.rear_impulse.normal, fore_force.normal, rear_force.normal
+    quantity_values = (
+        *landing_forces,
         *other_durations,
-        compute_takeoff_acceleration(s, sls1),
-        *_force_decrease_rates(s, dls, dls_duration),
+        compute_takeoff_acceleration(wheel_symbols, sls1),
+        *_compute_force_decrease_rates(wheel_symbols, dls, dls_duration),
     )
-    return dict(zip(CONTINUED_QUANTITIES, values, strict=True))
+    return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
 
 
-def _force_decrease_rates(s: Symbols, dls: PhasePoints, dls_duration: Array) -> tuple[Array, Array]:
+def _compute_force_decrease_rates(
+    s: Symbols, dls: PhasePoints, dls_duration: Array
+) -> tuple[Array, Array]:
     """Return the initial and the mean rate at which the rear foot's force decreases in DLS, N/s."""
-    phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
+    dls_phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 
     def make_instant(theta: Array, dtheta: Array) -> PhaseInstant:
-        return PhaseInstant(phase, phase.motion_at((theta,), (dtheta,)), None)
+        return PhaseInstant(dls_phase, dls_phase.motion_at((theta,), (dtheta,)), None)
 
-    rear_force = lambda *at: phase.end_guard(make_instant(*at))
+    compute_rear_force = lambda *state: dls_phase.end_guard(make_instant(*state))
     start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
-    rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
-    first_force, force_rate = jax.jvp(rear_force, start_state, rates)
-    mean_decrease_rate = (first_force - rear_force(*end_state)) / jnp.where(
+    state_rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
+    first_force, force_rate = jax.jvp(compute_rear_force, start_state, state_rates)
+    mean_decrease_rate = (first_force - compute_rear_force(*end_state)) / jnp.where(
         dls_duration == 0.0, 1.0, dls_duration
     )
     return -force_rate, mean_decrease_rate
 
 
-def _trial_monodromy(
-    system: CollocationSystem, parameters: Array, phase_active: Array, z: CollocationSolution
+def _compute_trial_monodromy(
+    system: CollocationSystem, parameters: Array, is_phase_active: Array, z: CollocationSolution
 ) -> Array:
     """Return the monodromy matrix of a trial solution."""
     collocation_state = CollocationState(
-        z, phase_active, *init_search_flags(system, z.section_state)
+        z, is_phase_active, *init_search_flags(system, z.section_state)
     )
     return system.linearize_at(parameters, collocation_state).monodromy
 
 
-QUANTITY_FUNCTIONS = {
-    CONTINUED_QUANTITIES: _continued_quantities,
-    BIFURCATION_NAMES: _trial_monodromy,
+QUANTITY_FUNCTION_BY_GROUP = {
+    CONTINUED_QUANTITIES: _stack_continued_quantities,
+    BIFURCATION_NAMES: _compute_trial_monodromy,
 }
-"""Functions that compute the quantities of a test function without an event-driven step, by
-group.
-"""
+"""Function that computes the quantities of a test function without an event-driven step, by the
+group of quantities."""

@@ -17,7 +17,7 @@ from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, wheel_from_pa
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 
-DEFAULT_BOUNDS: ParameterBounds = {
+DEFAULT_PARAMETER_BOUNDS: ParameterBounds = {
     "damping": (1.0, 250.0),
     "stiffness": (200.0, 1200.0),
     "natural_length": (1.001, 1.06),
@@ -40,7 +40,7 @@ def continue_special_point(
     `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
     as "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point
     is searched for along the first parameter from the gait, then along the second. It is continued
-    within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_BOUNDS`, through
+    within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`, through
     turning points. The curve ends when it closes or leaves the bounds, or when the gaits end. Each
     point is accurate to 1e-9. `codim2_points` are the points at which other special points occur.
     On the curve of an indicator these are other indicators and bifurcations, on other curves also
@@ -74,27 +74,28 @@ def continue_special_point(
 
 
 def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
-    """Return the names of the two parameters and their ranges, shape (2, 2); raise an error if
-    they are invalid.
+    """Return the names of the two parameters and their ranges, shape (2, 2).
+
+    Raise TypeError or ValueError if names or bounds are invalid.
     """
     check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
-    all_bounds = {**DEFAULT_BOUNDS, **(bounds or {})}
-    parameter_pair = check_names("parameters", parameters)
+    all_bounds = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
+    parameter_names = check_names("parameters", parameters)
     for name in all_bounds:
         check_parameter_name(name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
-    for name in parameter_pair:
+    for name in parameter_names:
         check_parameter_name(name, tuple(all_bounds), "parameter with bounds")
-    if len(parameter_pair) != 2 or len(set(parameter_pair)) != 2:
+    if len(parameter_names) != 2 or len(set(parameter_names)) != 2:
         raise ValueError(
-            f"parameters are {parameter_pair}, but a curve needs two different ones: write "
+            f"parameters are {parameter_names}, but a curve needs two different ones: write "
             "('damping', 'slope')."
         )
     parameter_ranges = {
         name: check_range(f"bounds[{name!r}]", bound_pair)
         for name, bound_pair in all_bounds.items()
     }
-    return (parameter_pair[0], parameter_pair[1]), np.array(
-        [parameter_ranges[name] for name in parameter_pair], float
+    return (parameter_names[0], parameter_names[1]), np.array(
+        [parameter_ranges[name] for name in parameter_names], float
     )
 
 
@@ -120,18 +121,21 @@ def continue_special_points(
     step_options = StepOptions.tight() if step_options is None else step_options
     check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
-    tracer = CurveTracer(parameters, parameter_ranges, cycle.model, options, step_options)
+    curve_tracer = CurveTracer(parameters, parameter_ranges, cycle.model, options, step_options)
     params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
     seeds_by_name: dict[str, CurveSeed] = {}
-    for axis, parameter in enumerate(parameters):
+    for parameter_index, parameter in enumerate(parameters):
         if set(names) - set(seeds_by_name):
-            seeds = tracer.find_seeds(axis, jax.tree.map(lambda x: x[None], params))
+            curve_seeds = curve_tracer.find_seeds(
+                parameter_index, jax.tree.map(lambda x: x[None], params)
+            )
             start_value = float(getattr(params, parameter))
-            tracing_order = np.argsort(
-                [-abs(seed.parameter_values[axis] - start_value) for seed in seeds]
+            distance_order = np.argsort(
+                [-abs(seed.parameter_values[parameter_index] - start_value) for seed in curve_seeds]
             )
             seeds_by_name = {
-                seeds[seed_index].name: seeds[seed_index] for seed_index in tracing_order
+                curve_seeds[seed_index].special_point_name: curve_seeds[seed_index]
+                for seed_index in distance_order
             } | seeds_by_name
     missing_names = sorted(set(names) - set(seeds_by_name))
     if missing_names:
@@ -142,8 +146,8 @@ def continue_special_points(
             "bounds."
         )
     curves_by_name = {
-        traced_curve.curve.name: traced_curve.curve
-        for traced_curve in tracer.trace_curves([seeds_by_name[name] for name in names], ())
+        traced_curve.special_point_curve.name: traced_curve.special_point_curve
+        for traced_curve in curve_tracer.trace_curves([seeds_by_name[name] for name in names], ())
     }
     lost_names = sorted(set(names) - set(curves_by_name))
     if lost_names:

@@ -15,15 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, COARSE_MESH_NAME
+from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, COARSE_MESH_END_NAME
 from vrw_jax.branches.curve_tracing import (
     DEFAULT_CURVE_OPTIONS,
     CurveSeed,
     CurveTracer,
     TracedCurve,
-    distance_to_polyline,
+    compute_distances_to_polyline,
 )
-from vrw_jax.branches.gait_test_functions import DLS_VANISHES, LINEAR_SUBSTITUTES
+from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
 from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import ViscoelasticWheel
@@ -34,255 +34,325 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 @dataclass(frozen=True)
-class MapOptions:
-    """Options of the map of special points; distances are in cells of the scan.
+class SpecialPointMapOptions:
+    """Options of the map of special points. Distances are in cells of the scan.
 
-    - `n_lines`: number of parallel branches along each parameter with which the map starts;
+    - `n_parallel_branches`: number of parallel branches along each parameter with which the map
+      starts;
     - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
     - `max_search_rounds`: largest number of rounds in which changes of sign are examined;
-    - `max_explained_distance`: largest distance of a change of sign from a curve that explains it;
-    - `min_change_distance`: smallest distance between changes that are examined.
+    - `max_explained_distance`: largest distance of a change of sign from a curve that explains the
+      change;
+    - `min_examined_distance`: smallest distance between changes that are examined.
     """
 
-    n_lines: int = 5
+    n_parallel_branches: int = 5
     n_meeting_rounds: int = 3
     max_search_rounds: int = 8
     max_explained_distance: float = 1.0
-    min_change_distance: float = 5.0
+    min_examined_distance: float = 5.0
 
 
-MAP_OPTIONS = MapOptions()
+SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
 """Options of all maps of special points."""
 
-GAIT_CHANGE = "gait"
-"""Name of a change between a sample with a gait and one without."""
+GAIT_CHANGE_NAME = "gait"
+"""Name of a change between a sample with a gait and a sample without one."""
 
-STABILITY_CHANGE = "spectral_radius"
+STABILITY_CHANGE_NAME = "spectral_radius"
 """Name of a change between a stable and an unstable gait."""
 
-SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE)
+SPECIAL_POINT_MEASURES = ("lambda_4_plus", STABILITY_CHANGE_NAME)
 """Measures of a scan whose zeros indicate special points, in addition to the margins of every
-scan.
-"""
+scan."""
 
-EXPLAINING_CURVES: Mapping[str, tuple[str, ...]] = {
-    GAIT_CHANGE: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
-    STABILITY_CHANGE: BIFURCATION_NAMES,
-    "lambda_4_plus": ("lambda_4_plus", DLS_VANISHES),
-    **{exact: (name,) for name, exact in LINEAR_SUBSTITUTES.items()},
+EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
+    GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
+    STABILITY_CHANGE_NAME: BIFURCATION_NAMES,
+    "lambda_4_plus": ("lambda_4_plus", DLS_VANISHING_NAME),
+    **{exact: (name,) for name, exact in LINEAR_MARGIN_SUBSTITUTES.items()},
 }
-"""Names of the curves that explain a change, if they are not the curve of the same name."""
+"""Names of the curves that explain a change of sign, if they are not the curve of the same name."""
 
 
-class UnexplainedChange(NamedTuple):
-    """Change of sign between two neighboring samples of a scan that no curve explains."""
+class ScanSignChange(NamedTuple):
+    """Change of sign between two neighboring samples of a scan."""
 
-    name: str
-    axis: int
-    sample: tuple[int, int]  # indices of the first sample, which has a gait
-    cell_position: tuple[float, float]  # position of the change in cells of the scan
+    quantity_name: str
+    parameter_index: int
+    sample_indices: tuple[int, int]  # indices of the first sample, which has a gait
+    position_in_cells: tuple[float, float]  # position of the change in cells of the scan
 
 
 @with_default_settings
 def trace_special_points(
-    scan: xr.Dataset,
+    scan_dataset: xr.Dataset,
     params: WheelParams,
     model: ViscoelasticWheel,
     on_stage: Callable[[str], None] | None = None,
-    options: MapOptions = MAP_OPTIONS,
-) -> tuple[tuple[SpecialPointCurve, ...], tuple[UnexplainedChange, ...]]:
-    """Return all curves of special points over the parameters of a scan, and the unexplained
+    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
+) -> tuple[tuple[SpecialPointCurve, ...], tuple[ScanSignChange, ...]]:
+    """Return all curves of special points over the parameters of a scan, and unexplained sign
     changes.
 
-    The scan contains `SPECIAL_POINT_MEASURES` and margins. A change between its samples is
+    The scan contains `SPECIAL_POINT_MEASURES` and margins. A change of sign between two samples is
     unexplained if no curve is near it. `on_stage` is called with a description of each stage.
     """
-    names = tuple(map(str, scan.outcome.dims))
+    parameter_names = tuple(map(str, scan_dataset.outcome.dims))
     parameter_ranges = np.array(
-        [(scan[name].values[0], scan[name].values[-1]) for name in names], float
+        [(scan_dataset[name].values[0], scan_dataset[name].values[-1]) for name in parameter_names],
+        float,
     )
-    tracer = CurveTracer(
-        (names[0], names[1]),
+    curve_tracer = CurveTracer(
+        (parameter_names[0], parameter_names[1]),
         parameter_ranges,
         model,
         DEFAULT_CURVE_OPTIONS,
         StepOptions.tight(),
         on_stage,
     )
-    seeds = find_seeds_on_middle_lines(tracer, params, options)
-    curves = _trace_all(tracer, seeds, [], options)
-    changes = find_sign_changes(scan, tracer.parameters)
-    examined_changes: list[UnexplainedChange] = []
-    remaining_changes = lambda: find_unexplained_changes(
-        changes, [curve.curve for curve in curves], scan, options
+    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params, map_options)
+    traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [], map_options)
+    sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
+    examined_changes: list[ScanSignChange] = []
+    find_remaining_changes = lambda: find_unexplained_changes(
+        sign_changes,
+        [curve.special_point_curve for curve in traced_curves],
+        scan_dataset,
+        map_options,
     )
-    for _ in range(options.max_search_rounds):
-        new_changes = _select_distant_changes(remaining_changes(), examined_changes, options)
+    for _ in range(map_options.max_search_rounds):
+        new_changes = _select_distant_changes(
+            find_remaining_changes(), examined_changes, map_options
+        )
         if not new_changes:
             break
         examined_changes += new_changes
-        seeds = []
-        for axis in range(2):
-            wheels = []
-            for change in new_changes:
-                if change.axis == axis:
-                    indices = zip(tracer.parameters, change.sample, strict=True)
-                    values = {
-                        name: float(scan[name][change_index]) for name, change_index in indices
+        curve_seeds = []
+        for parameter_index in range(2):
+            changed_wheels = []
+            for sign_change in new_changes:
+                if sign_change.parameter_index == parameter_index:
+                    parameter_sample_indices = zip(
+                        curve_tracer.parameter_names, sign_change.sample_indices, strict=True
+                    )
+                    sample_parameters = {
+                        name: float(scan_dataset[name][change_index])
+                        for name, change_index in parameter_sample_indices
                     }
-                    wheels.append(tracer.with_parameters(params, values))
-            seeds += _find_seeds_on_branches(tracer, axis, wheels, options.n_lines)
-        curves = _trace_all(tracer, seeds, curves, options)
-    return tuple(curve.curve for curve in curves), tuple(remaining_changes())
+                    changed_wheels.append(curve_tracer.with_parameters(params, sample_parameters))
+            curve_seeds += _find_seeds_in_batches(
+                curve_tracer, parameter_index, changed_wheels, map_options.n_parallel_branches
+            )
+        traced_curves = _trace_curves_and_meetings(
+            curve_tracer, curve_seeds, traced_curves, map_options
+        )
+    return tuple(curve.special_point_curve for curve in traced_curves), tuple(
+        find_remaining_changes()
+    )
 
 
-def _trace_all(
-    tracer: CurveTracer, seeds: list[CurveSeed], curves: list[TracedCurve], options: MapOptions
+def _trace_curves_and_meetings(
+    curve_tracer: CurveTracer,
+    curve_seeds: list[CurveSeed],
+    traced_curves: list[TracedCurve],
+    map_options: SpecialPointMapOptions,
 ) -> list[TracedCurve]:
-    """Return the curves, and those through the seeds and through special points on them."""
-    for _ in range(options.n_meeting_rounds):
-        new_curves = tracer.trace_curves(seeds, curves)
+    """Return known curves, and curves through the seeds and through special points on new
+    curves.
+    """
+    for _ in range(map_options.n_meeting_rounds):
+        new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
         known_curves = [
             curve
-            for curve in curves
-            if not any(tracer.is_same_curve(curve, new_curve) for new_curve in new_curves)
+            for curve in traced_curves
+            if not any(curve_tracer.are_same_curve(curve, new_curve) for new_curve in new_curves)
         ]
-        curves = [*known_curves, *new_curves]
-        seeds = [seed for curve in new_curves for seed in curve.new_seeds]
-    return curves
+        traced_curves = [*known_curves, *new_curves]
+        curve_seeds = [seed for curve in new_curves for seed in curve.meeting_seeds]
+    return traced_curves
 
 
-def find_seeds_on_middle_lines(
-    tracer: CurveTracer, params: WheelParams, options: MapOptions = MAP_OPTIONS
+def find_seeds_on_parallel_lines(
+    curve_tracer: CurveTracer,
+    params: WheelParams,
+    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
 ) -> list[CurveSeed]:
-    """Return seeds on the branches through wheels on the middle lines of both ranges."""
-    seeds, midpoints, n_lines = [], tracer.parameter_ranges.mean(1), options.n_lines
-    for axis, name in enumerate(tracer.parameters):
-        lower, upper = tracer.parameter_ranges[1 - axis]
-        line_values = lower + (np.arange(n_lines) + 0.5) / n_lines * (upper - lower)
-        other_parameter = tracer.parameters[1 - axis]
-        wheels = [
-            tracer.with_parameters(params, {name: midpoints[axis], other_parameter: coordinate})
-            for coordinate in line_values
+    """Return seeds on branches that cross the middle line of each range at evenly spaced values."""
+    curve_seeds, midpoints, n_lines = (
+        [],
+        curve_tracer.parameter_ranges.mean(1),
+        map_options.n_parallel_branches,
+    )
+    for parameter_index, name in enumerate(curve_tracer.parameter_names):
+        lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
+        line_values = lower_bound + (np.arange(n_lines) + 0.5) / n_lines * (
+            upper_bound - lower_bound
+        )
+        other_parameter = curve_tracer.parameter_names[1 - parameter_index]
+        line_wheels = [
+            curve_tracer.with_parameters(
+                params, {name: midpoints[parameter_index], other_parameter: line_value}
+            )
+            for line_value in line_values
         ]
-        seeds += _find_seeds_on_branches(tracer, axis, wheels, n_lines)
-    return seeds
+        curve_seeds += _find_seeds_in_batches(curve_tracer, parameter_index, line_wheels, n_lines)
+    return curve_seeds
 
 
-def _find_seeds_on_branches(
-    tracer: CurveTracer, axis: int, wheels: list[WheelParams], batch_size: int
+def _find_seeds_in_batches(
+    curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams], batch_size: int
 ) -> list[CurveSeed]:
-    """Return seeds on branches, which are continued in batches of one size so that one program
-    is compiled.
+    """Return seeds on branches that are continued in batches of one size.
+
+    With one size, only one program is compiled.
     """
-    seeds = []
+    curve_seeds = []
     for first_wheel in range(0, len(wheels), batch_size):
         wheel_group = wheels[first_wheel : first_wheel + batch_size]
         padded_wheels = [*wheel_group, *wheel_group[-1:] * (batch_size - len(wheel_group))]
-        seeds += tracer.find_seeds(axis, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels))
-    return seeds
+        curve_seeds += curve_tracer.find_seeds(
+            parameter_index, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels)
+        )
+    return curve_seeds
 
 
-def _select_signed_quantities(scan: xr.Dataset, dims: tuple[str, str]) -> dict[str, np.ndarray]:
+def _collect_signed_quantities(
+    scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
+) -> dict[str, np.ndarray]:
     """Return the quantities whose signs may change, as arrays over the two parameters."""
-    quantities = {"lambda_4_plus": scan.lambda_4_plus.transpose(*dims).values}
-    quantities[STABILITY_CHANGE] = 1.0 - scan[STABILITY_CHANGE].transpose(*dims).values
-    for name in (name for name in MARGIN_MEASURES if name not in LINEAR_SUBSTITUTES):
-        values = scan[name].transpose(*dims, ...).values
-        leg_numbers = scan.leg.values if MARGIN_MEASURES[name].dimension else []
-        quantities |= {f"{name}[{leg}]": values[..., i] for i, leg in enumerate(leg_numbers)}
+    signed_quantities = {
+        "lambda_4_plus": scan_dataset.lambda_4_plus.transpose(*parameter_names).values
+    }
+    signed_quantities[STABILITY_CHANGE_NAME] = (
+        1.0 - scan_dataset[STABILITY_CHANGE_NAME].transpose(*parameter_names).values
+    )
+    for name in (name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES):
+        measure_values = scan_dataset[name].transpose(*parameter_names, ...).values
+        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[name].dimension else []
+        signed_quantities |= {
+            f"{name}[{leg}]": measure_values[..., i] for i, leg in enumerate(leg_numbers)
+        }
         if not MARGIN_MEASURES[name].dimension:
-            quantities[name] = values
-    return quantities
+            signed_quantities[name] = measure_values
+    return signed_quantities
 
 
-def find_sign_changes(scan: xr.Dataset, dims: tuple[str, str]) -> list[UnexplainedChange]:
+def find_sign_changes_in_scan(
+    scan_dataset: xr.Dataset, parameter_names: tuple[str, str]
+) -> list[ScanSignChange]:
     """Return the changes of sign between all neighboring samples.
 
     Changes of measures count only if both samples, or none, have double support.
     """
-    outcome = scan.outcome.transpose(*dims).values
-    is_found, is_coarse = outcome == Outcome.STEPPED, outcome == Outcome.MESH_TOO_COARSE
-    quantities, changes = _select_signed_quantities(scan, dims), []
-    quantities[GAIT_CHANGE] = np.where(is_found, 1.0, np.where(is_coarse, np.nan, -1.0))
-    quantities[COARSE_MESH_NAME] = np.where(is_found, 1.0, np.where(is_coarse, -1.0, np.nan))
-    for axis in range(2):
-        neighbor_indices = lambda x, axis=axis: (
-            np.moveaxis(x, axis, 0)[:-1],
-            np.moveaxis(x, axis, 0)[1:],
+    outcome_codes = scan_dataset.outcome.transpose(*parameter_names).values
+    has_gait, has_coarse_mesh = (
+        outcome_codes == Outcome.STEPPED,
+        outcome_codes == Outcome.MESH_TOO_COARSE,
+    )
+    signed_quantities, sign_changes = _collect_signed_quantities(scan_dataset, parameter_names), []
+    signed_quantities[GAIT_CHANGE_NAME] = np.where(
+        has_gait, 1.0, np.where(has_coarse_mesh, np.nan, -1.0)
+    )
+    signed_quantities[COARSE_MESH_END_NAME] = np.where(
+        has_gait, 1.0, np.where(has_coarse_mesh, -1.0, np.nan)
+    )
+    for parameter_index in range(2):
+        get_neighbor_values = lambda x, parameter_index=parameter_index: (
+            np.moveaxis(x, parameter_index, 0)[:-1],
+            np.moveaxis(x, parameter_index, 0)[1:],
         )
-        move_axis_first = lambda a, b, axis=axis: (a, b) if axis == 0 else (b, a)
-        first_found, second_found = neighbor_indices(is_found)
-        has_same_double_support = np.equal(*neighbor_indices(quantities["lambda_4_plus"] > 0.0))
-        for name, quantity_values in quantities.items():
-            first_values, second_values = neighbor_indices(quantity_values)
-            changes_sign = first_values * second_values < 0.0
-            if name not in (GAIT_CHANGE, COARSE_MESH_NAME):
-                changes_sign &= (
+        order_by_parameter = lambda a, b, parameter_index=parameter_index: (
+            (a, b) if parameter_index == 0 else (b, a)
+        )
+        first_found, second_found = get_neighbor_values(has_gait)
+        has_same_double_support = np.equal(
+            *get_neighbor_values(signed_quantities["lambda_4_plus"] > 0.0)
+        )
+        for name, quantity_values in signed_quantities.items():
+            first_values, second_values = get_neighbor_values(quantity_values)
+            has_sign_change = first_values * second_values < 0.0
+            if name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
+                has_sign_change &= (
                     first_found
                     & second_found
                     & (has_same_double_support | (name == "lambda_4_plus"))
                 )
-            for i, j in np.argwhere(changes_sign):
-                fraction = first_values[i, j] / (first_values[i, j] - second_values[i, j])
-                sample = move_axis_first(int(i if first_found[i, j] else i + 1), int(j))
-                changes.append(
-                    UnexplainedChange(
-                        name, axis, sample, move_axis_first(float(i + fraction), float(j))
+            for i, j in np.argwhere(has_sign_change):
+                zero_fraction = first_values[i, j] / (first_values[i, j] - second_values[i, j])
+                sample_indices = order_by_parameter(int(i if first_found[i, j] else i + 1), int(j))
+                sign_changes.append(
+                    ScanSignChange(
+                        name,
+                        parameter_index,
+                        sample_indices,
+                        order_by_parameter(float(i + zero_fraction), float(j)),
                     )
                 )
-    return changes
+    return sign_changes
 
 
 def find_unexplained_changes(
-    changes: Sequence[UnexplainedChange],
-    curves: Sequence[SpecialPointCurve],
-    scan: xr.Dataset,
-    options: MapOptions = MAP_OPTIONS,
-) -> list[UnexplainedChange]:
+    sign_changes: Sequence[ScanSignChange],
+    special_point_curves: Sequence[SpecialPointCurve],
+    scan_dataset: xr.Dataset,
+    map_options: SpecialPointMapOptions = SPECIAL_POINT_MAP_OPTIONS,
+) -> list[ScanSignChange]:
     """Return the changes that are near no curve that can explain them."""
     remaining_changes = []
-    for name in sorted({change.name for change in changes}):
-        changes_of_name = [change for change in changes if change.name == name]
-        explaining_curves = [
-            curve for curve in curves if curve.name in EXPLAINING_CURVES.get(name, (name,))
+    for name in sorted({sign_change.quantity_name for sign_change in sign_changes}):
+        named_changes = [
+            sign_change for sign_change in sign_changes if sign_change.quantity_name == name
         ]
-        changes_in_cells = np.array([change.cell_position for change in changes_of_name])
-        distances = np.full(len(changes_of_name), np.inf)
+        explaining_curves = [
+            curve
+            for curve in special_point_curves
+            if curve.name in EXPLAINING_CURVE_NAMES.get(name, (name,))
+        ]
+        change_positions = np.array(
+            [sign_change.position_in_cells for sign_change in named_changes]
+        )
+        curve_distances = np.full(len(named_changes), np.inf)
         for curve in explaining_curves:
-            axes = zip(curve.values.T, curve.parameters, strict=True)
-            curve_in_cells = [
-                np.interp(values_of_axis, scan[n_samples].values, np.arange(scan.sizes[n_samples]))
-                for values_of_axis, n_samples in axes
+            values_and_names = zip(curve.values.T, curve.parameters, strict=True)
+            curve_positions = [
+                np.interp(
+                    curve_parameter_values,
+                    scan_dataset[parameter_name].values,
+                    np.arange(scan_dataset.sizes[parameter_name]),
+                )
+                for curve_parameter_values, parameter_name in values_and_names
             ]
-            distances = np.minimum(
-                distances, distance_to_polyline(changes_in_cells, np.stack(curve_in_cells, -1))
+            curve_distances = np.minimum(
+                curve_distances,
+                compute_distances_to_polyline(change_positions, np.stack(curve_positions, -1)),
             )
         remaining_changes += [
-            change
-            for change, distance_to_curve in zip(changes_of_name, distances, strict=True)
-            if distance_to_curve > options.max_explained_distance
+            sign_change
+            for sign_change, curve_distance in zip(named_changes, curve_distances, strict=True)
+            if curve_distance > map_options.max_explained_distance
         ]
     return remaining_changes
 
 
 def _select_distant_changes(
-    remaining_changes: Sequence[UnexplainedChange],
-    examined_changes: Sequence[UnexplainedChange],
-    options: MapOptions,
-) -> list[UnexplainedChange]:
+    remaining_changes: Sequence[ScanSignChange],
+    examined_changes: Sequence[ScanSignChange],
+    map_options: SpecialPointMapOptions,
+) -> list[ScanSignChange]:
     """Return changes of each name that are distant from each other and from the examined ones."""
-    selected_changes: list[UnexplainedChange] = []
-    for change in remaining_changes:
+    selected_changes: list[ScanSignChange] = []
+    for sign_change in remaining_changes:
         changes_of_same_name = [
             other_change
             for other_change in (*examined_changes, *selected_changes)
-            if (other_change.name, other_change.axis) == (change.name, change.axis)
+            if (other_change.quantity_name, other_change.parameter_index)
+            == (sign_change.quantity_name, sign_change.parameter_index)
         ]
         if all(
-            np.hypot(*np.subtract(other_change.cell_position, change.cell_position))
-            > options.min_change_distance
+            np.hypot(*np.subtract(other_change.position_in_cells, sign_change.position_in_cells))
+            > map_options.min_examined_distance
             for other_change in changes_of_same_name
         ):
-            selected_changes.append(change)
+            selected_changes.append(sign_change)
     return selected_changes

@@ -10,8 +10,8 @@ import numpy as np
 
 from vrw_jax.branches import (
     SPECIAL_POINT_MEASURES,
+    ScanSignChange,
     SpecialPointCurve,
-    UnexplainedChange,
     trace_special_points,
 )
 from vrw_jax.numerics import StepOptions
@@ -39,7 +39,7 @@ class SpecialPointMap(NamedTuple):
 
     scan: xr.Dataset
     curves: tuple[SpecialPointCurve, ...]
-    unexplained_changes: tuple[UnexplainedChange, ...]
+    unexplained_changes: tuple[ScanSignChange, ...]
 
     @property
     def ending(self) -> str:
@@ -52,9 +52,11 @@ class SpecialPointMap(NamedTuple):
         for change in self.unexplained_changes:
             values = [
                 float(self.scan[name][leg_index])
-                for name, leg_index in zip(self.scan.outcome.dims, change.sample, strict=True)
+                for name, leg_index in zip(
+                    self.scan.outcome.dims, change.sample_indices, strict=True
+                )
             ]
-            lines.append(f"    {change.name} at ({values[0]:.6g}, {values[1]:.6g})")
+            lines.append(f"    {change.quantity_name} at ({values[0]:.6g}, {values[1]:.6g})")
         return "\n\n".join([*map(str, self.curves), "\n".join(lines)])
 
     def __repr__(self) -> str:
