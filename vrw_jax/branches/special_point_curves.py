@@ -39,12 +39,12 @@ def continue_special_point(
 
     `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
     as "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point
-    is searched for along the first parameter from the gait, then along the second. It is continued
-    within `bounds` of the two, by default `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`, through
-    turning points. The curve ends when it closes or leaves the bounds, or when the gaits end. Each
-    point is accurate to 1e-9. `codim2_points` are the points at which other special points occur.
-    On the curve of an indicator these are other indicators and bifurcations, on other curves also
-    margins.
+    is searched for along the first parameter from the gait, then along the second. The curve is
+    continued through turning points, within `bounds` of the two parameters. The default bounds are
+    `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The curve ends when it closes or
+    leaves the bounds, or when the gaits end. Each point is accurate to 1e-9. `codim2_points` are
+    the points at which other special points occur. On the curve of an indicator these are other
+    indicators and bifurcations, on other curves also margins.
 
     Args:
         name: name of the special point.
