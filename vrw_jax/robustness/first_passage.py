@@ -1,23 +1,28 @@
 """Mean number of steps until a wheel fails on uneven ground (first-passage time)."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import limit_cycle, resolve_model
 from vrw_jax.models import PassageMethod
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions
+from vrw_jax.numerics import Scalar, StatusCode, StepOptions, zero_tangent
 from vrw_jax.printing import AbstractPrintable, TextRow, describe_ending
+from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
 from vrw_jax.validation import check_int, check_not_traced, check_positive, is_traced
-from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 
 MAX_QUADRATURE_NODES = 3200
 """Largest number of quadrature nodes, chosen because a matrix of this size takes 80 MB."""
@@ -25,6 +30,9 @@ MAX_QUADRATURE_NODES = 3200
 SAMPLED_STEP_TOLERANCE = 1e-6
 """Tolerance of sampled steps. The value is chosen because the error of an event time is then small:
 a ten-thousandth of the standard deviation that random slopes cause."""
+
+SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
+"""Remedy for a sampled computation inside `jit` or `vmap`."""
 
 
 class PassageStatus(StatusCode):
@@ -140,6 +148,11 @@ def first_passage(
     number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
     confidence interval.
 
+    `jax.grad` of a sampled mean returns first derivatives with an error of some per cent. A walk
+    fails beyond a radius in the space of slopes, and this radius is a smooth function of the
+    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. They need known
+    numbers, so that `jit`, `vmap` and `tune` do not accept sampled means.
+
     Args:
         params: the wheel, whose slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
@@ -174,19 +187,68 @@ def first_passage(
         return _solve_passage_by_quadrature(
             params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
         )
-    check_not_traced("vrw.first_passage", "take the rigid wheel", params, slope_sd)
+    check_not_traced("vrw.first_passage", "differentiate by the wheel only", resolved_model)
     if options is None:
         options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
-    return _estimate_passage_by_sampling(
-        params,
-        float(slope_sd),
-        resolved_model,
-        check_options(options),
+    estimate_passage = functools.partial(
+        _estimate_passage_by_sampling,
+        model=resolved_model,
+        options=check_options(options),
         seed=seed,
         n_walkers=n_walkers,
         relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
+    if not is_traced(params, slope_sd):
+        return estimate_passage(params, float(slope_sd))[0]
+    return _estimate_differentiable_passage(estimate_passage, params, slope_sd)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _estimate_differentiable_passage(
+    estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
+    params: WheelParams,
+    slope_sd: Any,
+) -> FirstPassage:
+    """Return sampled first-passage times, with first derivatives of the means.
+
+    Raise TypeError if the numbers of the wheel are unknown, as inside `jit` and `vmap`.
+    """
+    check_not_traced("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    return estimate_passage(params, float(slope_sd))[0]
+
+
+@functools.partial(_estimate_differentiable_passage.defjvp, symbolic_zeros=True)
+def _differentiate_passage(
+    estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
+    primals: tuple[WheelParams, Any],
+    tangents: tuple[WheelParams, Any],
+) -> tuple[FirstPassage, FirstPassage]:
+    """Return sampled first-passage times and their tangents."""
+    params, slope_sd = primals
+    check_not_traced("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    params_tangent, slope_sd_tangent = tangents
+    tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
+    tangent_by_name["slope_sd"] = slope_sd_tangent
+    tangent_by_name = {
+        name: tangent
+        for name, tangent in tangent_by_name.items()
+        if not isinstance(tangent, SymbolicZero)
+    }
+    passage, gradient = estimate_passage(
+        params, float(slope_sd), differentiated_names=tuple(tangent_by_name)
+    )
+    relative_tangent = sum(gradient[name] * tangent for name, tangent in tangent_by_name.items())
+    passage_tangent = eqx.tree_at(
+        lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
+        zero_tangent(passage),
+        (
+            passage.mean_steps * relative_tangent,
+            passage.mean_steps_from_gait * relative_tangent,
+            -passage.failure_probability * relative_tangent,
+        ),
+    )
+    return passage, passage_tangent
 
 
 def _solve_passage_by_quadrature(
@@ -255,9 +317,11 @@ def _estimate_passage_by_sampling(
     n_walkers: int,
     relative_tolerance: float,
     max_steps: int,
-) -> FirstPassage:
+    differentiated_names: tuple[str, ...] = (),
+) -> tuple[FirstPassage, dict[str, float]]:
     """Return the first-passage times of a model by sampled walks.
 
+    Return also the derivatives of the logarithm of `mean_steps`, by the names of the parameters.
     Raise ValueError if the wheel has no gait, or if hardly any step succeeds.
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
@@ -280,6 +344,11 @@ def _estimate_passage_by_sampling(
             f"slope_sd is {slope_sd:g} rad, with which hardly any step of this wheel succeeds: "
             "give a smaller one."
         ) from error
+    gradient = {}
+    if differentiated_names:
+        gradient = differentiate_log_mean_steps(
+            walker_groups, sampled_passage.walk_density, differentiated_names
+        )
     failure_probability = sampled_passage.failure_probability
     mean_steps = 1.0 / failure_probability if failure_probability else np.inf
     is_within_tolerance = sampled_passage.relative_error <= relative_tolerance
@@ -288,7 +357,7 @@ def _estimate_passage_by_sampling(
     )
     passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
     to_float_array = lambda values: jnp.asarray(values, params.damping.dtype)
-    return FirstPassage(
+    passage = FirstPassage(
         mean_steps=to_float_array(mean_steps),
         mean_steps_from_gait=to_float_array(sampled_passage.mean_steps_from_gait),
         failure_probability=to_float_array(failure_probability),
@@ -308,3 +377,4 @@ def _estimate_passage_by_sampling(
         end_names=tuple(sampled_passage.fraction_by_outcome),
         n_steps=sampled_passage.n_sampled_steps,
     )
+    return passage, gradient

@@ -88,6 +88,9 @@ class SampledPassage(NamedTuple):
     quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
     fraction_by_outcome: dict[str, float]
     n_sampled_steps: int
+    walk_density: (
+        GaussianMixture  # of the slope deviations of walks that may fail in their last step
+    )
 
 
 class WalkerGroups:
@@ -234,18 +237,23 @@ def sample_passage(
         step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
     )
     walker_groups.weight_by_outcome.clear()
-    n_biased_lines = min(
+    n_biased_lines = n_decay_lines = min(
         count_decay_steps(sampling_options.negligible_line_effect),
         sampling_options.max_biased_lines,
     )
     sample_failure_weights: Callable[[], np.ndarray] | None
+    walk_density = GaussianMixture.make_isotropic_gaussian(n_decay_lines, 1.0)
     if n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting:
         n_biased_lines = 1
         sample_failure_weights = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(
             float
         )
     else:
-        sample_failure_weights = _make_biased_sampler(walker_groups, n_biased_lines)
+        failure_density = _fit_density_of_failures(walker_groups, n_biased_lines)
+        sample_failure_weights = None
+        if failure_density is not None:
+            walk_density = failure_density
+            sample_failure_weights = lambda: run_biased_walks(walker_groups, walk_density)[1]
     group_weight_sums, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
     failure_probability, relative_error = 0.0, np.inf
     remaining_start_effect = max(kappa_2, spectral_radius) ** (
@@ -294,6 +302,7 @@ def sample_passage(
             )
         },
         n_sampled_steps=walker_groups.n_steps,
+        walk_density=walk_density,
     )
 
 
@@ -322,20 +331,15 @@ def _estimate_survival_from_gait(
     return n_survivors / n_walks
 
 
-def _make_biased_sampler(
-    walker_groups: WalkerGroups, n_biased_lines: int
-) -> Callable[[], np.ndarray] | None:
-    """Return a function that runs one walk from every walker over `n_biased_lines` lines.
-
-    The function returns the likelihood ratios of walks that fail in their last step, and 0 for
-    other walks. The mean of these weights is the probability of such a failure. Return None if no
-    walk fails.
+def _fit_density_of_failures(walker_groups: WalkerGroups, n_lines: int) -> GaussianMixture | None:
+    """Return a density of slope deviations on which walks over `n_lines` lines often fail in their
+    last step; return None if no walk fails.
     """
 
     def find_failures(slope_deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         walk_results = walker_groups.run_walks(slope_deviations)
         has_walk_failed = walk_results.outcome != Outcome.STEPPED
-        return has_walk_failed & (walk_results.n_stepped == n_biased_lines - 1), has_walk_failed
+        return has_walk_failed & (walk_results.n_stepped == n_lines - 1), has_walk_failed
 
     density_options = dataclasses.replace(
         FAILURE_DENSITY_OPTIONS,
@@ -343,30 +347,32 @@ def _make_biased_sampler(
             FAILURE_DENSITY_OPTIONS.max_walks_per_stage, len(walker_groups.states)
         ),
     )
-    failure_density = fit_failure_density(
-        find_failures, n_biased_lines, walker_groups.random, density_options
+    return fit_failure_density(find_failures, n_lines, walker_groups.random, density_options)
+
+
+def run_biased_walks(
+    walker_groups: WalkerGroups, walk_density: GaussianMixture
+) -> tuple[np.ndarray, np.ndarray]:
+    """Run one walk from every walker, over lines whose slope deviations are drawn from a density.
+
+    Return the slope deviations, shape (walkers, lines), and a weight of each walk. The weight is
+    the likelihood ratio if the walk fails in its last step, and 0 otherwise. The mean of the
+    weights is the probability of such a failure.
+    """
+    n_lines = walk_density.component_means.shape[1]
+    slope_deviations = walk_density.draw_samples(len(walker_groups.states), walker_groups.random)
+    walk_results = walker_groups.run_walks(slope_deviations)
+    has_failed_last = (walk_results.outcome != Outcome.STEPPED) & (
+        walk_results.n_stepped == n_lines - 1
     )
-    if failure_density is None:
-        return None
-    nominal_density = GaussianMixture.make_isotropic_gaussian(n_biased_lines, 1.0)
-
-    def sample_failure_weights() -> np.ndarray:
-        slope_deviations = failure_density.draw_samples(
-            len(walker_groups.states), walker_groups.random
-        )
-        walk_results = walker_groups.run_walks(slope_deviations)
-        has_failed_last = (walk_results.outcome != Outcome.STEPPED) & (
-            walk_results.n_stepped == n_biased_lines - 1
-        )
-        likelihood_ratios = np.exp(
-            nominal_density.compute_log_density(slope_deviations)
-            - failure_density.compute_log_density(slope_deviations)
-        )
-        failure_weights = np.where(has_failed_last, likelihood_ratios, 0.0)
-        walker_groups.record_failures(walk_results.outcome, failure_weights)
-        return failure_weights
-
-    return sample_failure_weights
+    nominal_density = GaussianMixture.make_isotropic_gaussian(n_lines, 1.0)
+    likelihood_ratios = np.exp(
+        nominal_density.compute_log_density(slope_deviations)
+        - walk_density.compute_log_density(slope_deviations)
+    )
+    failure_weights = np.where(has_failed_last, likelihood_ratios, 0.0)
+    walker_groups.record_failures(walk_results.outcome, failure_weights)
+    return slope_deviations, failure_weights
 
 
 def _solve_failure_probability(
