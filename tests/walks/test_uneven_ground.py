@@ -10,10 +10,9 @@ from reference_code import complementarity, uneven_ground
 from reference_code.five_coordinates import TABLE_1
 
 import vrw_jax as vrw
-from vrw_jax.batches.landing_steps import step_batch_after_landing
 from vrw_jax.contact.mechanics import find_slots, slot_friction
 from vrw_jax.contact.section import pack_section_state, unpack_section_state
-from vrw_jax.wheel import PARAMETER_NAMES, transitions
+from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)
 TIGHT = vrw.StepOptions.tight()
@@ -158,53 +157,6 @@ def test_rigid_wheels_step_from_line_to_line_by_the_closed_formula():
         rates.append(np.sqrt(x))
     np.testing.assert_allclose(walk.steps.section_state[:, 1], rates, atol=1e-8)
     assert 0 < int(walk.n_stepped) <= 4
-
-
-def test_a_step_between_landings_is_that_of_the_walk():
-    params, walk = vrw.WheelParams(**WHEEL), paper_walk(LINES[:4], 3)
-
-    def landed(x):
-        landing = transitions.land(params.symbols(), *x)
-        return np.array([landing.theta, landing.motion.dtheta]), float(landing.rear_impulse.normal)
-
-    states = [jnp.asarray(START), *walk.steps.section_state]
-    wheels = np.tile([[float(getattr(params, name))] for name in PARAMETER_NAMES], 3)
-    wheels[PARAMETER_NAMES.index("slope")] = LINES[:3]
-    starts = np.stack([landed(x)[0] for x in states[:3]], 1)
-    found = step_batch_after_landing(wheels, starts, np.array(LINES[1:4]))
-    np.testing.assert_allclose(
-        found.state, np.stack([landed(x)[0] for x in states[1:]], 1), atol=1e-13
-    )
-    np.testing.assert_allclose(found.rear_impulse, [landed(x)[1] for x in states[1:]], atol=1e-12)
-    np.testing.assert_allclose(found.durations.T, walk.steps.durations, atol=1e-13)
-
-
-def test_the_margin_to_an_early_touchdown_is_smooth_where_it_vanishes():
-    params = vrw.WheelParams()
-    landing = transitions.land(params.symbols(), *vrw.limit_cycle(params).section_state)
-    wheel = np.array([[float(getattr(params, name))] for name in PARAMETER_NAMES])
-    start = np.array([[float(landing.theta)], [float(landing.motion.dtheta)]])
-
-    def at(slopes, **given):
-        lanes = np.ones((1, len(slopes)))
-        return step_batch_after_landing(wheel * lanes, start * lanes, np.asarray(slopes), **given)
-
-    edge = 0.21
-    for _ in range(5):
-        found = at([edge], derivatives=("next_slope",))
-        edge = edge - found.event_order_margin[0] / found.jacobian[0, 3, 0]
-    near = at([edge - 1e-6, edge + 1e-6], derivatives=("next_slope",))
-    early = vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
-    assert near.outcome.tolist() == [early, vrw.Outcome.STEPPED]
-    slopes = near.jacobian[0, 3]
-    assert abs(slopes[1] - slopes[0]) < 1e-5 * slopes[0]
-    h, options = 1e-5, TIGHT
-    ends = [at([0.29 + d], options=options) for d in (h, -h)]
-    rows = [
-        np.array([*end.state[:, 0], *end.rear_impulse, *end.event_order_margin]) for end in ends
-    ]
-    jacobian = at([0.29], derivatives=("next_slope",)).jacobian[0, :, 0]
-    np.testing.assert_allclose(jacobian, (rows[0] - rows[1]) / (2 * h), atol=1e-8)
 
 
 @pytest.mark.parametrize("model", [None, vrw.RigidWheel(), vrw.UnilateralWheel()])

@@ -7,7 +7,6 @@ from vrw_jax.models.batch_step import (
     compute_jacobian_columns,
     split_jacobian,
     take_gait_step,
-    take_step_after_landing,
 )
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel, StepGround

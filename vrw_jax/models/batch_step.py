@@ -6,7 +6,7 @@ onto lanes, for use in JAX programs.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,7 +29,6 @@ from vrw_jax.integrator import (
     with_batched_jvp,
 )
 from vrw_jax.models.phase_sequence import (
-    PAPER_START,
     PhaseResult,
     PhaseRunner,
     PhaseSequenceResult,
@@ -63,8 +62,6 @@ from vrw_jax.wheel import (
     Motion,
     Outcome,
     PhaseInstant,
-    SingleSupport1,
-    Symbols,
     WheelParams,
     compute_wheel_units,
     transitions,
@@ -192,82 +189,6 @@ def take_gait_step(
     )
 
 
-class LandingStep(NamedTuple):
-    """Step of every lane between two landings that leave both feet on the ground."""
-
-    landing_quantities: Array
-    """Array (4, lanes): (theta+, dtheta+) just after the next landing, rad and rad/s; the rear
-    foot's normal impulse in that landing with both feet held, N s; `_event_order_margin`, m^2/s.
-    The first three are zero unless the outcome is STEPPED."""
-    outcome: Int[Array, " lanes"]  # an Outcome
-    durations: Vector  # of DLS, SLS-I, SLS-II, s
-    solver_steps: Int[Array, " lanes"]
-    is_unfinished: Bool[Array, " lanes"]  # see `BatchAdvanceResult`
-
-
-def take_step_after_landing(
-    params: WheelParams,
-    y: Vector,
-    options: StepOptions,
-    tableau: ButcherTableau,
-    stop_at_lift_off: bool,
-    straggler_count: Array | None = None,
-) -> LandingStep:
-    """Return one step of every lane from just after a landing to just after the next one.
-
-    - `y`: (theta+, dtheta+), rad and rad/s, in the frame of the line under both feet. The result is
-      in the frame of the next line, see `split_slopes`.
-    """
-    theta, dtheta = y
-    phase_sequence = run_batch_phases(
-        params,
-        (theta + params.leg_angle, dtheta, 0.0 * dtheta),
-        options,
-        tableau,
-        stop_at_lift_off,
-        records_margins=False,
-        straggler_count=straggler_count,
-        land=transitions.start_on_both_feet,
-    )
-    phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
-    next_section = tuple(
-        jnp.where(has_stepped, value, jnp.asarray(safe_value, value.dtype))
-        for value, safe_value in zip(next_section_state(phase_sequence), PAPER_START, strict=True)
-    )
-    landing = with_batched_jvp(transitions.land)(phase_sequence.s, *next_section)
-    landing_rows = landing.theta, landing.motion.dtheta, landing.rear_impulse.normal
-    landing_values = [jnp.where(has_stepped, landing_row, 0.0) for landing_row in landing_rows]
-    sls1 = phase_sequence.phases[1]
-    order_margin = with_batched_jvp(_event_order_margin)(
-        phase_sequence.s, sls1.tilt_sin_cos, phase_ends[1].q, phase_ends[1].v
-    )
-    order_margin = jnp.where(phase_sequence.phases_happened[1], order_margin, 0.0)
-    return LandingStep(
-        landing_quantities=jnp.stack([*landing_values, order_margin]),
-        outcome=phase_sequence.outcome,
-        durations=tuple(phase_end.duration for phase_end in phase_ends),
-        solver_steps=phase_ends[0].n_solver_steps
-        + phase_ends[1].n_solver_steps
-        + phase_ends[2].n_solver_steps,
-        is_unfinished=phase_ends[0].engine_carry.is_unfinished
-        | phase_ends[1].engine_carry.is_unfinished
-        | phase_ends[2].engine_carry.is_unfinished,
-    )
-
-
-def _event_order_margin(s: Symbols, turn: Vector, q: Vector, v: Vector) -> Array:
-    """Return a margin of the order of two events at the end of SLS-I, m^2/s.
-
-    If Leg 2 meets its stopper first, the margin is the rate of Leg 2 times the height of the
-    landing foot. If that foot lands first, the margin is minus the foot's falling speed times the
-    distance of Leg 2 from its stopper. Both forms vanish together, with equal derivatives.
-    """
-    phase = SingleSupport1(s, (), False, turn)
-    motion = phase.motion_at(q, v)
-    falling_speed = -phase.landing_rate(motion)
-    return phase.landing_height(motion) * motion.dL2 - (s.L0 - motion.L2) * falling_speed
-
-
 def run_batch_phases(
     params: WheelParams,
     x: Vector,
@@ -277,19 +198,18 @@ def run_batch_phases(
     records_margins: bool,
     straggler_count: Array | None = None,
     is_noinline: bool = False,
-    land: Callable[..., transitions.Landing] = transitions.land,
     stiff_start: StiffStartOptions = STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
     """Return the result of all phases of every lane's step.
 
     - `straggler_count`: see `integrate_batch_phase`;
-    - `is_noinline`: see `BatchPhase`;
-    - `land`: function of the landing that opens the step.
+    - `is_noinline`: see `BatchPhase`.
     """
     run_phase = _make_phase_runner(
         options, tableau, records_margins, straggler_count, is_noinline, stiff_start
     )
-    return run_phases(run_phase, params, x, options, stop_at_lift_off, with_batched_jvp(land))
+    land = with_batched_jvp(transitions.land)
+    return run_phases(run_phase, params, x, options, stop_at_lift_off, land)
 
 
 def _make_phase_runner(

@@ -34,7 +34,6 @@ from vrw_jax.wheel.phases import (
     AbstractPhase,
     PhaseInstant,
     PhaseMargins,
-    SingleSupport1,
     make_phases,
 )
 from vrw_jax.wheel.rest import is_at_rest, is_still, replace_rest_outcome

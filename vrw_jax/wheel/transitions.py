@@ -194,34 +194,6 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     )
 
 
-def start_on_both_feet(
-    s: Symbols, theta: Elementwise, dtheta: Elementwise, _dL1: Elementwise
-) -> Landing:
-    """Return a landing that left both feet on the ground, from the rate `dtheta` just after the
-    landing.
-
-    theta is the angle just before the landing, in the leg labels of the ending step, as in `land`.
-    Impulses and losses depend on the motion before the landing. They are returned as zero.
-    """
-    motion_before = motion_before_landing(s, theta, dtheta, 0.0 * dtheta)
-    sin, cos = landing_direction(s, motion_before.sin, motion_before.cos)
-    distance = s.L0 * s.sin_alpha / motion_before.cos
-    circle = double_support_circle(s, distance, sin, cos)
-    rates = dtheta, circle.G1 * dtheta, circle.G2 * dtheta
-    zero = 0.0 * (theta + dtheta)
-    no_impulse = FootForce(zero, zero)
-    return Landing(
-        theta=theta - s.alpha,
-        motion=Motion(sin, cos, s.L0 + zero, motion_before.L1, *rates),
-        distance=distance,
-        keeps_rear_foot=zero == 0.0,
-        fore_impulse=no_impulse,
-        rear_impulse=no_impulse,
-        energy_lost=zero,
-        hub_jump=(zero, zero),
-    )
-
-
 def stop_leg_2(s: Symbols, motion_before: Motion) -> Motion:
     """Return the motion after Leg 2, at L2 = L0, has met its stopper."""
     M = mass_matrix(s, motion_before.L1, motion_before.L2)
