@@ -157,6 +157,14 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     assert float(passage.kappa_2) == pytest.approx(float(gait.spectral_radius), abs=0.02)
 
 
+def test_a_mean_that_few_walks_dominate_has_no_error_estimate():
+    # Other seeds give 2e13 to 7e16 steps for this slowly decaying gait, of spectral radius 0.71.
+    params = vrw.WheelParams(damping=109.66, stiffness=524.94, slope=0.31148)
+    passage = vrw.first_passage(params, 0.008915, n_walkers=1024, max_steps=10_000)
+    assert float(passage.error) == np.inf
+    assert passage.ending == "A few sampled walks dominate the mean: its error is unknown."
+
+
 def test_no_failure_is_an_ending_and_not_an_error():
     passage = vrw.first_passage(vrw.WheelParams(), 1e-5, n_walkers=64)
     assert float(passage.mean_steps) == np.inf

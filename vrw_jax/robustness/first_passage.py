@@ -41,6 +41,7 @@ class PassageStatus(StatusCode):
     CONVERGED = 0, "The error estimate is within the tolerance."
     TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."
     NO_FAILURE = 2, "No walk failed, however uneven its slopes were made: the mean has no estimate."
+    UNKNOWN_ERROR = 3, "A few sampled walks dominate the mean: its error is unknown."
 
 
 class FirstPassage(AbstractPrintable):
@@ -57,7 +58,7 @@ class FirstPassage(AbstractPrintable):
     - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays.
       With samples, its error is some hundredths;
     - `error`: error estimate of `mean_steps`. With samples, it is half a confidence interval of 99
-      %;
+      %, and infinite if a few walks dominate the mean;
     - `states`: states of the quasi-stationary distribution. With quadrature, they are squared rates
       with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states with
       the slope as last component;
@@ -355,6 +356,8 @@ def _estimate_passage_by_sampling(
     passage_status = (
         PassageStatus.CONVERGED if is_within_tolerance else PassageStatus.TOLERANCE_NOT_MET
     )
+    if not np.isfinite(sampled_passage.relative_error):
+        passage_status = PassageStatus.UNKNOWN_ERROR
     passage_status = passage_status if failure_probability else PassageStatus.NO_FAILURE
     to_float_array = lambda values: jnp.asarray(values, params.damping.dtype)
     passage = FirstPassage(

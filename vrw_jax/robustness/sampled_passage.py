@@ -58,6 +58,10 @@ class PassageSamplingOptions:
     fewer rounds is uncertain."""
     max_start_effect_per_tol: float = 0.1
     """Largest fraction of the start's effect that may remain, divided by the tolerance."""
+    min_effective_failures: float = 100.0
+    """Smallest effective number of sampled failures for which an error is estimated. The value is
+    chosen because a few likelihood ratios dominate smaller samples. Their spread is then no
+    estimate of the error."""
     confidence_level: float = 0.99
     """Confidence level of the error estimate."""
 
@@ -82,7 +86,7 @@ class SampledPassage(NamedTuple):
     """First-passage times of a model, estimated from samples."""
 
     failure_probability: float  # of one step from the quasi-stationary distribution
-    relative_error: float  # half a confidence interval, plus the remaining effect of the start
+    relative_error: float  # half a confidence interval, plus the start's effect; inf if unknown
     mean_steps_from_gait: float
     kappa_2: float
     quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
@@ -255,6 +259,7 @@ def sample_passage(
             walk_density = failure_density
             sample_failure_weights = lambda: run_biased_walks(walker_groups, walk_density)[1]
     group_weight_sums, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
+    weight_sum, squared_weight_sum = 0.0, 0.0
     failure_probability, relative_error = 0.0, np.inf
     remaining_start_effect = max(kappa_2, spectral_radius) ** (
         n_forgetting_steps + n_biased_lines - 1
@@ -263,7 +268,10 @@ def sample_passage(
         n_sampling_rounds < sampling_options.min_sampling_rounds
         or (relative_error > relative_tolerance and walker_groups.n_steps < max_steps)
     ):
-        group_weight_sums += sample_failure_weights().reshape(walker_groups.n_groups, -1).mean(1)
+        failure_weights = sample_failure_weights()
+        group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
+        weight_sum += float(np.sum(failure_weights))
+        squared_weight_sum += float(np.sum(failure_weights**2))
         n_sampling_rounds += 1
         last_step_failure_probability = float(np.mean(group_weight_sums)) / n_sampling_rounds
         if last_step_failure_probability > 0.0:
@@ -282,6 +290,8 @@ def sample_passage(
                 / last_step_failure_probability
             )
             relative_error = float(sampling_error + remaining_start_effect)
+            if weight_sum**2 < sampling_options.min_effective_failures * squared_weight_sum:
+                relative_error = np.inf
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
         mean_steps_from_gait = float(
