@@ -15,7 +15,7 @@ these checks is stepped again by the adaptive engine.
 
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -39,7 +39,15 @@ from vrw_jax.collocation import (
 )
 from vrw_jax.models import PAPER_START, is_valid_start, replace_invalid
 from vrw_jax.numerics import Vector, value_and_partials
-from vrw_jax.wheel import AbstractPhase, PhaseInstant, WheelParams, make_phases, transitions
+from vrw_jax.wheel import (
+    AbstractPhase,
+    PhaseInstant,
+    WheelParams,
+    compute_wheel_units,
+    convert_to_wheel_units,
+    make_phases,
+    transitions,
+)
 
 _EIGENVALUES, _EIGENVECTORS = np.linalg.eig(INTEGRATION_MATRIX)
 _UPPER_HALF_PLANE_INDICES = np.flatnonzero(_EIGENVALUES.imag > 0.0)
@@ -85,10 +93,13 @@ class CollocationStepOptions:
     """Number of corrections of the duration in the last mesh interval."""
     n_sweeps_per_event_round: int = 2
     """Number of Newton sweeps after each of these corrections."""
+    max_duration: float = 10.0
+    """Bound of the expected durations in the wheel's unit of time, chosen because no phase of a
+    gait lasts that long."""
     max_correction: float = 5e-8
-    """Largest accepted `CollocatedPhase.correction`, rad/s and m/s."""
+    """Largest accepted `CollocatedPhase.correction`, in the wheel's units of rates."""
     max_event_shift: float = 1e-5
-    """Largest accepted `CollocatedPhase.event_shift`, s.
+    """Largest accepted `CollocatedPhase.event_shift`, in the wheel's unit of time.
 
     The end is extrapolated by the last shift, with an error of half of its square times a rate."""
     max_mismatch: tuple[float, float, float] = (2e-3, 1.2e-1, 8e-5)
@@ -657,10 +668,20 @@ def collocation_gait_step(
 ) -> CollocationStep:
     """Return one gait step of every lane, near the expected durations of DLS, SLS-I and
     SLS-II (s).
+
+    It is computed in the wheel's units, in which the limits of `options` hold.
     """
-    has_valid_duration = [(duration > 0.0) & (duration < 10.0) for duration in expected_durations]
-    is_valid = functools.reduce(operator.and_, has_valid_duration, is_valid_start(params, x))
+    is_valid = is_valid_start(params, x)
     params, x = replace_invalid(is_valid, params, x, PAPER_START)
+    units = compute_wheel_units(params.symbols())
+    state_units: tuple[Any, ...] = (1.0, units.rate, units.speed)
+    params = convert_to_wheel_units(params)
+    x = tuple(value / unit for value, unit in zip(x, state_units, strict=True))
+    expected_durations = tuple(duration / units.time for duration in expected_durations)
+    has_valid_duration = [
+        (duration > 0.0) & (duration < options.max_duration) for duration in expected_durations
+    ]
+    is_valid = functools.reduce(operator.and_, has_valid_duration, is_valid)
     expected_durations = tuple(
         jnp.where(is_valid, duration, 0.1) for duration in expected_durations
     )
@@ -684,7 +705,16 @@ def collocation_gait_step(
         )
         theta, motion = phase_end.q[0], phase.reset_map(phase.motion_at(phase_end.q, phase_end.v))
         durations.append(phase_end.duration)
-    zero_untrusted = lambda values: tuple(jnp.where(is_trusted, value, 0.0) for value in values)
+
+    def to_trusted_si(values: Iterable[Array], units: Iterable[Any]) -> Vector:
+        """Return values in SI; zeros for lanes that are not trusted."""
+        return tuple(
+            jnp.where(is_trusted, value * unit, 0.0)
+            for value, unit in zip(values, units, strict=True)
+        )
+
     return CollocationStep(
-        zero_untrusted((theta, motion.dtheta, motion.dL1)), zero_untrusted(durations), is_trusted
+        to_trusted_si((theta, motion.dtheta, motion.dL1), state_units),
+        to_trusted_si(durations, [units.time] * len(durations)),
+        is_trusted,
     )

@@ -35,7 +35,7 @@ from vrw_jax.contact.mechanics import (
     prevent_fusion,
 )
 from vrw_jax.numerics import Elementwise, tree_where
-from vrw_jax.wheel import Symbols
+from vrw_jax.wheel import Symbols, compute_wheel_units
 
 Friction = Elementwise | SlotPair
 """Friction coefficient of all feet, or of each slot's foot."""
@@ -786,9 +786,10 @@ def is_release_consistent(
         jnp.where(is_liftoff, -sin, release_direction * cos),
         jnp.where(is_liftoff, cos, release_direction * sin),
     )
+    acceleration_unit = compute_wheel_units(s).acceleration
     shift_pair = lambda slot_pair, shift: (
-        slot_pair[0] - shift * slot_weights[0],
-        slot_pair[1] - shift * slot_weights[1],
+        slot_pair[0] - acceleration_unit * shift * slot_weights[0],
+        slot_pair[1] - acceleration_unit * shift * slot_weights[1],
     )
     displaced_motion = free_motion._replace(
         foot_transverse_motion=shift_pair(free_motion.foot_transverse_motion, e),

@@ -38,4 +38,9 @@ from vrw_jax.wheel.phases import (
 )
 from vrw_jax.wheel.rest import is_at_rest, is_still, replace_rest_outcome
 from vrw_jax.wheel.transitions import Landing
-from vrw_jax.wheel.units import WheelUnits, compute_wheel_units, compute_wheel_units_of_rows
+from vrw_jax.wheel.units import (
+    WheelUnits,
+    compute_wheel_units,
+    compute_wheel_units_of_rows,
+    convert_to_wheel_units,
+)

@@ -13,7 +13,13 @@ import numpy as np
 from jax import lax
 
 from vrw_jax.numerics import Elementwise, StepOptions
-from vrw_jax.wheel.params import PARAMETER_NAMES, UNIT_POWERS, Symbols
+from vrw_jax.wheel.params import (
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    UNIT_POWERS,
+    Symbols,
+    WheelParams,
+)
 
 TABLE_1_LENGTH_M = 1.0
 """Length of a locked leg of the wheel whose units are those of SI, chosen because the defaults of
@@ -49,6 +55,11 @@ class WheelUnits(NamedTuple):
         return 1.0 / self.time
 
     @property
+    def acceleration(self) -> Elementwise:
+        """Return the unit of an acceleration, m/s^2."""
+        return self.speed / self.time
+
+    @property
     def energy(self) -> Elementwise:
         """Return the unit of an energy, J."""
         return self.mass * self.speed * self.speed
@@ -65,6 +76,18 @@ def compute_wheel_units(s: Symbols) -> WheelUnits:
     """Return the units of a wheel: 1 m, 1 s and 1 kg for Table 1's wheel, to the last bit."""
     length, gravity = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
     return lax.stop_gradient(WheelUnits(length, jnp.sqrt(length / gravity), s.Mt / TABLE_1_MASS_KG))
+
+
+def convert_to_wheel_units(params: WheelParams) -> WheelParams:
+    """Return the similar wheel of Table 1's length, gravity and mass: `params` in its own units."""
+    units = compute_wheel_units(params.symbols())
+    return WheelParams(
+        **{
+            name: getattr(params, name) / units.si_value(domain.unit)
+            for name, domain in PARAMETER_DOMAINS.items()
+        },
+        n_legs=params.n_legs,
+    )
 
 
 def compute_wheel_units_of_rows(parameter_rows: np.ndarray, n_legs: int) -> WheelUnits:
