@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -48,8 +48,12 @@ class ParameterDomain(NamedTuple):
 MIN_SI_VALUE = 1e-15
 """Smallest SI number of a positive parameter, chosen because quotients of smaller numbers
 overflow."""
-MAX_SI_VALUE = 1e9
-"""Bound of the SI numbers of a wheel, chosen because products of larger numbers overflow."""
+MAX_SI_VALUE = 1e60
+"""Bound of the SI numbers of a wheel, chosen because products of four larger numbers are near the
+largest number of 64 bits."""
+MAX_RELATIVE_VALUE = 1e9
+"""Bound of natural length, stiffness and damping in units of total mass, locked length and gravity,
+chosen because it is far above the values of legs whose motion a solver resolves."""
 
 PARAMETER_DOMAINS: dict[str, ParameterDomain] = {
     "hub_mass": ParameterDomain("m_H", "kg", 0.0, MAX_SI_VALUE, True, "mass of the body frame"),
@@ -129,17 +133,18 @@ class WheelParams(AbstractPrintable):
 
     All fields except `n_legs` are pytree leaves in SI units and may be swept and differentiated.
     The paper does not print g; 9.81 m/s^2 reproduces its numbers. A plain scalar outside its domain
-    raises an error here; in a batch, such a value becomes `Outcome.BAD_INPUT`.
+    raises an error here; in a batch, such a value becomes `Outcome.BAD_INPUT`. In units of total
+    mass, locked length and gravity, natural length, stiffness and damping must be below 1e9.
 
-    - `hub_mass`: m_H, mass of the body frame, in [0, 1e+09) kg;
-    - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+09) kg;
-    - `leg_com`: a, distance from foot to the leg's mass, in [0, 1e+09) m;
-    - `locked_length`: L_0, length of a leg on its stopper, in [1e-15, 1e+09) m;
-    - `natural_length`: L*, length of the unloaded spring, in [1e-15, 1e+09) m;
-    - `stiffness`: k, spring constant of each leg, in [0, 1e+09) N/m;
-    - `damping`: c, viscous damping of each leg, in [0, 1e+09) N s/m;
+    - `hub_mass`: m_H, mass of the body frame, in [0, 1e+60) kg;
+    - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+60) kg;
+    - `leg_com`: a, distance from foot to the leg's mass, in [0, 1e+60) m;
+    - `locked_length`: L_0, length of a leg on its stopper, in [1e-15, 1e+60) m;
+    - `natural_length`: L*, length of the unloaded spring, in [1e-15, 1e+60) m;
+    - `stiffness`: k, spring constant of each leg, in [0, 1e+60) N/m;
+    - `damping`: c, viscous damping of each leg, in [0, 1e+60) N s/m;
     - `slope`: phi, downhill slope, in (-1.5708, 1.5708) rad;
-    - `gravity`: g, gravitational acceleration, in [1e-15, 1e+09) m/s^2;
+    - `gravity`: g, gravitational acceleration, in [1e-15, 1e+60) m/s^2;
     - `n_legs`: 5 and more, a whole number; angles between legs are 2 pi / n_legs.
 
     Examples:
@@ -196,6 +201,8 @@ class WheelParams(AbstractPrintable):
         }
         for name, value in concrete_values.items():
             PARAMETER_DOMAINS[name].require_inside(name, value)
+        if len(concrete_values) == len(PARAMETER_DOMAINS):
+            _check_relative_values(concrete_values, self.n_legs)
         leg_com, locked_length = (
             concrete_values.get(name) for name in ("leg_com", "locked_length")
         )
@@ -259,11 +266,17 @@ class WheelParams(AbstractPrintable):
         return 2.0 * math.pi / self.n_legs
 
     def is_in_domain(self) -> Bool[Array, "..."]:
-        """Return whether every parameter is finite and in its domain, elementwise."""
+        """Return whether every parameter is finite and in its domain, elementwise.
+
+        Products of four parameters must be finite in their floating type too.
+        """
         is_in_all_domains = self.leg_com < self.locked_length
+        values = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
         for name, domain in PARAMETER_DOMAINS.items():
-            value = getattr(self, name)
-            is_in_all_domains = is_in_all_domains & domain.contains(value) & jnp.isfinite(value)
+            largest_factor = float(jnp.finfo(jnp.result_type(values[name])).max) ** 0.25
+            is_in_all_domains &= domain.contains(values[name]) & (values[name] < largest_factor)
+        for square in _compute_relative_squares(values, self.n_legs).values():
+            is_in_all_domains &= square < MAX_RELATIVE_VALUE**2
         return is_in_all_domains
 
     def scaled(
@@ -317,6 +330,33 @@ class WheelParams(AbstractPrintable):
     def symbols(self) -> Symbols:
         """Return the symbols of the paper for this wheel, with shared quantities."""
         return compute_symbols(self.n_legs, *(getattr(self, name) for name in PARAMETER_DOMAINS))
+
+
+def _compute_relative_squares(values: Mapping[str, Any], n_legs: int) -> dict[str, Any]:
+    """Return the squares of natural length, stiffness and damping in units of total mass, locked
+    length and gravity, by parameter name.
+
+    - `values`: values of all parameters by name, in SI units.
+    """
+    locked_length, gravity = values["locked_length"], values["gravity"]
+    total_mass = values["hub_mass"] + n_legs * values["leg_mass"]
+    relative_stiffness = values["stiffness"] * locked_length / (total_mass * gravity)
+    return {
+        "natural_length": (values["natural_length"] / locked_length) ** 2,
+        "stiffness": relative_stiffness**2,
+        "damping": (values["damping"] / total_mass) ** 2 * locked_length / gravity,
+    }
+
+
+def _check_relative_values(values: Mapping[str, float], n_legs: int) -> None:
+    """Raise `ValueError` if a value is too large for the mass, length and gravity of its wheel."""
+    for name, square in _compute_relative_squares(values, n_legs).items():
+        if not square < MAX_RELATIVE_VALUE**2:
+            raise ValueError(
+                f"{name} is {values[name]:g} {PARAMETER_DOMAINS[name].unit}, which is "
+                f"{math.sqrt(square):.1e} in units of the wheel's mass, locked length and gravity, "
+                f"but it must be below {MAX_RELATIVE_VALUE:g} in them: give a smaller value."
+            )
 
 
 def compute_symbols(
