@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from experiments.shared.tables import write_table
 
 MAX_BATCH_SIZE = 300
 """Largest number of wheels of a call, chosen because several padded batch sizes occur below it."""
+MAX_SLOW_BATCH_SIZE = 24
+"""Largest number of wheels of a call of `SLOW_FUNCTIONS`, chosen because 2,000 calls of each then
+take a quarter of an hour at most."""
 N_COUNTS = 10
 """Number of counts over the calls of a function."""
 
@@ -51,9 +54,9 @@ MAX_GROWTH = ProcessResources(100, 100, 4, 4)
 maps at each new batch size, while an allocator keeps some tens of MiB."""
 
 
-def draw_wheels(rng: np.random.Generator) -> vrw.WheelParams:
+def draw_wheels(rng: np.random.Generator, max_batch_size: int) -> vrw.WheelParams:
     """Return a batch of wheels of random size from the paper's box."""
-    n = int(rng.integers(1, MAX_BATCH_SIZE + 1))
+    n = int(rng.integers(1, max_batch_size + 1))
     draw = lambda low, high: rng.uniform(low, high, n)
     return vrw.WheelParams(
         damping=draw(100.0, 215.0), stiffness=draw(450.0, 540.0), slope=draw(0.28, 0.32)
@@ -70,31 +73,73 @@ def make_contact_model() -> vrw.UnilateralWheel:
     return vrw.UnilateralWheel(friction=0.8)
 
 
+def make_design(params: vrw.WheelParams) -> Any:
+    """Return a design with as many samples as there are wheels."""
+    return vrw.uniform(damping=(100.0, 215.0), n=len(params.damping))
+
+
+def make_starts(n: int) -> dict[str, Any]:
+    """Return a grid of `n` starts before touchdown."""
+    return {
+        "theta_touchdown": 0.1,
+        "dtheta_touchdown": np.linspace(1.0, 2.5, n + 1)[:n],
+        "dL1_touchdown": -0.1,
+    }
+
+
+STARTS_BOX: dict[str, Any] = {
+    "theta_touchdown": 0.1,
+    "dtheta_touchdown": (1.0, 2.5),
+    "dL1_touchdown": -0.1,
+}
+"""Box of starts before touchdown, rad, rad/s, m/s."""
+
 BATCH_FUNCTIONS: dict[str, Callable[[vrw.WheelParams], object]] = {
     "step_batch": lambda p: vrw.step_batch(p, repeat_start(p)),
     "step_batch, 3 steps": lambda p: vrw.step_batch(p, repeat_start(p), 3),
     "step_batch, derivatives": lambda p: vrw.step_batch(
         p, repeat_start(p), derivatives=["damping"]
     ),
+    "step_batch, diffrax": lambda p: vrw.step_batch(p, repeat_start(p), engine="diffrax"),
+    "step_batch, rigid": lambda p: vrw.step_batch(p, repeat_start(p), model=vrw.RigidWheel()),
     "step_batch, unilateral contact": lambda p: vrw.step_batch(
         p, repeat_start(p), model=make_contact_model()
     ),
-    "limit_cycles": vrw.limit_cycles,
-    "limit_cycles, unilateral contact": lambda p: vrw.limit_cycles(p, model=make_contact_model()),
-    "scan": lambda p: vrw.scan(
-        vrw.uniform(damping=(100.0, 215.0), n=len(p.damping)),
-        measures=["period"],
+    "step_batch, unilateral contact, derivatives": lambda p: vrw.step_batch(
+        p, repeat_start(p), model=make_contact_model(), derivatives=["damping"]
     ),
+    "limit_cycles": vrw.limit_cycles,
+    "limit_cycles, rigid": lambda p: vrw.limit_cycles(p, model=vrw.RigidWheel()),
+    "limit_cycles, unilateral contact": lambda p: vrw.limit_cycles(p, model=make_contact_model()),
+    "scan": lambda p: vrw.scan(make_design(p), ["period"]),
+    "scan, derivatives": lambda p: vrw.scan(make_design(p), ["d period / d damping"]),
+    "scan, unilateral contact": lambda p: vrw.scan(
+        make_design(p), ["period"], model=make_contact_model()
+    ),
+    "scan, auto": lambda p: vrw.scan(make_design(p), ["period"], model="auto"),
+    "measure_to_tolerance": lambda p: vrw.measure_to_tolerance("speed", p, 1e-4),
+    "basin": lambda p: vrw.basin(vrw.WheelParams(), make_starts(len(p.damping)), max_steps=30),
+    "basin_share": lambda p: vrw.basin_share(
+        vrw.WheelParams(), STARTS_BOX, n_starts=len(p.damping), max_steps=30
+    ),
+    "continue_branches": lambda p: vrw.continue_branches(p, "slope", (0.27, 0.33)),
 }
-"""Public functions of a batch of wheels."""
+"""Public functions of a batch of wheels, starts or samples."""
+SLOW_FUNCTIONS = (
+    "limit_cycles, unilateral contact", "scan, unilateral contact", "scan, auto",
+    "measure_to_tolerance", "continue_branches",
+)  # fmt: skip
+"""Functions that are called with smaller batches, because they search a gait of each wheel by many
+steps, or a branch of gaits."""
 
 
 def count_over_calls(name: str, n_calls: int, seed: int) -> list[ProcessResources]:
     """Return the counts after each tenth of the calls of a function."""
     rng, function = np.random.default_rng(seed), BATCH_FUNCTIONS[name]
+    max_batch_size = MAX_SLOW_BATCH_SIZE if name in SLOW_FUNCTIONS else MAX_BATCH_SIZE
     counts = []
     for i in range(n_calls):
-        function(draw_wheels(rng))
+        function(draw_wheels(rng, max_batch_size))
         if (i + 1) * N_COUNTS // n_calls > i * N_COUNTS // n_calls:
             counts.append(ProcessResources.count())
     return counts

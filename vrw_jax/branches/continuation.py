@@ -55,7 +55,7 @@ from vrw_jax.measures import (
     provenance,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.numerics import StepOptions, batch_sizes, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, take_rows
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import refuse_ladder
@@ -336,30 +336,37 @@ def continue_branches(
     batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
     if len(batch_shape) != 1:
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
-    params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch_shape), params)
-    start_values = jnp.broadcast_to(
-        getattr(model if name == FRICTION_NAME else params, name), batch_shape
+    (n_wheels,) = batch_shape
+    if n_wheels == 0:
+        return ()
+    # The batch is padded to a power of two, because each size compiles programs.
+    padded_size = 1 << (n_wheels - 1).bit_length()
+    wheel_indices = np.minimum(np.arange(padded_size), n_wheels - 1)
+    pad_batch = lambda leaf: np.broadcast_to(np.asarray(leaf), batch_shape)[wheel_indices]
+    start_values = pad_batch(getattr(model if name == FRICTION_NAME else params, name))
+    params, parameter_values = jax.device_put(
+        (jax.tree.map(pad_batch, params), np.clip(start_values, lower_bound, upper_bound))
     )
-    parameter_values = jnp.clip(start_values, lower_bound, upper_bound)
+    if isinstance(cycle, AbstractCycle) and padded_size > n_wheels:
+        cycle = jax.device_put(take_rows(cycle, wheel_indices))
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
     branch_request = BranchRequest(
         params, model, name, parameter_values, period_n, cycle_options, step_options, force_peaks
     )
     outcomes, branch_data = _continue_gait_branches(
-        branch_request, cycle, options, np.array([lower_bound, upper_bound])
+        branch_request, cycle, options, np.array([lower_bound, upper_bound]), n_wheels
     )
-    take_wheel_params = lambda wheel_index: jax.tree.map(lambda leaf: leaf[wheel_index], params)
     return tuple(
         _label_gait_branch(
-            single_branch_data,
-            take_wheel_params(wheel_index),
+            branch_data[wheel_index],
+            jax.device_put(take_rows(params, wheel_index)),
             name,
             model,
             step_options,
             int(outcomes[wheel_index]),
         )
-        for wheel_index, single_branch_data in enumerate(branch_data)
+        for wheel_index in range(n_wheels)
     )
 
 
@@ -368,9 +375,11 @@ def _continue_gait_branches(
     start_cycle: Any,
     arclength_options: ArclengthOptions,
     parameter_bounds: np.ndarray,
+    n_wheels: int,
     gait_options: GaitBranchOptions = GAIT_BRANCH_OPTIONS,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
-    """Return the outcomes of the starts, and the data of the branches from them.
+    """Return the outcomes of the starts, and the data of the branches from the first `n_wheels`
+    of them; the other starts pad the batch.
 
     The mesh is that of the cycle options. Without options the mesh is as fine as the branches need.
     """
@@ -390,6 +399,7 @@ def _continue_gait_branches(
             gait_options,
         )
         has_start = branch_start.start_outcomes == Outcome.STEPPED
+        has_start &= np.arange(len(has_start)) < n_wheels
         is_finest_mesh = (
             not can_refine_mesh
             or branch_start.finer_cycle_options is None
@@ -501,7 +511,9 @@ def _label_gait_branch(
 
 def _make_stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
     """Return labeled variables of multipliers and stability measures along the branch."""
-    multiplier_values = np.asarray(floquet_multipliers(jnp.asarray(jacobians)))
+    multiplier_values = map_in_numpy_batches(
+        floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), jacobians
+    )
     spectral_radius = np.max(np.abs(multiplier_values), -1)
     multiplier_parts = {
         "multiplier_real": multiplier_values.real,

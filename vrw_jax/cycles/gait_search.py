@@ -257,7 +257,7 @@ def _find_chosen_gaits(gait_finder: Any, params: WheelParams, which: GaitChoice)
     """Return the attracting gait that `which` selects for each wheel."""
     n_wheels, gait_rank = params.damping.shape[0], parse_gait_choice(which)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
-        gait_finder, jax.vmap(gait_finder.model.parameter_values)(params)
+        gait_finder, gait_finder.model.parameter_rows(params)
     )
     n_gaits_per_wheel = np.bincount(gait_wheel_indices, minlength=n_wheels)
     insufficient_gait_counts = n_gaits_per_wheel[

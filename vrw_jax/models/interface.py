@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.models.capabilities import ModelCapabilities
@@ -71,6 +72,17 @@ class AbstractWheel(eqx.Module):
             for name in self.parameter_names
         ]
         return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in parameters])
+
+    def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
+        """Return `parameter_values` of each wheel of a batch, by numpy.
+
+        JAX would compile a program for each batch size.
+        """
+        columns = [
+            np.asarray(getattr(self if name == FRICTION_NAME else params, name))
+            for name in self.parameter_names
+        ]
+        return np.stack(np.broadcast_arrays(*columns), -1)
 
     def from_values(
         self, values: Array | tuple[Array, ...], n_legs: int

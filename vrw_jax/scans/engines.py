@@ -26,7 +26,7 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import PASSAGE_MEASURES
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
-from vrw_jax.numerics import batch_sizes, map_in_batches
+from vrw_jax.numerics import batch_sizes, map_in_batches, map_in_numpy_batches
 from vrw_jax.robustness import first_passage
 from vrw_jax.runtime import with_default_settings
 from vrw_jax.scans.collocation_engine import (
@@ -37,7 +37,7 @@ from vrw_jax.scans.collocation_engine import (
     stack_parameters,
 )
 from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
-from vrw_jax.selection import ModelCode, find_selection_reason
+from vrw_jax.selection import SELECTION_MARGINS, ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
@@ -214,8 +214,20 @@ class LadderEngine:
         """Return `ModelChoice.reason_code` of each gait of the paper's model, from the margins
         over its step.
         """
-        reason, _ = find_selection_reason(paper_results, friction - self._paper_model.friction)
-        return np.asarray(reason, np.int8)
+        names = (*SELECTION_MARGINS, "outcome")
+        reason = map_in_numpy_batches(
+            _find_selection_reasons,
+            (batch_sizes.GAIT_READ_BATCH_SIZE,),
+            {name: paper_results[name] for name in names},
+            friction - self._paper_model.friction,
+        )
+        return reason.astype(np.int8)
+
+
+@jax.jit
+def _find_selection_reasons(measures: dict[str, Array], friction_difference: Array) -> Array:
+    """Return `ModelChoice.reason_code` of a batch of viscoelastic steps."""
+    return find_selection_reason(measures, friction_difference)[0]
 
 
 class ToleranceEngine:

@@ -123,8 +123,9 @@ class GroundBatch:
         It follows from the height of the smallest bounce that the solver resolves.
         """
         get_parameter = lambda name: self.parameter_columns[PARAMETER_NAMES.index(name)]
-        leg_length = jnp.asarray(get_parameter("locked_length"))
-        bounce_height = np.asarray(min_bounce_height(leg_length, self.options))
+        # A scalar is used because JAX would compile a program for each batch size.
+        relative_height = float(min_bounce_height(jnp.ones(()), self.options))
+        bounce_height = relative_height * get_parameter("locked_length")
         return np.sqrt(8.0 * bounce_height / get_parameter("gravity"))[indices]
 
     def find_free_coordinates(self, section_states: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
@@ -188,9 +187,7 @@ def check_batch(
         np.asarray(argument_array, float), (n_elements,)
     )
     return (
-        jax.tree.map(
-            lambda argument_array: jnp.asarray(broadcast_parameters(argument_array)), params
-        ),
+        jax.tree.map(broadcast_parameters, params),
         broadcast_parameters(friction),
         shape,
     )
