@@ -66,11 +66,48 @@ def test_restitution_outside_its_domain_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="0 to 1"):
         vrw.UnilateralWheel(restitution=1.5)
     assert vrw.UnilateralWheel(restitution=0.0).restitution is None
-    model = vrw.UnilateralWheel(restitution=0.5)
-    with pytest.raises(ValueError, match="batches do not support it"):
+    model = vrw.UnilateralWheel(restitution=[0.5, 0.1])
+    with pytest.raises(ValueError, match="one number"):
         vrw.step_batch(vrw.WheelParams(), np.array([START]), model=model)
-    with pytest.raises(ValueError, match="engine='auto' or 'diffrax'"):
-        vrw.step(vrw.WheelParams(), START, model=model, engine="lanes")
+
+
+UNEVEN_SLOPES = np.array([0.3, 0.32, 0.29])
+TIGHT_OPTIONS = vrw.StepOptions.tight()
+
+
+@pytest.mark.slow
+def test_batches_with_restitution_on_uneven_ground_equal_walks_by_diffrax():
+    """Values at a tight tolerance, and derivatives of a batch by those of single walks."""
+    model, damping = vrw.UnilateralWheel(friction=0.7, restitution=0.3), np.array([150.0, 250.0])
+    params = vrw.WheelParams(damping=damping, slope=np.tile(UNEVEN_SLOPES, (2, 1)))
+    starts = np.tile(START, (2, 1))
+    batch = vrw.step_batch(
+        params, starts, 2, model=model, options=TIGHT_OPTIONS, derivatives=("damping",)
+    )
+    assert batch.engine == "lanes"
+
+    def walk_one(damping, engine):
+        params = vrw.WheelParams(damping=damping, slope=jnp.asarray(UNEVEN_SLOPES))
+        options = TIGHT_OPTIONS.with_engine(engine)
+        return vrw.walk(params, START, 2, model=model, options=options).steps.durations[-1]
+
+    for i in range(2):
+        expected = walk_one(jnp.asarray(damping[i]), "diffrax")
+        np.testing.assert_allclose(batch.durations[i], expected, atol=1e-9)
+        jacobian = jax.jacfwd(walk_one)(jnp.asarray(damping[i]), "lanes")
+        np.testing.assert_allclose(batch.derivatives["damping"].durations[i], jacobian, atol=1e-9)
+
+
+def test_the_derivative_by_restitution_is_a_difference_quotient():
+    def duration(restitution):
+        model = vrw.UnilateralWheel(friction=0.7, restitution=restitution)
+        step = vrw.step(vrw.WheelParams(), START, model=model, options=TIGHT_OPTIONS)
+        return step.period
+
+    h = 1e-5
+    difference = (duration(0.3 + h) - duration(0.3 - h)) / (2 * h)
+    assert abs(float(jax.grad(duration)(0.3)) - float(difference)) < 1e-6
+    assert abs(float(difference)) > 1e-3
 
 
 @pytest.mark.slow

@@ -1,15 +1,8 @@
-"""Steps of batches with unilateral contact.
-
-Machine code takes the steps. On uneven ground, `walk` under `jax.vmap` takes them if restitution is
-given or the engine is diffrax.
-"""
+"""Steps of batches with unilateral contact, by machine code."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.batches.walk_batch import (
@@ -21,9 +14,8 @@ from vrw_jax.batches.walk_batch import (
 )
 from vrw_jax.contact import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches
-from vrw_jax.simulation import walk
-from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
+from vrw_jax.numerics import StepOptions
+from vrw_jax.wheel import PARAMETER_NAMES
 
 CONTACT_PARAMETERS = (*PARAMETER_NAMES, "friction")
 UNEVEN_GROUND_PARAMETERS = ("previous_friction", "tilt")
@@ -51,14 +43,15 @@ def step_batch_with_contact(
     """
     friction = np.asarray(model.friction, states.dtype)
     is_uneven = any(np.ndim(x) == 2 for x in (*parameters, friction))
-    if is_uneven and (engine == "diffrax" or model.restitution is not None):
-        return _walk_with_diffrax(
-            model, parameters, states, n_steps, options, engine, n_legs, derivative_names
-        )
     if engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
-            "'lanes' and an explicit Runge-Kutta solver: map vrw.return_map over the wheels."
+            "'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
+        )
+    if np.ndim(model.restitution):
+        raise ValueError(
+            f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
+            "for all elements: call vrw.step_batch for each restitution."
         )
     ground = _GroundBySteps.from_arrays(parameters[SLOPE_INDEX], friction, len(states), n_steps)
     parameters = [ground.slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameters)]
@@ -169,64 +162,3 @@ class _GroundBySteps(NamedTuple):
             return {"friction": friction}
         slope = StepwiseParameter((SLOPE_INDEX, tilt_index), n_slopes, slope_terms)
         return {"slope": slope, "friction": friction}
-
-
-def _walk_with_diffrax(
-    model: Any,
-    parameters: list[np.ndarray],
-    states: np.ndarray,
-    n_steps: int,
-    options: StepOptions,
-    engine: str,
-    n_legs: int,
-    derivative_names: Sequence[str],
-) -> StepBatchResult:
-    """Return the result of `step_batch` on uneven ground by `walk` under `jax.vmap`, without
-    derivatives.
-    """
-    if engine not in ("auto", "diffrax") or len(derivative_names):
-        raise ValueError(
-            "uneven ground with restitution, or by engine 'diffrax', is available without "
-            "derivatives: leave engine and derivatives out, or map vrw.walk over the elements."
-        )
-    n_states = len(states)
-    parameter_columns = (*parameters, np.asarray(model.friction, states.dtype))
-    full_columns = [np.broadcast_to(x, (n_states, *x.shape[1:])) for x in parameter_columns]
-    walk_elements = lambda x, *full_columns: _vmapped_walk(
-        model, options, n_legs, n_steps, x, full_columns
-    )
-    x, durations, outcome, n_stepped, n_solver_steps = map_in_numpy_batches(
-        walk_elements, batch_sizes.UNEVEN_GROUND_BATCH_SIZES, states, *full_columns
-    )
-    int_zeros = np.zeros(n_states, np.int32)
-    result_arrays = x, durations, outcome, n_stepped, n_solver_steps, int_zeros > 0, int_zeros
-    return StepBatchResult(*result_arrays, engine="diffrax", solver_names=(options.solver,))
-
-
-@eqx.filter_jit
-def _vmapped_walk(
-    model: Any, options: StepOptions, n_legs: int, n_steps: int, states: Any, input_columns: Any
-) -> tuple:
-    """Return the last step of a walk from each state, with outcome and counts."""
-
-    def walk_one(x: Any, input_columns: Any) -> tuple:
-        *parameter_values, friction = input_columns
-        model_with_friction = eqx.tree_at(lambda model: model.friction, model, friction)
-        params = wheel_from_parameters(tuple(parameter_values), n_legs)
-        walk_result = walk(
-            params, x, n_steps, model=model_with_friction, options=options, engine="diffrax"
-        )
-        last_step = jax.tree.map(
-            lambda x: x[jnp.minimum(walk_result.n_stepped, n_steps - 1)], walk_result.steps
-        )
-        n_solver_steps = jnp.sum(walk_result.steps.solver_steps)
-        return (
-            last_step.section_state,
-            last_step.durations,
-            walk_result.outcome,
-            walk_result.n_stepped,
-            n_solver_steps,
-        )
-
-    narrow_integers = lambda x: x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
-    return jax.tree.map(narrow_integers, jax.vmap(walk_one)(states, input_columns))

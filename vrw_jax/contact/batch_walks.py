@@ -60,7 +60,8 @@ def walk_batch(
     - `states`: full section states, shape (wheels, 4 + 3 n).
     """
     config = _WalkConfig.from_model(model, options, n, False, len(input_columns))
-    walk_result = _run_walk(config, [input_columns, states.T], n_steps, options)
+    walk_arguments = [_append_restitution(input_columns, model), states.T]
+    walk_result = _run_walk(config, walk_arguments, n_steps, options)
     summary = walk_result.step_result
     result_counts = walk_result.outcome, walk_result.n_stepped, walk_result.n_solver_steps
     return summary.section_state, summary.durations, *result_counts, summary.step_length
@@ -116,7 +117,11 @@ def step_batch_with_jacobian(
     lane_index, tangent_position, lane_wheels = _pack_tangents(has_tangent.sum(1))
     tangent_input_indices = np.full((MAX_TANGENTS_PER_LANE, len(lane_wheels)), -1.0)
     tangent_input_indices[tangent_position, lane_index] = input_index
-    walk_arguments = [input_columns[:, lane_wheels], states[lane_wheels].T, tangent_input_indices]
+    walk_arguments = [
+        _append_restitution(input_columns[:, lane_wheels], model),
+        states[lane_wheels].T,
+        tangent_input_indices,
+    ]
     walk_result, tangents = _run_walk(
         config, walk_arguments, 1, options.with_derivative_tolerances()
     )
@@ -133,6 +138,14 @@ def step_batch_with_jacobian(
     return jax.tree.map(lambda x: x[first_lane], walk_result.step_result), jax.tree.map(
         gather_tangents, tangents
     )
+
+
+def _append_restitution(input_columns: np.ndarray, model: UnilateralWheel) -> np.ndarray:
+    """Return the input columns with the model's restitution, if given, as the last one."""
+    if model.restitution is None:
+        return input_columns
+    restitution_row = np.full_like(input_columns[:1], np.asarray(model.restitution))
+    return np.concatenate([input_columns, restitution_row])
 
 
 MAX_TANGENTS_PER_LANE = 16
@@ -366,6 +379,7 @@ class _WalkConfig(NamedTuple):
     uses_paper_rule: bool
     has_tangents: bool  # whether the detailed step and its tangents are computed
     is_uneven: bool
+    has_restitution: bool
 
     @classmethod
     def from_model(
@@ -376,15 +390,7 @@ class _WalkConfig(NamedTuple):
         has_tangents: bool,
         n_columns: int,
     ) -> "_WalkConfig":
-        """Return the configuration for a model and these options.
-
-        Raises `ValueError` for a model with restitution.
-        """
-        if model.restitution is not None:
-            raise ValueError(
-                "restitution is given, but batches do not support it: walk wheels one by one with "
-                "vrw.walk, or map vrw.return_map over them."
-            )
+        """Return the configuration for a model and these options."""
         static_options = eqx.filter(options, eqx.is_array, inverse=True)
         is_uneven = n_columns > N_PARAMETERS + 1
         return cls(
@@ -395,6 +401,7 @@ class _WalkConfig(NamedTuple):
             model.uses_paper_rule,
             has_tangents,
             is_uneven,
+            model.restitution is not None,
         )
 
     def make_walk(self, traced_options: StepOptions, n_steps: Array) -> BatchWalkSettings:
@@ -409,6 +416,7 @@ class _WalkConfig(NamedTuple):
             options,
             tableau,
             self.is_uneven,
+            self.has_restitution,
         )
         return BatchWalkSettings(self.n_legs, n_steps, self.max_events, *contact_rules)
 
@@ -416,10 +424,8 @@ class _WalkConfig(NamedTuple):
         """Return the number of rows of each input: columns, states and, if requested, tangent
         inputs.
         """
-        row_counts = (
-            N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.is_uneven,
-            full_section_size(self.n_legs),
-        )
+        n_columns = N_PARAMETERS + 1 + N_UNEVEN_COLUMNS * self.is_uneven + self.has_restitution
+        row_counts = n_columns, full_section_size(self.n_legs)
         return (*row_counts, MAX_TANGENTS_PER_LANE) if self.has_tangents else row_counts
 
     def result_structure(self, dtype: Any) -> Any:
@@ -510,7 +516,10 @@ def _compile_walk(
         if not config.has_tangents:
             return tuple(jax.tree.leaves(run_walks(walk_settings, *walk_inputs)))
         input_columns, x, tangent_input_indices = walk_inputs
-        input_index = np.arange(len(input_columns) + len(x), dtype=np.int32)[:, None]
+        # Batches have no tangent of restitution, which is the last column.
+        n_columns = len(input_columns) - config.has_restitution
+        column_index = [*range(n_columns), *[-2] * config.has_restitution]
+        input_index = np.array([*column_index, *n_columns + np.arange(len(x))], np.int32)[:, None]
         unit_tangents = (tangent_input_indices[:, None] == input_index).astype(x.dtype)
         unit_tangents = lax.optimization_barrier(unit_tangents)
         tangents = unit_tangents[:, : len(input_columns)], unit_tangents[:, len(input_columns) :]

@@ -61,7 +61,10 @@ class ContactStepConfig(NamedTuple):
         """Return the lanes' input columns and section states, and (wheel, params, options)."""
         wheel, params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
         uneven_columns = () if wheel.uneven is None else wheel.uneven
-        input_columns = jnp.stack([*stack_parameters(params), wheel.friction, *uneven_columns])
+        restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
+        input_columns = jnp.stack(
+            [*stack_parameters(params), wheel.friction, *uneven_columns, *restitution]
+        )
         return input_columns, x, (wheel, params, options)
 
     def make_walk_settings(self, step_settings: Any) -> BatchWalkSettings:
@@ -75,9 +78,8 @@ class ContactStepConfig(NamedTuple):
             wheel.uses_paper_rule,
             self.is_detailed,
         )
-        return BatchWalkSettings(
-            params.n_legs, 1, *contact_rules, options, tableau, wheel.uneven is not None
-        )
+        has_columns = wheel.uneven is not None, wheel.restitution is not None
+        return BatchWalkSettings(params.n_legs, 1, *contact_rules, options, tableau, *has_columns)
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return zero arrays in the structure and shapes of `compute_outputs` for one wheel."""

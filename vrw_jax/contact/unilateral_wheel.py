@@ -301,10 +301,8 @@ class UnilateralWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions, is_detailed: bool
     ) -> tuple[Any, str]:
         """Return the outputs of a step, and the name of the engine that computed them."""
-        (leaves, argument_structure), engine = (
-            self._flatten_arguments(params, x, options),
-            self._choose_engine(options),
-        )
+        leaves, argument_structure = self._flatten_arguments(params, x, options)
+        engine = "lanes" if can_use_lanes(options) else "diffrax"
         return eqx.combine(*_compile_step(argument_structure, is_detailed, engine)(*leaves)), engine
 
     def _flatten_arguments(
@@ -315,29 +313,10 @@ class UnilateralWheel(AbstractWheel):
         model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
         return jax.tree.flatten((model, params, x, options))
 
-    def _choose_engine(self, options: StepOptions) -> str:
-        """Return the name of the engine for these options, "lanes" or "diffrax"."""
-        return (
-            "lanes" if self._check_lane_support(options) and can_use_lanes(options) else "diffrax"
-        )
-
-    def _check_lane_support(self, options: StepOptions) -> bool:
-        """Return whether machine code supports the model, that is, whether restitution is None.
-
-        Raises `ValueError` if the options require machine code.
-        """
-        is_supported = self.restitution is None
-        if options.engine == "lanes" and not is_supported:
-            raise ValueError(
-                "engine is 'lanes', which does not support restitution: take engine='auto' or "
-                "'diffrax'."
-            )
-        return is_supported
-
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        if self._choose_engine(options) == "lanes":
+        if can_use_lanes(options):
             leaves, argument_structure = self._flatten_arguments(params, x, options)
             samples = build_contact_step_sampler(argument_structure, n_samples)(*leaves)
         else:

@@ -68,7 +68,7 @@ N_PARAMETERS = len(PARAMETER_NAMES)
 """Number of input columns that hold parameters. The column of friction follows."""
 N_UNEVEN_COLUMNS = 2
 """Number of further input columns on uneven ground: friction of the feet that landed earlier, and
-the angle by which the next line is steeper, rad."""
+the angle by which the next line is steeper, rad. The column of restitution, if given, is last."""
 STATUS_UNFINISHED = -1
 """Code in place of the outcome of a lane whose walk is unfinished."""
 
@@ -175,6 +175,7 @@ class BatchWalkSettings(NamedTuple):
     options: StepOptions
     tableau: ButcherTableau
     is_uneven: bool = False  # whether the input has `N_UNEVEN_COLUMNS`; one step only
+    has_restitution: bool = False  # whether the last input column is restitution
 
     def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of the lanes in this contact state."""
@@ -201,6 +202,10 @@ class BatchWalkSettings(NamedTuple):
     def tilt(self, input_columns: Array) -> Array | None:
         """Return the angle by which the next line is steeper, rad; None on flat ground."""
         return input_columns[N_PARAMETERS + 2] if self.is_uneven else None
+
+    def restitution(self, input_columns: Array) -> Array | None:
+        """Return Newton's coefficient of restitution of the feet, None if it is 0."""
+        return input_columns[-1] if self.has_restitution else None
 
     def begin_walk(self, input_columns: Array, x: Array) -> LaneState:
         """Return the state of the lanes at the first landing of their walk, before the impact is
@@ -305,7 +310,9 @@ class BatchWalkSettings(NamedTuple):
         )
         guard = jnp.where(opens_step, guard_layout.landing, interval.triggered_guard)
         law_arguments = s, friction, self.options, self.is_one_sided, self.is_detailed
-        contact_law = make_contact_law(*law_arguments, tilt=self.tilt(input_columns))
+        contact_law = make_contact_law(
+            *law_arguments, self.restitution(input_columns), self.tilt(input_columns)
+        )
         event_arguments = guard, counters.n_events, self.max_events
         event_result, event, event_outcome = process_event(
             contact_law, guard_layout, motion, contact_state, *event_arguments
@@ -382,11 +389,13 @@ class BatchWalkSettings(NamedTuple):
         is_valid, params, friction, x = replace_invalid_start(*start_arguments)
         column_rows = [*stack_parameters(params), friction]
         if self.is_uneven:
-            previous_friction, tilt = input_columns[N_PARAMETERS + 1 :]
+            previous_friction, tilt = input_columns[N_PARAMETERS + 1 : N_PARAMETERS + 3]
             column_rows += [
                 jnp.where(is_valid, previous_friction, 1.0),
                 jnp.where(is_valid, tilt, 0.0),
             ]
+        if self.has_restitution:
+            column_rows.append(input_columns[-1])
         return jnp.stack(column_rows), x, is_valid
 
     def deactivate_invalid(self, lane_state: LaneState, is_valid: Array) -> LaneState:

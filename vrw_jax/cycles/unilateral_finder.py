@@ -32,7 +32,6 @@ from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import (
     AbstractReturnMapFinder,
     ReturnMapCycle,
-    ReturnMapFinder,
     compute_newton_tolerance,
     find_return_map_cycle,
     make_return_map_cycle,
@@ -90,8 +89,6 @@ class UnilateralFinder(AbstractReturnMapFinder):
         period_n: int,
         cycle_options: CycleOptions,
     ) -> AbstractReturnMapFinder:
-        if model.restitution is not None:  # The batched engine has no restitution.
-            return ReturnMapFinder(model, n_legs, step_options, period_n)
         return cls(model, n_legs, step_options, period_n)
 
     def find_cycle(self, params: WheelParams, guess: Any = None) -> ReturnMapCycle:

@@ -13,8 +13,6 @@ XLA_LANE_BATCH_SIZE = 32_768
 """Number of gait steps of the "lanes" engine by XLA, chosen because a GPU needs many lanes."""
 CONTACT_XLA_BATCH_SIZE = 2048
 """Number of steps with unilateral contact by XLA, on devices without machine code."""
-UNEVEN_GROUND_BATCH_SIZES = (16, 256)
-"""Numbers of walks with unilateral contact on uneven ground by the diffrax engine."""
 ATTRACTOR_BATCH_SIZE = 128
 """Number of walks toward attractors; after each round, the remaining walks are gathered in new
 batches.
