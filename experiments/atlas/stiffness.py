@@ -10,7 +10,7 @@ from experiments.atlas.events import START, Rows
 from experiments.atlas.limits import light_wheel
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.integrator import load_explicit_tableau, real_stability_limit
+from vrw_jax.integrator import compute_real_stability_limit, load_explicit_tableau
 from vrw_jax.wheel import transitions
 
 STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2
@@ -38,7 +38,7 @@ def real_axis_limit(solver: str) -> float:
     """Largest z with |R(-z)| <= 1 of an explicit solver's stability polynomial."""
     tableau = load_explicit_tableau(solver)
     assert tableau is not None
-    return real_stability_limit(tableau)
+    return compute_real_stability_limit(tableau)
 
 
 N_TIMING_ROUNDS, MIN_TIMING_SECONDS, MAX_TIMING_SECONDS = 7, 0.1, 3.0

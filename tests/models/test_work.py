@@ -7,7 +7,7 @@ from support import reference_values
 from support.batched import compute_states_and_work
 
 import vrw_jax as vrw
-from vrw_jax.integrator.tableaus import load_explicit_tableau, real_stability_limit
+from vrw_jax.integrator.tableaus import compute_real_stability_limit, load_explicit_tableau
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
@@ -74,6 +74,6 @@ def test_a_stiff_step_needs_little_more_than_the_solver_steps_of_the_stability_l
     solver = batch_result.solver_names[int(batch_result.solver_index[0])]
     assert solver == by
     # 1.03 c/m is the rate of SLS-I's fast mode; DLS, SLS-II and the start of it take the rest.
-    limit = real_stability_limit(load_explicit_tableau(solver))
+    limit = compute_real_stability_limit(load_explicit_tableau(solver))
     requested = 1.03 * 100.0 / mass * float(batch_result.durations[0, 1]) / limit
     assert requested < int(batch_result.solver_steps[0]) <= WORK_ALLOWANCE * steps

@@ -20,7 +20,12 @@ from vrw_jax.hybrid import (
     simulate_hybrid,
     time_errors,
 )
-from vrw_jax.hybrid.program_cache import MAX_PROGRAMS, _programs, call_compiled, find_program
+from vrw_jax.hybrid.program_cache import (
+    MAX_CACHED_PROGRAMS,
+    _program_by_key,
+    call_compiled,
+    find_program,
+)
 
 GRAVITY = 9.81
 
@@ -156,7 +161,7 @@ def test_a_closure_over_a_differentiated_or_mapped_value_shares_no_program():
 
 def test_at_most_the_stated_number_of_programs_is_kept():
     scale = lambda static, x: static * x
-    for factor in range(2 * MAX_PROGRAMS):
+    for factor in range(2 * MAX_CACHED_PROGRAMS):
         program = find_program(scale, float(factor), 2.0)
         assert float(program(2.0)) == 2.0 * factor
-        assert len(_programs) <= MAX_PROGRAMS
+        assert len(_program_by_key) <= MAX_CACHED_PROGRAMS

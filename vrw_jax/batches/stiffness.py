@@ -6,7 +6,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from vrw_jax.integrator import load_explicit_tableau, real_stability_limit
+from vrw_jax.integrator import compute_real_stability_limit, load_explicit_tableau
 from vrw_jax.numerics import SolverName, StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES
 
@@ -96,4 +96,4 @@ def _count_stages_and_stability_limit(solver: str) -> tuple[int, float]:
     """
     tableau = load_explicit_tableau(solver)
     assert tableau is not None  # The caller has checked the solver.
-    return len(tableau.nodes) - 1, real_stability_limit(tableau)
+    return len(tableau.nodes) - 1, compute_real_stability_limit(tableau)

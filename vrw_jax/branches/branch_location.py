@@ -236,7 +236,9 @@ def _continue_in_both_directions(
         repeat_for_both_directions(is_branch_requested),
     )
     continue_all = (
-        arclength.continue_from if continuation.problem.is_traceable else continue_many_from
+        arclength.continue_branches_from
+        if continuation.problem.is_traceable
+        else continue_many_from
     )
     continue_all = functools.partial(
         continue_all, continuation.problem, continuation.arclength_options
@@ -599,14 +601,14 @@ def _locate_zeros(
     all_requests = np.arange(len(zero_requests))
     # The point beside the zero is to the left even of an exact zero, so that it is admissible.
     points_beside, quantities_beside = solve_at_fractions(
-        np.maximum(zero_location.left_end - bracket_tolerances, 0.0), all_requests
+        np.maximum(zero_location.left_bracket_ends - bracket_tolerances, 0.0), all_requests
     )
     for retry_fraction in location_options.retry_fractions:
         inadmissible_requests = np.flatnonzero(~(quantities_beside[ADMISSIBILITY_COLUMN] > 0.0))
         row_indices = np.arange(len(zero_requests))
         if len(inadmissible_requests):
             retried_points_and_quantities = solve_at_fractions(
-                retry_fraction * zero_location.left_end[inadmissible_requests],
+                retry_fraction * zero_location.left_bracket_ends[inadmissible_requests],
                 inadmissible_requests,
             )
             row_indices[inadmissible_requests] = len(row_indices) + np.arange(
@@ -619,8 +621,8 @@ def _locate_zeros(
     return [
         _LocatedZero(
             zero_requests[i],
-            float(parameter_by_location[i, zero_location.best[i]]),
-            float(zero_location.best[i]),
+            float(parameter_by_location[i, zero_location.best_locations[i]]),
+            float(zero_location.best_locations[i]),
             take_rows(points_beside, slice(i, i + 1)),
             take_rows(quantities_beside, slice(i, i + 1)),
         )

@@ -25,8 +25,8 @@ from vrw_jax.continuation import (
     AbstractContinuationProblem,
     ContinuationPoint,
     NewtonStep,
+    ProblemUnknowns,
     SectionVector,
-    Unknowns,
     arclength,
 )
 from vrw_jax.cycles import (
@@ -80,7 +80,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
 
     @abc.abstractmethod
     def read_gait_state(
-        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state before the first landing, and continued quantities by name.
 
@@ -131,7 +131,7 @@ class CollocationProblem(AbstractGaitProblem):
             eqx.tree_at(lambda w: getattr(w, self.parameter_name), wheel.params, p)
         )
 
-    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         linearize_trial = make_trial_linearizer(
             self.system, (PARAMETER_NAMES.index(self.parameter_name),)
         )
@@ -140,13 +140,13 @@ class CollocationProblem(AbstractGaitProblem):
         )
         return NewtonStep(correction, jax.tree.map(lambda x: x[0], tangents), monodromy)
 
-    def section_state(self, z: Unknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionVector:
         return z.section_state
 
-    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
         return unbatch(compute_correction_norm)(z, correction)
 
-    def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether the durations are positive.
 
         The event-driven step checks all other conditions.
@@ -154,7 +154,7 @@ class CollocationProblem(AbstractGaitProblem):
         return jnp.all((z.durations > 0.0) | (wheel.is_phase_active < 0.5))
 
     def read_gait_state(
-        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state, and quantities that continue beyond a special point, by name.
 
@@ -276,18 +276,20 @@ class AbstractReturnMapProblem(AbstractGaitProblem):
     def n_steps(self) -> int:
         return self.period_n
 
-    def section_state(self, z: Unknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionVector:
         return z[: self.n_coordinates]
 
-    def interpolate(self, left: Unknowns, right: Unknowns, fraction: Scalar) -> Unknowns:
+    def interpolate(
+        self, left: ProblemUnknowns, right: ProblemUnknowns, fraction: Scalar
+    ) -> ProblemUnknowns:
         return interpolate_section_states(left, right, fraction, self.n_coordinates)
 
-    def is_smooth_between(self, left: Unknowns, right: Unknowns) -> Bool[Array, ""]:
+    def is_smooth_between(self, left: ProblemUnknowns, right: ProblemUnknowns) -> Bool[Array, ""]:
         """Return whether the codes of both points are equal."""
         return jnp.all(left[self.n_coordinates :] == right[self.n_coordinates :])
 
     def read_gait_state(
-        self, wheel: BranchWheel, z: Unknowns, p: Scalar
+        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
     ) -> tuple[AnySectionState, dict[str, Array]]:
         """Return the section state without continued quantities, because all quantities are
         measures of the step.
@@ -314,7 +316,7 @@ class ReturnMapProblem(AbstractReturnMapProblem):
             )
         return z
 
-    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> NewtonStep:
+    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         return_map = lambda z, p: self._iterate_return_map(wheel, z, p)
         return arclength.make_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
 
@@ -346,7 +348,7 @@ class GroundProblem(AbstractReturnMapProblem):
         parameter_values = np.asarray(self.stack_parameter_values(wheels, p))
         return PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
 
-    def linearize(self, wheel: BranchWheel, z: Unknowns, p: Array) -> NewtonStep:
+    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Array) -> NewtonStep:
         """Return the Newton steps of many wheels."""
         section_states, n_coordinates = np.asarray(z), self.n_coordinates
         is_continued_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
@@ -406,7 +408,7 @@ class GroundProblem(AbstractReturnMapProblem):
         model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
         return model.friction - jnp.tan(params.slope) * (1.0 + MIN_FRICTION_SURPLUS)
 
-    def is_admissible(self, wheel: BranchWheel, z: Unknowns, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
         """Return whether friction can balance the weight along the slope."""
         return jnp.all(jnp.isfinite(z)) & (self._compute_friction_surplus(wheel, p) > 0.0)
 

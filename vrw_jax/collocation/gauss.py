@@ -41,11 +41,11 @@ class PhaseMesh(NamedTuple):
     @property
     def interval_fractions(self) -> np.ndarray:
         """Return the length of each interval as a fraction of the phase's duration."""
-        boundaries = np.linspace(0.0, 1.0, self.n_intervals + 1)
+        boundary_fractions = np.linspace(0.0, 1.0, self.n_intervals + 1)
         log_grading = np.log(self.grading)
         if abs(log_grading) > 1e-12:
-            boundaries = np.expm1(log_grading * boundaries) / np.expm1(log_grading)
-        return np.diff(boundaries)
+            boundary_fractions = np.expm1(log_grading * boundary_fractions) / np.expm1(log_grading)
+        return np.diff(boundary_fractions)
 
     @property
     def node_fractions(self) -> np.ndarray:
@@ -63,8 +63,8 @@ def phase_integration_matrices(mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
     """
     n = mesh.n_intervals * N_GAUSS_NODES
     rate_matrix, position_matrix = np.zeros((n + 1, n)), np.zeros((n + 1, n))
-    times = np.ones(n + 1)
-    interval_rate_weights, interval_position_weights, time = np.zeros(n), np.zeros(n), 0.0
+    node_times = np.ones(n + 1)
+    interval_rate_weights, interval_position_weights, interval_start = np.zeros(n), np.zeros(n), 0.0
     for i, h in enumerate(mesh.interval_fractions):
         node_slice = slice(i * N_GAUSS_NODES, (i + 1) * N_GAUSS_NODES)
         rate_matrix[node_slice] = interval_rate_weights
@@ -73,26 +73,26 @@ def phase_integration_matrices(mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
         )
         rate_matrix[node_slice, node_slice] += h * INTEGRATION_MATRIX
         position_matrix[node_slice, node_slice] += h * h * DOUBLE_INTEGRATION_MATRIX
-        times[node_slice] = time + h * GAUSS_NODES
+        node_times[node_slice] = interval_start + h * GAUSS_NODES
         interval_position_weights = interval_position_weights + h * interval_rate_weights
         interval_position_weights[node_slice] += h * h * DOUBLE_END_WEIGHTS
         interval_rate_weights = interval_rate_weights.copy()
         interval_rate_weights[node_slice] += h * END_WEIGHTS
-        time += h
+        interval_start += h
     rate_matrix[n], position_matrix[n] = interval_rate_weights, interval_position_weights
-    return times, rate_matrix, position_matrix
+    return node_times, rate_matrix, position_matrix
 
 
-def lagrange_weights(location: float) -> np.ndarray:
+def lagrange_weights(interval_location: float) -> np.ndarray:
     """Return the weights of node values with which their polynomial is evaluated at `location`.
 
     The location is the time from the interval's start in interval lengths.
     """
     node_differences = GAUSS_NODES[:, None] - GAUSS_NODES + np.eye(N_GAUSS_NODES)
-    factors = np.where(
-        np.eye(N_GAUSS_NODES, dtype=bool), 1.0, (location - GAUSS_NODES) / node_differences
+    lagrange_factors = np.where(
+        np.eye(N_GAUSS_NODES, dtype=bool), 1.0, (interval_location - GAUSS_NODES) / node_differences
     )
-    return np.prod(factors, axis=1)
+    return np.prod(lagrange_factors, axis=1)
 
 
 def mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -> np.ndarray:
@@ -105,20 +105,22 @@ def mesh_transfer_matrix(source_mesh: PhaseMesh, target_mesh: PhaseMesh) -> np.n
         return np.concatenate([[0.0], np.cumsum(mesh.interval_fractions)])
 
     source_ends = interval_ends(source_mesh)
-    times = (
+    target_times = (
         interval_ends(target_mesh)[:-1, None]
         + target_mesh.interval_fractions[:, None] * GAUSS_NODES
     ).ravel()
-    matrix = np.zeros((times.size, source_mesh.n_intervals * N_GAUSS_NODES))
-    for target_index, time in enumerate(times):
-        interval = int(
-            np.clip(np.searchsorted(source_ends, time) - 1, 0, source_mesh.n_intervals - 1)
+    transfer_matrix = np.zeros((target_times.size, source_mesh.n_intervals * N_GAUSS_NODES))
+    for target_index, target_time in enumerate(target_times):
+        source_interval = int(
+            np.clip(np.searchsorted(source_ends, target_time) - 1, 0, source_mesh.n_intervals - 1)
         )
-        location = (time - source_ends[interval]) / source_mesh.interval_fractions[interval]
-        matrix[target_index, interval * N_GAUSS_NODES : (interval + 1) * N_GAUSS_NODES] = (
-            lagrange_weights(location)
-        )
-    return matrix
+        source_location = (
+            target_time - source_ends[source_interval]
+        ) / source_mesh.interval_fractions[source_interval]
+        transfer_matrix[
+            target_index, source_interval * N_GAUSS_NODES : (source_interval + 1) * N_GAUSS_NODES
+        ] = lagrange_weights(source_location)
+    return transfer_matrix
 
 
 def differentiation_matrix() -> np.ndarray:

@@ -1,14 +1,13 @@
-"""Collocation of a limit cycle: all phases, their durations and the section state are solved
-together.
+"""Collocation of a limit cycle: all phases, their durations and the section state together.
 
 Each phase is divided into mesh intervals of four Gauss nodes (order 8). The unknowns are the
 section state, the durations of the phases and the accelerations at all nodes. Positions and rates
-follow from them explicitly. One pass of `linearize_cycle` goes through the intervals once and
-propagates a few tangents. They are the Newton correction, one tangent for each entry of the section
-state, one for each requested parameter, and one for the duration of the running phase. The node
-equations of an interval are eliminated immediately, the duration of a phase at its event, and the
-section state at the closing of the cycle. The monodromy matrix and the sensitivities of all
-unknowns to the parameters are therefore tangents of the same pass.
+are explicit functions of the unknowns. `linearize_cycle` visits each interval once and propagates a
+few tangents. They are the Newton correction, one tangent for each component of the section state,
+one for each requested parameter, and one for the duration of the current phase. The node equations
+of an interval are eliminated immediately, the duration of a phase at its event, and the section
+state when the cycle is closed. The monodromy matrix and the sensitivities of all unknowns to the
+parameters are therefore tangents of the same linearization.
 
 Arrays have batch elements (independent wheels) on their last axis, and no code branches.
 """
@@ -50,7 +49,7 @@ from vrw_jax.numerics import (
 )
 
 PhaseConstants = tuple[Elementwise, ...]
-"""Constants of the phases' equations, one array for each."""
+"""Constants of the equations of all phases, one array for each constant."""
 
 
 class PhasePoint(NamedTuple):
@@ -65,10 +64,10 @@ class CollocationPhase(NamedTuple):
     """One phase as functions that are elementwise over the batch.
 
     `residual` is the residual of the equations of motion at (constants, point, acceleration), which
-    is linear in the acceleration. This form costs far less to differentiate than the solved form.
-    The functions `event`, zero at the end, and `guards`, positive inside, take (constants, point).
-    `reset` maps the end of the phase to the start of the next phase, and the end of the last phase
-    to the section state (in `q`).
+    is linear in the acceleration. The residual costs far less to differentiate than the solved
+    equations. The functions `event`, zero at the end, and `guards`, positive inside, take
+    (constants, point). `reset` maps the end of the phase to the start of the next phase, and the
+    end of the last phase to the section state (in `q`).
     """
 
     name: str
@@ -95,8 +94,9 @@ class PhaseSequence(NamedTuple):
 
 
 class CollocationSolution(NamedTuple):
-    """The unknowns of a cycle of n gait steps, batch last; each gait step runs the whole phase
-    sequence.
+    """Unknowns of a cycle of n gait steps, with the batch on the last axis.
+
+    Each gait step runs the whole phase sequence.
     """
 
     section_state: LaneArray  # (section_size, batch), at the start of the first gait step
@@ -107,7 +107,7 @@ class CollocationSolution(NamedTuple):
 
 
 class CycleLinearization(NamedTuple):
-    """Results of one linearized pass at a trial solution."""
+    """Results of the linearization of a cycle at a trial solution."""
 
     correction: CollocationSolution  # correction of Newton's method
     tangents: (
@@ -123,11 +123,12 @@ class CycleLinearization(NamedTuple):
     monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
 
 
-class _PassContext(NamedTuple):
-    """Inputs of a whole pass, and the layout of the tangents that it propagates.
+class _LinearizationContext(NamedTuple):
+    """Inputs of a linearization, and the layout of its tangents.
 
-    The order of the tangents is: the correction; one for each entry of the section state; one for
-    each parameter in `parameter_indices`; and, within a phase, one for its duration.
+    The order of the tangents is: the correction; one for each component of the section state; one
+    for each parameter in `parameter_indices`; and, within a phase, one for the duration of the
+    phase.
     """
 
     section_size: int
@@ -169,18 +170,19 @@ class _PassContext(NamedTuple):
         )
 
 
-def _make_context(
+def _make_linearization_context(
     section_size: int,
     parameter_indices: tuple[int, ...],
     parameters: LaneArray,
     compute_constants: Callable[..., PhaseConstants],
-) -> _PassContext:
-    """Return the context of a pass, with the constants and their tangents."""
+) -> _LinearizationContext:
+    """Return the context of a linearization, with the constants and their tangents."""
     prevent_fusion = fusion_barrier(parameters)
     dtype, lanes = parameters.dtype, parameters.shape[1:]
-    units = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
+    unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
     parameter_tangents = tuple(
-        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lanes)) for x in units.T
+        jnp.broadcast_to(x[:, None], (len(parameter_indices), *lanes))
+        for x in unit_parameter_tangents.T
     )
     if parameter_indices:
         constants, constants_tangents = value_and_jvps(
@@ -188,7 +190,7 @@ def _make_context(
         )
     else:
         constants, constants_tangents = compute_constants(*parameters), ()
-    return _PassContext(
+    return _LinearizationContext(
         section_size,
         parameter_indices,
         parameters,
@@ -199,14 +201,14 @@ def _make_context(
     )
 
 
-def _stack_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
+def _stack_phase_point(point: PhasePoint, template: Array) -> tuple[Array, ...]:
     """Return the parts of a point as arrays, some of which may be empty."""
     empty = jnp.zeros((0, *template.shape[1:]), template.dtype)
     return tuple(jnp.stack(components) if components else empty for components in point)
 
 
-class _PassState(NamedTuple):
-    """State of the pass with its tangents, on a leading axis."""
+class _PhaseTangentState(NamedTuple):
+    """State within a phase with its tangents, on a leading axis."""
 
     held_constants: LaneArray
     q: LaneArray
@@ -224,20 +226,22 @@ class _MeshInterval(NamedTuple):
     accelerations: LaneArray  # (node, coordinate, batch)
 
 
-def _unit_tangent(n_tangents: int, tangent_index: int, dtype: Any) -> np.ndarray:
+def _make_unit_tangent(n_tangents: int, tangent_index: int, dtype: Any) -> np.ndarray:
     """Return a unit vector over the tangents, with trailing axes for multiplication."""
     return np.eye(n_tangents, dtype=dtype)[tangent_index][:, None, None, None]
 
 
-def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Array, ...]:
+def _evaluate_interval_nodes(
+    tangent_state: _PhaseTangentState, mesh_interval: _MeshInterval
+) -> tuple[Array, ...]:
     """Return coordinates and rates at the nodes of an interval, and their tangents."""
-    duration_fraction, h, accelerations = interval
-    v, q_tangents, v_tangents = pass_state.v, pass_state.q_tangents, pass_state.v_tangents
+    duration_fraction, h, accelerations = mesh_interval
+    v, q_tangents, v_tangents = tangent_state.v, tangent_state.q_tangents, tangent_state.v_tangents
     nodes = GAUSS_NODES.astype(h.dtype)[:, None, None]
-    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)
+    duration_unit = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)
     rate_increments = apply_matrix(INTEGRATION_MATRIX, accelerations)
     position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, accelerations)
-    node_q = pass_state.q + h * (nodes * v + h * position_increments)
+    node_q = tangent_state.q + h * (nodes * v + h * position_increments)
     node_v = v + h * rate_increments
     node_q_tangents = (
         q_tangents[:, None]
@@ -248,13 +252,15 @@ def _evaluate_nodes(pass_state: _PassState, interval: _MeshInterval) -> tuple[Ar
     return node_q, node_v, node_q_tangents, node_v_tangents
 
 
-def _evaluate_end(
-    pass_state: _PassState, interval: _MeshInterval, acceleration_tangents: LaneArray
-) -> _PassState:
+def _evaluate_interval_end(
+    tangent_state: _PhaseTangentState,
+    mesh_interval: _MeshInterval,
+    acceleration_tangents: LaneArray,
+) -> _PhaseTangentState:
     """Return the state at the end of an interval from its accelerations and their tangents."""
-    duration_fraction, h, accelerations = interval
-    _, q, v, _, q_tangents, v_tangents = pass_state
-    duration_unit = _unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
+    duration_fraction, h, accelerations = mesh_interval
+    _, q, v, _, q_tangents, v_tangents = tangent_state
+    duration_unit = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
     rate_increment = weighted_sum(END_WEIGHTS, accelerations)
     position_increment = weighted_sum(DOUBLE_END_WEIGHTS, accelerations)
     rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
@@ -272,13 +278,13 @@ def _evaluate_end(
         + duration_unit * (duration_fraction * rate_increment)
     )
     q, v = q + h * v + h * h * position_increment, v + h * rate_increment
-    return pass_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
+    return tangent_state._replace(q=q, v=v, q_tangents=q_tangents, v_tangents=v_tangents)
 
 
 def _linearize_residual(
-    context: _PassContext,
+    linearization_context: _LinearizationContext,
     phase: CollocationPhase,
-    pass_state: _PassState,
+    tangent_state: _PhaseTangentState,
     node_q: LaneArray,
     node_v: LaneArray,
     accelerations: LaneArray,
@@ -289,36 +295,40 @@ def _linearize_residual(
     acceleration, held constants). The derivatives with respect to the parameters are separate, with
     the parameters on a leading axis.
     """
-    dim, n_held_constants = phase.n_coordinates, pass_state.held_constants.shape[0]
+    n_coordinates, n_held_constants = phase.n_coordinates, tangent_state.held_constants.shape[0]
 
     def evaluate_residual(*arguments: Array) -> Vector:
-        q, v, a = (arguments[i * dim : (i + 1) * dim] for i in range(3))
-        held_constants = arguments[3 * dim :][:n_held_constants]
-        parameters = arguments[3 * dim :][n_held_constants:]
+        q, v, a = (arguments[i * n_coordinates : (i + 1) * n_coordinates] for i in range(3))
+        held_constants = arguments[3 * n_coordinates :][:n_held_constants]
+        parameters = arguments[3 * n_coordinates :][n_held_constants:]
         constants = (
-            context.compute_constants(*parameters)
-            if context.parameter_indices
-            else context.constants
+            linearization_context.compute_constants(*parameters)
+            if linearization_context.parameter_indices
+            else linearization_context.constants
         )
         return phase.residual(constants, PhasePoint(held_constants, q, v), a)
 
-    arguments = [
-        argument[:, argument_offset]
-        for argument in (node_q, node_v, accelerations)
-        for argument_offset in range(dim)
+    residual_arguments = [
+        residual_argument[:, argument_offset]
+        for residual_argument in (node_q, node_v, accelerations)
+        for argument_offset in range(n_coordinates)
     ]
-    arguments += [
-        jnp.broadcast_to(argument, node_q[:, 0].shape) for argument in pass_state.held_constants
+    residual_arguments += [
+        jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
+        for residual_argument in tangent_state.held_constants
     ]
-    n_state_arguments = len(arguments)
-    if context.parameter_indices:
-        arguments += [
-            jnp.broadcast_to(argument, node_q[:, 0].shape) for argument in context.parameters
+    n_state_arguments = len(residual_arguments)
+    if linearization_context.parameter_indices:
+        residual_arguments += [
+            jnp.broadcast_to(residual_argument, node_q[:, 0].shape)
+            for residual_argument in linearization_context.parameters
         ]
     # The partial derivatives stay separate arrays at first, because each is a small kernel and
     # stacking them is a copy.
-    value, partials = context.prevent_fusion(value_and_partials(evaluate_residual, arguments))
-    partials_by_argument = list(zip(*partials, strict=True))
+    residual_value, partials_by_output = linearization_context.prevent_fusion(
+        value_and_partials(evaluate_residual, residual_arguments)
+    )
+    partials_by_argument = list(zip(*partials_by_output, strict=True))
     jacobian = jnp.stack(
         [
             jnp.stack(partials_of_argument, 1)
@@ -328,117 +338,131 @@ def _linearize_residual(
     )
     parameter_partials = [
         jnp.stack(partials_by_argument[n_state_arguments + argument_offset], 1)
-        for argument_offset in context.parameter_indices
+        for argument_offset in linearization_context.parameter_indices
     ]
-    return context.prevent_fusion(
-        (jnp.stack(value, 1), jacobian, jnp.stack(parameter_partials) if parameter_partials else ())
+    return linearization_context.prevent_fusion(
+        (
+            jnp.stack(residual_value, 1),
+            jacobian,
+            jnp.stack(parameter_partials) if parameter_partials else (),
+        )
     )
 
 
 def _assemble_node_system(
-    context: _PassContext,
-    pass_state: _PassState,
+    linearization_context: _LinearizationContext,
+    tangent_state: _PhaseTangentState,
     h: LaneArray,
     linearization: tuple,
     state_tangents: LaneArray,
 ) -> tuple[Array, Array]:
-    """Return the matrix and the right-hand sides, one for each tangent, of the equations for the
-    corrections of the accelerations.
+    """Return the matrix and the right-hand sides of the equations for corrections of the
+    accelerations.
+
+    There is one right-hand side for each tangent.
     """
-    value, jacobian, parameter_partials = linearization
-    n_tangents, dim, dtype = state_tangents.shape[0], value.shape[1], h.dtype
+    residual_value, jacobian, parameter_partials = linearization
+    n_tangents, n_coordinates, dtype = state_tangents.shape[0], residual_value.shape[1], h.dtype
     tangent_terms = [
         jacobian[:, :, argument_index] * state_tangents[:, :, argument_index, None]
-        for argument_index in range(2 * dim)
+        for argument_index in range(2 * n_coordinates)
     ]
     tangent_terms += [
-        jacobian[:, :, 3 * dim + argument_index]
-        * pass_state.held_tangents[:, argument_index, None, None]
-        for argument_index in range(pass_state.held_constants.shape[0])
+        jacobian[:, :, 3 * n_coordinates + argument_index]
+        * tangent_state.held_tangents[:, argument_index, None, None]
+        for argument_index in range(tangent_state.held_constants.shape[0])
     ]
-    rhs = sum(tangent_terms, start=_unit_tangent(n_tangents, 0, dtype) * value)
-    if context.parameter_indices:
-        n_leading = context.n_tangents - len(context.parameter_indices)
-        rhs = rhs + jnp.pad(parameter_partials, ((n_leading, 1), *((0, 0),) * 3))
+    right_hand_sides = sum(
+        tangent_terms, start=_make_unit_tangent(n_tangents, 0, dtype) * residual_value
+    )
+    if linearization_context.parameter_indices:
+        n_leading = linearization_context.n_tangents - len(linearization_context.parameter_indices)
+        right_hand_sides = right_hand_sides + jnp.pad(
+            parameter_partials, ((n_leading, 1), *((0, 0),) * 3)
+        )
     double_matrix, single_matrix = (
         matrix.astype(dtype)[:, None, :, None, None]
         for matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
     )
     jacobian_q, jacobian_v, jacobian_a = (
-        jacobian[:, :, None, i * dim : (i + 1) * dim] for i in range(3)
+        jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates] for i in range(3)
     )
     node_diagonal = np.eye(N_GAUSS_NODES, dtype=dtype)[:, None, :, None, None]
     system_matrix = node_diagonal * jacobian_a + h * (
         h * double_matrix * jacobian_q + single_matrix * jacobian_v
     )
-    return system_matrix, -jnp.moveaxis(rhs, 0, 2)
+    return system_matrix, -jnp.moveaxis(right_hand_sides, 0, 2)
 
 
 def _linearize_phase(
-    context: _PassContext,
+    linearization_context: _LinearizationContext,
     phase: CollocationPhase,
     mesh: PhaseMesh,
-    pass_state: _PassState,
+    tangent_state: _PhaseTangentState,
     duration: LaneArray,
     accelerations: LaneArray,
-) -> tuple[_PassState, LaneArray]:
-    """Return the state at the end of a phase, with one more tangent, and the tangents of its
-    accelerations.
+) -> tuple[_PhaseTangentState, LaneArray]:
+    """Return the state at the end of a phase, and the tangents of the phase's accelerations.
 
-    The last tangent is that with respect to the duration of the phase.
+    Within the phase there is one more tangent, the last one. It belongs to the duration of the
+    phase.
     """
     append_zero_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-    pass_state = pass_state._replace(
-        held_tangents=append_zero_tangent(pass_state.held_tangents),
-        q_tangents=append_zero_tangent(pass_state.q_tangents),
-        v_tangents=append_zero_tangent(pass_state.v_tangents),
+    tangent_state = tangent_state._replace(
+        held_tangents=append_zero_tangent(tangent_state.held_tangents),
+        q_tangents=append_zero_tangent(tangent_state.q_tangents),
+        v_tangents=append_zero_tangent(tangent_state.v_tangents),
     )
 
-    def linearize_interval(interval_state: tuple, inputs: tuple) -> tuple[tuple, Array]:
-        accelerations, duration_fraction = inputs
-        interval = _MeshInterval(duration_fraction, duration_fraction * duration, accelerations)
-        start_state = pass_state._replace(
-            **dict(zip(INTERVAL_STATE_FIELDS, interval_state, strict=True))
+    def linearize_interval(interval_state: tuple, interval_inputs: tuple) -> tuple[tuple, Array]:
+        accelerations, duration_fraction = interval_inputs
+        mesh_interval = _MeshInterval(
+            duration_fraction, duration_fraction * duration, accelerations
         )
-        node_q, node_v, node_q_tangents, node_v_tangents = context.prevent_fusion(
-            _evaluate_nodes(start_state, interval)
+        start_state = tangent_state._replace(
+            **dict(zip(PROPAGATED_STATE_FIELDS, interval_state, strict=True))
+        )
+        node_q, node_v, node_q_tangents, node_v_tangents = linearization_context.prevent_fusion(
+            _evaluate_interval_nodes(start_state, mesh_interval)
         )
         linearization = _linearize_residual(
-            context, phase, start_state, node_q, node_v, accelerations
+            linearization_context, phase, start_state, node_q, node_v, accelerations
         )
         # Axes: (tangent, node, argument, batch).
         state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
-        node_system = context.prevent_fusion(
-            _assemble_node_system(context, start_state, interval.h, linearization, state_tangents)
+        node_system = linearization_context.prevent_fusion(
+            _assemble_node_system(
+                linearization_context, start_state, mesh_interval.h, linearization, state_tangents
+            )
         )
         # Axes: (node, row, tangent, batch).
-        acceleration_tangents = context.prevent_fusion(
-            solve_node_equations(*node_system, context.parameters)
+        acceleration_tangents = linearization_context.prevent_fusion(
+            solve_node_equations(*node_system, linearization_context.parameters)
         )
-        end_state = _evaluate_end(start_state, interval, acceleration_tangents)
-        next_state = tuple(getattr(end_state, name) for name in INTERVAL_STATE_FIELDS)
+        end_state = _evaluate_interval_end(start_state, mesh_interval, acceleration_tangents)
+        next_state = tuple(getattr(end_state, name) for name in PROPAGATED_STATE_FIELDS)
         return next_state, jnp.moveaxis(acceleration_tangents, 2, 0)
 
-    start_state = tuple(getattr(pass_state, name) for name in INTERVAL_STATE_FIELDS)
+    start_state = tuple(getattr(tangent_state, name) for name in PROPAGATED_STATE_FIELDS)
     interval_fractions = jnp.asarray(mesh.interval_fractions, duration.dtype)
     end_state, acceleration_tangents = lax.scan(
         linearize_interval, start_state, (accelerations, interval_fractions)
     )
-    end_fields = dict(zip(INTERVAL_STATE_FIELDS, end_state, strict=True))
-    return pass_state._replace(**end_fields), acceleration_tangents
+    end_fields = dict(zip(PROPAGATED_STATE_FIELDS, end_state, strict=True))
+    return tangent_state._replace(**end_fields), acceleration_tangents
 
 
-INTERVAL_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
-"""Fields of the pass state that change within a phase."""
+PROPAGATED_STATE_FIELDS = ("q", "v", "q_tangents", "v_tangents")
+"""Names of the fields of `_PhaseTangentState` that change within a phase."""
 
 
 def _eliminate_duration(
-    context: _PassContext,
+    linearization_context: _LinearizationContext,
     phase: CollocationPhase,
-    pass_state: _PassState,
+    tangent_state: _PhaseTangentState,
     duration: LaneArray,
-    phase_active: Bool[Array, " lanes"],
-) -> tuple[_PassState, LaneArray, Callable[[Array], Array]]:
+    is_phase_active: Bool[Array, " lanes"],
+) -> tuple[_PhaseTangentState, LaneArray, Callable[[Array], Array]]:
     """Eliminate the duration of a phase by its event, and apply the reset.
 
     Return the state of the next phase, the tangents of the duration, and the function that
@@ -447,122 +471,152 @@ def _eliminate_duration(
 
     def evaluate_end(held_constants: Array, q: Array, v: Array, *constants: Array) -> tuple:
         point = PhasePoint(tuple(held_constants), tuple(q), tuple(v))
-        return phase.event(constants, point), _stack_point(phase.reset(constants, point), q)
+        return phase.event(constants, point), _stack_phase_point(phase.reset(constants, point), q)
 
-    point = pass_state.held_constants, pass_state.q, pass_state.v
-    point_tangents = pass_state.held_tangents, pass_state.q_tangents, pass_state.v_tangents
-    (event_value, next_point), (event_tangents, next_point_tangents) = context.value_and_tangents(
-        evaluate_end, point, point_tangents
+    end_point = tangent_state.held_constants, tangent_state.q, tangent_state.v
+    point_tangents = tangent_state.held_tangents, tangent_state.q_tangents, tangent_state.v_tangents
+    (event_value, next_point), (event_tangents, next_point_tangents) = (
+        linearization_context.value_and_tangents(evaluate_end, end_point, point_tangents)
     )
     correction_unit, duration_unit = (
-        _unit_tangent(event_tangents.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1)
+        _make_unit_tangent(event_tangents.shape[0], i, duration.dtype)[:, 0, 0] for i in (0, -1)
     )
-    event_value = jnp.where(phase_active, event_value, duration)
-    event_tangents = jnp.where(phase_active, event_tangents, duration_unit)
+    event_value = jnp.where(is_phase_active, event_value, duration)
+    event_tangents = jnp.where(is_phase_active, event_tangents, duration_unit)
     duration_tangents = (
         -(event_tangents[:-1] + correction_unit[:-1] * event_value) / event_tangents[-1]
     )
 
     def eliminate_duration(tangents: Array) -> Array:
-        factor = duration_tangents.reshape(
+        duration_factor = duration_tangents.reshape(
             duration_tangents.shape[:1] + (1,) * (tangents.ndim - 2) + (-1,)
         )
-        return tangents[:-1] + factor * tangents[-1:]
+        return tangents[:-1] + duration_factor * tangents[-1:]
 
-    next_state = _PassState(*next_point, *(eliminate_duration(x) for x in next_point_tangents))
+    next_state = _PhaseTangentState(
+        *next_point, *(eliminate_duration(x) for x in next_point_tangents)
+    )
     return next_state, duration_tangents, eliminate_duration
 
 
-def _linearize_step(
-    context: _PassContext,
-    sequence: PhaseSequence,
-    meshes: tuple[PhaseMesh, ...],
+def _linearize_gait_step(
+    linearization_context: _LinearizationContext,
+    phase_sequence: PhaseSequence,
+    phase_meshes: tuple[PhaseMesh, ...],
     section_and_tangents: tuple,
-    inputs: tuple,
+    step_inputs: tuple,
 ) -> tuple:
     """Propagate the section state and its tangents through one gait step, and return them."""
     section_state, section_tangents = section_and_tangents
-    durations, accelerations, phase_active = inputs
+    durations, accelerations, is_phase_active = step_inputs
 
     def evaluate_start(section_state: Array, *constants: Array) -> tuple:
-        return _stack_point(sequence.start(constants, tuple(section_state)), section_state)
+        return _stack_phase_point(
+            phase_sequence.start(constants, tuple(section_state)), section_state
+        )
 
-    start_point, start_tangents = context.value_and_tangents(
+    start_point, start_tangents = linearization_context.value_and_tangents(
         evaluate_start, (section_state,), (section_tangents,)
     )
-    pass_state = _PassState(*start_point, *start_tangents)
+    tangent_state = _PhaseTangentState(*start_point, *start_tangents)
     duration_tangents, acceleration_tangents = [], []
-    for i, phase in enumerate(sequence.phases):
-        pass_state, phase_acceleration_tangents = _linearize_phase(
-            context, phase, meshes[i], pass_state, durations[i], accelerations[i]
+    for i, phase in enumerate(phase_sequence.phases):
+        tangent_state, phase_acceleration_tangents = _linearize_phase(
+            linearization_context,
+            phase,
+            phase_meshes[i],
+            tangent_state,
+            durations[i],
+            accelerations[i],
         )
-        end_state = jnp.concatenate((pass_state.q, pass_state.v), -2)
-        end_tangents = jnp.concatenate((pass_state.q_tangents, pass_state.v_tangents), -2)
-        pass_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
-            context, phase, pass_state, durations[i], phase_active[i]
+        phase_end_state = jnp.concatenate((tangent_state.q, tangent_state.v), -2)
+        phase_end_tangents = jnp.concatenate(
+            (tangent_state.q_tangents, tangent_state.v_tangents), -2
+        )
+        tangent_state, phase_duration_tangents, eliminate_duration = _eliminate_duration(
+            linearization_context, phase, tangent_state, durations[i], is_phase_active[i]
         )
         duration_tangents.append(phase_duration_tangents)
         # Axes: (tangent, interval, node, row, batch).
         acceleration_tangents.append(
             eliminate_duration(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
         )
-        pass_state = context.prevent_fusion(pass_state)
+        tangent_state = linearization_context.prevent_fusion(tangent_state)
     # The end state and its tangents are those of the last phase.
-    outputs = (
-        end_state,
-        eliminate_duration(end_tangents),
+    step_outputs = (
+        phase_end_state,
+        eliminate_duration(phase_end_tangents),
         jnp.stack(duration_tangents, 1),
         tuple(acceleration_tangents),
     )
-    return (pass_state.q, pass_state.q_tangents), outputs
+    return (tangent_state.q, tangent_state.q_tangents), step_outputs
 
 
 def linearize_cycle(
-    sequence: PhaseSequence,
-    meshes: tuple[PhaseMesh, ...],
+    phase_sequence: PhaseSequence,
+    phase_meshes: tuple[PhaseMesh, ...],
     compute_constants: Callable[..., PhaseConstants],
     parameters: LaneArray,
     solution: CollocationSolution,
-    phase_active: Bool[Array, "n n_phases lanes"],
+    is_phase_active: Bool[Array, "n n_phases lanes"],
     parameter_indices: tuple[int, ...] = (),
 ) -> CycleLinearization:
     """Return Newton's correction, the monodromy matrix and the requested tangents at `solution`.
 
-    `phase_active` marks the phases that take place. An inactive phase has duration zero and only
+    `is_phase_active` marks the phases that take place. An inactive phase has duration zero and only
     applies its reset.
     """
-    context = _make_context(sequence.section_size, parameter_indices, parameters, compute_constants)
-    section_state, dtype, n_tangents = solution.section_state, parameters.dtype, context.n_tangents
-    section_units = np.eye(n_tangents, dtype=dtype)[:, context.section_slice, None]
-    carry = section_state, jnp.broadcast_to(section_units, (n_tangents, *section_state.shape))
-    inputs = (solution.durations, solution.accelerations, phase_active)
-    linearize_step = functools.partial(_linearize_step, context, sequence, meshes)
+    linearization_context = _make_linearization_context(
+        phase_sequence.section_size, parameter_indices, parameters, compute_constants
+    )
+    section_state, dtype, n_tangents = (
+        solution.section_state,
+        parameters.dtype,
+        linearization_context.n_tangents,
+    )
+    section_units = np.eye(n_tangents, dtype=dtype)[:, linearization_context.section_slice, None]
+    section_and_tangents = (
+        section_state,
+        jnp.broadcast_to(section_units, (n_tangents, *section_state.shape)),
+    )
+    step_inputs = (solution.durations, solution.accelerations, is_phase_active)
+    linearize_step = functools.partial(
+        _linearize_gait_step, linearization_context, phase_sequence, phase_meshes
+    )
     if solution.durations.shape[0] == 1:
-        (return_state, return_tangents), outputs = linearize_step(
-            carry, jax.tree.map(lambda x: x[0], inputs)
+        (return_state, return_tangents), step_outputs = linearize_step(
+            section_and_tangents, jax.tree.map(lambda x: x[0], step_inputs)
         )
-        outputs = jax.tree.map(lambda x: x[None], outputs)
+        step_outputs = jax.tree.map(lambda x: x[None], step_outputs)
     else:
-        (return_state, return_tangents), outputs = lax.scan(linearize_step, carry, inputs)
+        (return_state, return_tangents), step_outputs = lax.scan(
+            linearize_step, section_and_tangents, step_inputs
+        )
 
-    monodromy = jnp.swapaxes(return_tangents[context.section_slice], 0, 1)
-    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[context.section_slice.stop :]])
-    correction_unit = np.eye(n_tangents - context.section_size, dtype=dtype)[0][:, None, None]
-    rhs = drop_section_tangents(return_tangents) + correction_unit * (return_state - section_state)
+    monodromy = jnp.swapaxes(return_tangents[linearization_context.section_slice], 0, 1)
+    drop_section_tangents = lambda x: jnp.concatenate(
+        [x[:1], x[linearization_context.section_slice.stop :]]
+    )
+    correction_unit_vector = np.eye(n_tangents - linearization_context.section_size, dtype=dtype)[
+        0
+    ][:, None, None]
+    right_hand_sides = drop_section_tangents(return_tangents) + correction_unit_vector * (
+        return_state - section_state
+    )
     closing_matrix = invert_small(
-        jnp.eye(context.section_size, dtype=dtype)[:, :, None] - monodromy
+        jnp.eye(linearization_context.section_size, dtype=dtype)[:, :, None] - monodromy
     )
     closed_section_tangents = jnp.swapaxes(
-        contract_axes(closing_matrix, jnp.swapaxes(rhs, 0, 1)), 0, 1
+        contract_axes(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
     def close_cycle(tangents: Array) -> Array:
-        """Return (tangent, n, ...) from (n, tangent, ...), with the tangents of the section
-        state eliminated.
+        """Return (tangent, n, ...) from (n, tangent, ...) without the tangents of the section
+        state.
         """
         tangents = jnp.swapaxes(tangents, 0, 1)
         shape = (-1, *(1,) * (tangents.ndim - 2), *section_state.shape[1:])
-        section_tangents = tangents[context.section_slice]
+        section_tangents = tangents[linearization_context.section_slice]
         section_terms = [
             closed_section_tangents[:, section_index].reshape(shape)
             * section_tangents[section_index]
@@ -570,11 +624,11 @@ def linearize_cycle(
         ]
         return drop_section_tangents(tangents) + sum(section_terms[1:], start=section_terms[0])
 
-    step_ends, *uncorrected_tangents = context.prevent_fusion(outputs)
+    step_ends, *uncorrected_tangents = linearization_context.prevent_fusion(step_outputs)
     step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
         close_cycle, tuple(uncorrected_tangents)
     )
-    step_end_tangents, solution_tangents = context.prevent_fusion(
+    step_end_tangents, solution_tangents = linearization_context.prevent_fusion(
         (
             step_end_tangents,
             CollocationSolution(closed_section_tangents, duration_tangents, acceleration_tangents),
@@ -598,48 +652,49 @@ class PhasePoints(NamedTuple):
 
 
 def reconstruct_step(
-    sequence: PhaseSequence,
-    meshes: tuple[PhaseMesh, ...],
+    phase_sequence: PhaseSequence,
+    phase_meshes: tuple[PhaseMesh, ...],
     constants: PhaseConstants,
     section_state: Vector,
     durations: Array,
     accelerations: tuple[Array, ...],
 ) -> tuple[Vector, tuple[PhasePoints, ...]]:
-    """Return the section state after a gait step of known durations and accelerations, and the
-    points of its phases.
+    """Return the section state after a gait step, and the points of its phases.
 
-    No equation is solved. Any trailing axes are allowed.
+    Durations and accelerations of the step are known, so no equation is solved. Any trailing axes
+    are allowed.
     """
-    point = sequence.start(constants, section_state)
+    start_point = phase_sequence.start(constants, section_state)
     phase_points = []
-    for i, phase in enumerate(sequence.phases):
-        times, rate_matrix, position_matrix = (
-            weights.astype(durations.dtype) for weights in phase_integration_matrices(meshes[i])
+    for i, phase in enumerate(phase_sequence.phases):
+        node_times, rate_matrix, position_matrix = (
+            weights.astype(durations.dtype)
+            for weights in phase_integration_matrices(phase_meshes[i])
         )
         accelerations_of_phase, duration = accelerations[i], durations[i]
         accelerations_of_phase = accelerations_of_phase.reshape(
             -1, *accelerations_of_phase.shape[2:]
         )
-        q, v = jnp.stack(point.q), jnp.stack(point.v)
-        times = times.reshape(-1, *(1,) * q.ndim)
+        q, v = jnp.stack(start_point.q), jnp.stack(start_point.v)
+        node_times = node_times.reshape(-1, *(1,) * q.ndim)
         node_q = q + duration * (
-            times * v + duration * jnp.tensordot(position_matrix, accelerations_of_phase, 1)
+            node_times * v + duration * jnp.tensordot(position_matrix, accelerations_of_phase, 1)
         )
         node_v = v + duration * jnp.tensordot(rate_matrix, accelerations_of_phase, 1)
-        nodes = PhasePoint(
-            point.held_constants,
+        node_points = PhasePoint(
+            start_point.held_constants,
             tuple(node_q[:-1].swapaxes(0, 1)),
             tuple(node_v[:-1].swapaxes(0, 1)),
         )
-        end = PhasePoint(point.held_constants, tuple(node_q[-1]), tuple(node_v[-1]))
-        phase_points.append(PhasePoints(point, nodes, end))
-        point = phase.reset(constants, end)
-    return point.q, tuple(phase_points)
+        end_point = PhasePoint(start_point.held_constants, tuple(node_q[-1]), tuple(node_v[-1]))
+        phase_points.append(PhasePoints(start_point, node_points, end_point))
+        start_point = phase.reset(constants, end_point)
+    return start_point.q, tuple(phase_points)
 
 
 def estimate_mesh_error(
-    sequence: PhaseSequence,
-    meshes: tuple[PhaseMesh, ...],
+    phase_sequence: PhaseSequence,
+    phase_meshes: tuple[PhaseMesh, ...],
     solution: CollocationSolution,
     error_per_jump: float = 0.05,
 ) -> LaneArray:
@@ -655,26 +710,32 @@ def estimate_mesh_error(
       round-off. It was tested with 346 random gaits of periods to 10 s on two meshes. For most of
       them the estimate is far above the error.
     """
-    largest_jump = jnp.zeros(solution.section_state.shape[-1], solution.section_state.dtype)
-    for i, mesh in enumerate(meshes):
-        if mesh.n_intervals == 1 or not sequence.phases[i].is_smooth:
+    largest_acceleration_jump = jnp.zeros(
+        solution.section_state.shape[-1], solution.section_state.dtype
+    )
+    for i, mesh in enumerate(phase_meshes):
+        if mesh.n_intervals == 1 or not phase_sequence.phases[i].is_smooth:
             continue
         left_limits, right_limits = (
             jnp.tensordot(
-                jnp.asarray(lagrange_weights(location), largest_jump.dtype),
+                jnp.asarray(lagrange_weights(interval_location), largest_acceleration_jump.dtype),
                 node_accelerations,
                 (0, 2),
             )
-            for location, node_accelerations in (
+            for interval_location, node_accelerations in (
                 (1.0, solution.accelerations[i][:, :-1]),
                 (0.0, solution.accelerations[i][:, 1:]),
             )
         )
         max_fraction = np.maximum(mesh.interval_fractions[1:], mesh.interval_fractions[:-1])
-        length = (
-            max_fraction[:, None, None].astype(largest_jump.dtype)
+        longer_interval_length = (
+            max_fraction[:, None, None].astype(largest_acceleration_jump.dtype)
             * solution.durations[:, None, None, i]
         )
-        acceleration_jump = jnp.abs(left_limits - right_limits) * length * length
-        largest_jump = jnp.maximum(largest_jump, jnp.max(acceleration_jump, axis=(0, 1, 2)))
-    return error_per_jump * largest_jump
+        acceleration_jump = (
+            jnp.abs(left_limits - right_limits) * longer_interval_length * longer_interval_length
+        )
+        largest_acceleration_jump = jnp.maximum(
+            largest_acceleration_jump, jnp.max(acceleration_jump, axis=(0, 1, 2))
+        )
+    return error_per_jump * largest_acceleration_jump

@@ -34,9 +34,9 @@ from vrw_jax.contact.mechanics import WheelMotion, leg_directions, opaque_one, p
 from vrw_jax.hybrid import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.integrator import (
     ButcherTableau,
+    compute_step_size_factor,
     find_guard_minimum,
     fit_guard_parabola,
-    step_size_factor,
 )
 from vrw_jax.numerics import StepOptions, tree_where
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
@@ -522,7 +522,7 @@ def integrator_step(
     step_size_ratio = jnp.where(
         needs_retry,
         attempt.minimum_fraction,
-        step_size_factor(tableau, attempt.squared_error, h.dtype),
+        compute_step_size_factor(tableau, attempt.squared_error, h.dtype),
     )
     # The last step ends exactly at the time limit.
     time_limit = options.max_phase_time

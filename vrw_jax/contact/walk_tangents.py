@@ -41,7 +41,7 @@ from vrw_jax.contact.walk_kernel import (
     DifferentiableLaneState,
     LaneState,
 )
-from vrw_jax.integrator import ButcherTableau, real_stability_limit
+from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
 from vrw_jax.numerics import StepOptions, run_if_any, tree_where
 from vrw_jax.wheel import compute_wheel_units
 
@@ -502,7 +502,7 @@ def _max_stable_step(
         ~dynamics.contact_state.locked & (dynamics.contact_state.contact_modes == ContactMode.OFF),
         axis=0,
     )
-    step_factor = safety_factor * real_stability_limit(tableau)
+    step_factor = safety_factor * compute_real_stability_limit(tableau)
     return jnp.where(has_swing_leg, step_factor * dynamics.s.m / dynamics.s.c, jnp.inf)
 
 

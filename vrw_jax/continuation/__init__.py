@@ -10,8 +10,8 @@ from vrw_jax.continuation.arclength import (
     ContinuationStatus,
     FixedPointProblem,
     NewtonStep,
+    ProblemUnknowns,
     SectionVector,
-    Unknowns,
 )
 from vrw_jax.continuation.batched_continuation import (
     continue_many_from,

@@ -48,10 +48,10 @@ class FixedPointResult(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return whether Newton's method converged, as a sentence; for a batch, an array of
+        """Return a sentence about whether Newton's method converged; for a batch, an array of
         sentences.
         """
-        return describe_elements(_describe_convergence, self.converged, self.n_iterations)
+        return describe_elements(_describe_newton_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -59,19 +59,19 @@ class FixedPointResult(NamedTuple):
         multipliers = np.full(len(self.x), np.nan)
         if np.all(np.isfinite(self.jacobian)):
             multipliers = np.linalg.eigvals(self.jacobian)
-        rows = [
+        text_rows = [
             ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
             ("x", format_numbers(self.x)),
             ("residual", format_quantity(self.residual, "")),
             ("multipliers", format_numbers(multipliers)),
         ]
         if self.termination is not None:
-            rows.append(("simulation", Termination(int(self.termination)).meaning))
-        return format_text("FixedPointResult", rows)
+            text_rows.append(("simulation", Termination(int(self.termination)).meaning))
+        return format_text("FixedPointResult", text_rows)
 
 
-def _describe_convergence(converged: bool, n_iterations: int) -> str:
-    """Return a sentence on the convergence to one fixed point."""
+def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
+    """Return a sentence about the convergence to one fixed point."""
     if converged:
         return f"Newton's method converged after {n_iterations} iterations."
     return (
@@ -81,9 +81,8 @@ def _describe_convergence(converged: bool, n_iterations: int) -> str:
 
 
 MAX_NEWTON_ITERATIONS = 30
-"""Default limit of Newton's iterations, chosen far above the number that a start near the point
-needs.
-"""
+"""Default limit of Newton's iterations. The value is chosen far above the number that a start near
+the fixed point needs."""
 
 
 @raise_for_renamed_arguments(iterations="max_iterations")
@@ -122,10 +121,14 @@ def solve_fixed_point(
         0.739085 True
     """
 
-    cycle = _solve_checked(_run_newton, function, start, period_n, tolerance, max_iterations)
+    fixed_point = _check_and_solve(
+        _run_newton, function, start, period_n, tolerance, max_iterations
+    )
     if isinstance(function, ReturnMap):
-        cycle = cycle._replace(termination=function.find_termination(cycle.x, period_n))
-    return cycle
+        fixed_point = fixed_point._replace(
+            termination=function.find_termination(fixed_point.x, period_n)
+        )
+    return fixed_point
 
 
 def solve_fixed_point_implicit(
@@ -140,12 +143,12 @@ def solve_fixed_point_implicit(
     First derivatives of the point need only first derivatives of `function`, and second derivatives
     need second ones. Derivatives of the Jacobian are NaN.
     """
-    return _solve_checked(
+    return _check_and_solve(
         _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
     )
 
 
-def _solve_checked(
+def _check_and_solve(
     run_newton: Callable[..., FixedPointResult],
     function: Callable[[Array], Array],
     start: Any,
@@ -153,7 +156,7 @@ def _solve_checked(
     tolerance: float | Scalar,
     max_iterations: int,
 ) -> FixedPointResult:
-    """Check the arguments, and return the fixed point by one of the two methods below."""
+    """Check the arguments, and return the fixed point by the given form of Newton's method."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     max_iterations = check_int("max_iterations", max_iterations)
@@ -167,22 +170,30 @@ def _solve_checked(
         check_positive("tolerance", tolerance)
 
     start = lax.stop_gradient(start)
-    output = jax.eval_shape(function, start)
-    if getattr(output, "shape", None) != start.shape:
-        description = getattr(output, "shape", type(output).__name__)
+    map_output = jax.eval_shape(function, start)
+    if getattr(map_output, "shape", None) != start.shape:
+        map_description = getattr(map_output, "shape", type(map_output).__name__)
         raise ValueError(
-            f"the map gives {description} for a start of shape {start.shape}, but it must give "
+            f"the map gives {map_description} for a start of shape {start.shape}, but it must give "
             "an array of that shape: take a map of a state to the next state."
         )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     map_and_iterations = (run_newton, function, period_n, max_iterations)
-    arguments = start, tolerance
+    newton_arguments = start, tolerance
     uses_program_cache = isinstance(function, ReturnMap)
-    program = find_program(_solve, map_and_iterations, *arguments) if uses_program_cache else None
-    return (program or functools.partial(_solve, map_and_iterations))(*arguments)
+    compiled_program = (
+        find_program(_solve_iterated_map, map_and_iterations, *newton_arguments)
+        if uses_program_cache
+        else None
+    )
+    return (compiled_program or functools.partial(_solve_iterated_map, map_and_iterations))(
+        *newton_arguments
+    )
 
 
-def _solve(map_and_iterations: tuple, start: Array, tolerance: Array) -> FixedPointResult:
+def _solve_iterated_map(
+    map_and_iterations: tuple, start: Array, tolerance: Array
+) -> FixedPointResult:
     run_newton, function, period_n, iterations = map_and_iterations
 
     def iterate(x: Array) -> Array:
@@ -190,20 +201,24 @@ def _solve(map_and_iterations: tuple, start: Array, tolerance: Array) -> FixedPo
             x = function(x)
         return x
 
-    converted_map, closed_over = jax.closure_convert(iterate, start)
-    return run_newton(converted_map, iterations, start, tolerance, *closed_over)
+    converted_map, closed_over_values = jax.closure_convert(iterate, start)
+    return run_newton(converted_map, iterations, start, tolerance, *closed_over_values)
 
 
-ConvertedMap = Callable[..., Array]
+ClosureConvertedMap = Callable[..., Array]
 
 
-def _newton_correction(
-    converted_map: ConvertedMap, x: Array, closed_over: tuple
+def _compute_newton_correction(
+    converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
 ) -> tuple[Array, Array, Array]:
     """Return Newton's correction, the map's Jacobian, and the defect map(x) - x."""
-    image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over), x)
-    defect = image_point - x
-    return jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, defect), jacobian, defect
+    image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over_values), x)
+    map_defect = image_point - x
+    return (
+        jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect),
+        jacobian,
+        map_defect,
+    )
 
 
 N_DERIVATIVE_ITERATIONS = 2
@@ -214,10 +229,15 @@ derivatives of the point.
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton(
-    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+    converted_map: ClosureConvertedMap,
+    iterations: int,
+    start: Array,
+    tolerance: Array,
+    *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method in one loop, in which the map, often a large
-    program, is compiled once.
+    """Return the fixed point by Newton's method in one loop.
+
+    The loop compiles the map, often a large program, once.
     """
 
     def is_searching(correction_norm: Array, n_iterations: Array) -> Array:
@@ -227,16 +247,18 @@ def _run_newton(
             & jnp.isfinite(correction_norm)
         )
 
-    def needs_iteration(state: tuple) -> Array:
-        _, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+    def needs_newton_iteration(loop_state: tuple) -> Array:
+        _, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
         return is_searching(correction_norm, n_iterations) | (
             (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
         )
 
-    def iterate_newton(state: tuple) -> tuple:
-        x, correction_norm, n_iterations, n_derivative_iterations, *_ = state
+    def iterate_newton(loop_state: tuple) -> tuple:
+        x, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
         n_searching = is_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
-        correction, jacobian, defect = _newton_correction(converted_map, x, closed_over)
+        correction, jacobian, map_defect = _compute_newton_correction(
+            converted_map, x, closed_over_values
+        )
         # The correction is also checked in the last iterations, because the map may jump near the
         # point.
         correction_norm = jnp.max(jnp.abs(correction))
@@ -247,7 +269,7 @@ def _run_newton(
             n_iterations + n_searching,
             n_derivative_iterations + 1 - n_searching,
             jacobian,
-            jnp.max(jnp.abs(defect)),
+            jnp.max(jnp.abs(map_defect)),
         )
 
     zero_count, unit_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
@@ -260,7 +282,7 @@ def _run_newton(
         unit_norm,
     )
     x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
-        needs_iteration, iterate_newton, initial_state
+        needs_newton_iteration, iterate_newton, initial_state
     )
     is_converged = correction_norm <= tolerance
     return FixedPointResult(
@@ -271,58 +293,68 @@ def _run_newton(
 @_run_newton.defjvp
 @with_default_settings
 def _run_newton_jvp(
-    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+    converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent, by iterations with derivatives from the point."""
-    start, _, *closed_over = primals
-    result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
+    start, _, *closed_over_values = primals
+    newton_result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
 
-    def solve_from_fixed_point(*closed_over: Any) -> FixedPointResult:
+    def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            correction, jacobian, defect = _newton_correction(converted_map, point, closed_over)
-            next_point = point + jnp.where(result.converged, correction, 0.0)
-            return next_point, (jacobian, jnp.max(jnp.abs(defect)))
+            correction, jacobian, map_defect = _compute_newton_correction(
+                converted_map, point, closed_over_values
+            )
+            next_point = point + jnp.where(newton_result.converged, correction, 0.0)
+            return next_point, (jacobian, jnp.max(jnp.abs(map_defect)))
 
         point, (jacobians, residuals) = lax.scan(
-            iterate_with_derivatives, result.x, None, length=N_DERIVATIVE_ITERATIONS
+            iterate_with_derivatives, newton_result.x, None, length=N_DERIVATIVE_ITERATIONS
         )
-        x = jnp.where(result.converged, point, start)
+        x = jnp.where(newton_result.converged, point, start)
         return FixedPointResult(
-            x, jacobians[-1], residuals[-1], result.converged, result.n_iterations
+            x, jacobians[-1], residuals[-1], newton_result.converged, newton_result.n_iterations
         )
 
-    return jax.jvp(solve_from_fixed_point, tuple(closed_over), tuple(tangents[2:]))
+    return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[2:]))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_implicit(
-    converted_map: ConvertedMap, iterations: int, start: Array, tolerance: Array, *closed_over: Any
+    converted_map: ClosureConvertedMap,
+    iterations: int,
+    start: Array,
+    tolerance: Array,
+    *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Return the fixed point by Newton's method, with the derivative rule of the implicit
-    function theorem.
+    """Return the fixed point by Newton's method, with the implicit function theorem as derivative
+    rule.
     """
-    return _run_newton(converted_map, iterations, start, tolerance, *closed_over)
+    return _run_newton(converted_map, iterations, start, tolerance, *closed_over_values)
 
 
 @_run_newton_implicit.defjvp
 @with_default_settings
 def _run_newton_implicit_jvp(
-    converted_map: ConvertedMap, iterations: int, primals: tuple, tangents: tuple
+    converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
-    The point in this rule is differentiated by the same rule.
+    The same rule differentiates the fixed point that the tangent contains.
     """
-    result = _run_newton_implicit(converted_map, iterations, *primals)
-    closed_over, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
+    newton_result = _run_newton_implicit(converted_map, iterations, *primals)
+    closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
     _, map_tangent = jax.jvp(
-        lambda *arguments: converted_map(result.x, *arguments), closed_over, closed_over_tangents
+        lambda *arguments: converted_map(newton_result.x, *arguments),
+        closed_over_values,
+        closed_over_tangents,
     )
-    _, jacobian = value_and_jacobian(lambda x: converted_map(x, *closed_over), result.x)
+    _, jacobian = value_and_jacobian(
+        lambda x: converted_map(x, *closed_over_values), newton_result.x
+    )
     point_tangent = jnp.linalg.solve(
-        jnp.eye(result.x.size, dtype=result.x.dtype) - jacobian, map_tangent
+        jnp.eye(newton_result.x.size, dtype=newton_result.x.dtype) - jacobian, map_tangent
     )
-    point_tangent = jnp.where(result.converged, point_tangent, 0.0)
-    unknown_jacobian = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
-    zero_result = zero_tangent(result)
-    return result, zero_result._replace(x=point_tangent, jacobian=unknown_jacobian)
+    point_tangent = jnp.where(newton_result.converged, point_tangent, 0.0)
+    nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
+    zero_tangents = zero_tangent(newton_result)
+    return newton_result, zero_tangents._replace(x=point_tangent, jacobian=nan_jacobian_tangent)

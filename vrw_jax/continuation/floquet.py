@@ -54,38 +54,40 @@ MULTIPLIER_TOLERANCES = MultiplierTolerances()
 
 def characteristic_polynomial(matrix: RealMatrix) -> tuple[Array, ...]:
     """Return the coefficients (a_0, ..., a_{n-1}) of z^n + ... + a_1 z + a_0 = det(z - matrix)."""
-    entries = lambda i, j: matrix[..., i, j]
+    matrix_entries = lambda i, j: matrix[..., i, j]
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
         raise ValueError(
             f"the matrix has shape {matrix.shape}, but multipliers are built for 1x1, 2x2 and 3x3."
         )
     if n == 1:
-        return (-entries(0, 0),)
+        return (-matrix_entries(0, 0),)
     if n == 2:
-        return entries(0, 0) * entries(1, 1) - entries(0, 1) * entries(1, 0), -(
-            entries(0, 0) + entries(1, 1)
-        )
-    minors = [
-        entries(i, i) * entries(j, j) - entries(i, j) * entries(j, i)
+        return matrix_entries(0, 0) * matrix_entries(1, 1) - matrix_entries(0, 1) * matrix_entries(
+            1, 0
+        ), -(matrix_entries(0, 0) + matrix_entries(1, 1))
+    principal_minors = [
+        matrix_entries(i, i) * matrix_entries(j, j) - matrix_entries(i, j) * matrix_entries(j, i)
         for i, j in ((0, 1), (0, 2), (1, 2))
     ]
     cofactors = [
-        entries(1, 1) * entries(2, 2) - entries(1, 2) * entries(2, 1),
-        entries(1, 2) * entries(2, 0) - entries(1, 0) * entries(2, 2),
-        entries(1, 0) * entries(2, 1) - entries(1, 1) * entries(2, 0),
+        matrix_entries(1, 1) * matrix_entries(2, 2) - matrix_entries(1, 2) * matrix_entries(2, 1),
+        matrix_entries(1, 2) * matrix_entries(2, 0) - matrix_entries(1, 0) * matrix_entries(2, 2),
+        matrix_entries(1, 0) * matrix_entries(2, 1) - matrix_entries(1, 1) * matrix_entries(2, 0),
     ]
     determinant = (
-        entries(0, 0) * cofactors[0] + entries(0, 1) * cofactors[1] + entries(0, 2) * cofactors[2]
+        matrix_entries(0, 0) * cofactors[0]
+        + matrix_entries(0, 1) * cofactors[1]
+        + matrix_entries(0, 2) * cofactors[2]
     )
     return (
         -determinant,
-        minors[0] + minors[1] + minors[2],
-        -(entries(0, 0) + entries(1, 1) + entries(2, 2)),
+        principal_minors[0] + principal_minors[1] + principal_minors[2],
+        -(matrix_entries(0, 0) + matrix_entries(1, 1) + matrix_entries(2, 2)),
     )
 
 
-def _safe_sqrt(x: Array) -> Array:
+def _safe_square_root(x: Array) -> Array:
     """Return the square root of max(x, 0), with derivative zero if x <= 0."""
     is_positive = x > 0.0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
@@ -101,14 +103,16 @@ class _EigenvaluePair(NamedTuple):
     @property
     def modulus(self) -> Array:
         """Return the modulus of both eigenvalues if they are complex."""
-        return _safe_sqrt(self.mean * self.mean + self.imaginary_offset * self.imaginary_offset)
+        return _safe_square_root(
+            self.mean * self.mean + self.imaginary_offset * self.imaginary_offset
+        )
 
 
-def _solve_quadratic(a0: Array, a1: Array) -> _EigenvaluePair:
+def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
     """Return the roots of z^2 + a1 z + a0."""
     mean = -0.5 * a1
     discriminant = mean * mean - a0
-    return _EigenvaluePair(mean, _safe_sqrt(discriminant), _safe_sqrt(-discriminant))
+    return _EigenvaluePair(mean, _safe_square_root(discriminant), _safe_square_root(-discriminant))
 
 
 def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
@@ -125,7 +129,7 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
     has_three_real_roots = discriminant < 0.0
     # A single real root is the sum of two cube roots, computed without cancellation.
     larger_cube_root = jnp.cbrt(
-        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_sqrt(discriminant)
+        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * _safe_square_root(discriminant)
     )
     unique_real_root = larger_cube_root - jnp.where(
         larger_cube_root == 0.0,
@@ -133,36 +137,38 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
         p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
     )
     # Of three real roots, the extreme one on the isolated side is computed.
-    trigonometric_radius = 2.0 * _safe_sqrt(-p / 3.0)
-    cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
+    trigonometric_radius = 2.0 * _safe_square_root(-p / 3.0)
+    root_cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
     extreme_root = trigonometric_radius * jnp.cos(
-        jnp.arccos(jnp.clip(jnp.abs(cosine), 0.0, 1.0)) / 3.0
+        jnp.arccos(jnp.clip(jnp.abs(root_cosine), 0.0, 1.0)) / 3.0
     )
     z = mean_root + jnp.where(
         has_three_real_roots,
-        jnp.where(cosine >= 0.0, extreme_root, -extreme_root),
+        jnp.where(root_cosine >= 0.0, extreme_root, -extreme_root),
         unique_real_root,
     )
     for _ in range(3):
-        value = a0 + z * (a1 + z * (a2 + z))
-        derivative = a1 + z * (2.0 * a2 + 3.0 * z)
+        polynomial_value = a0 + z * (a1 + z * (a2 + z))
+        polynomial_derivative = a1 + z * (2.0 * a2 + 3.0 * z)
         z = z - jnp.where(
-            derivative == 0.0, 0.0, value / jnp.where(derivative == 0.0, 1.0, derivative)
+            polynomial_derivative == 0.0,
+            0.0,
+            polynomial_value / jnp.where(polynomial_derivative == 0.0, 1.0, polynomial_derivative),
         )
     return z
 
 
-def _split_eigenvalues(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair | None]:
+def _split_into_isolated_and_pair(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair | None]:
     """Return the isolated real eigenvalues, and the remaining pair."""
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
     if len(coefficients) == 2:
-        return [], _solve_quadratic(*coefficients)
+        return [], _solve_quadratic_pair(*coefficients)
     a0, a1, a2 = coefficients
     isolated_root = _solve_cubic_real_root(a0, a1, a2)
     linear_coefficient = a2 + isolated_root
-    return [isolated_root], _solve_quadratic(
+    return [isolated_root], _solve_quadratic_pair(
         a1 + isolated_root * linear_coefficient, linear_coefficient
     )
 
@@ -172,37 +178,41 @@ def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
     """Return all eigenvalues, largest modulus first."""
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return _sort_by_modulus(jnp.linalg.eigvals(matrix))
-    isolated_values, pair = _split_eigenvalues(matrix)
-    values = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_values]
-    if pair is not None:
-        mean, real_offset, imaginary_offset = pair
-        values += [
+    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_values]
+    if remaining_pair is not None:
+        mean, real_offset, imaginary_offset = remaining_pair
+        eigenvalues += [
             lax.complex(mean + sign * real_offset, sign * imaginary_offset) for sign in (1.0, -1.0)
         ]
-    return _sort_by_modulus(jnp.stack(values, -1))
+    return _sort_by_modulus(jnp.stack(eigenvalues, -1))
 
 
-def _sort_by_modulus(values: Array) -> Array:
+def _sort_by_modulus(eigenvalues: Array) -> Array:
     """Return the eigenvalues sorted by modulus, the largest first."""
-    modulus = jnp.square(values.real) + jnp.square(values.imag)
-    descending_order = jnp.argsort(-lax.stop_gradient(modulus), axis=-1)
-    return jnp.take_along_axis(values, descending_order, -1)
+    eigenvalue_moduli = jnp.square(eigenvalues.real) + jnp.square(eigenvalues.imag)
+    descending_order = jnp.argsort(-lax.stop_gradient(eigenvalue_moduli), axis=-1)
+    return jnp.take_along_axis(eigenvalues, descending_order, -1)
 
 
 @jax.jit
 def compute_spectral_radius(matrix: RealMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of an eigenvalue.
 
-    If two eigenvalues are equal, its derivative is one-sided or zero.
+    If two eigenvalues are equal, the derivative of the spectral radius is one-sided or zero.
     """
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
         return jnp.abs(floquet_multipliers(matrix)[..., 0])
-    isolated_values, pair = _split_eigenvalues(matrix)
-    moduli = [jnp.abs(x) for x in isolated_values]
-    if pair is not None:
-        max_real_modulus = jnp.abs(pair.mean) + pair.real_offset
-        moduli.append(jnp.where(pair.imaginary_offset > 0.0, pair.modulus, max_real_modulus))
-    return functools.reduce(jnp.maximum, moduli)
+    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalue_moduli = [jnp.abs(x) for x in isolated_values]
+    if remaining_pair is not None:
+        max_real_modulus = jnp.abs(remaining_pair.mean) + remaining_pair.real_offset
+        eigenvalue_moduli.append(
+            jnp.where(
+                remaining_pair.imaginary_offset > 0.0, remaining_pair.modulus, max_real_modulus
+            )
+        )
+    return functools.reduce(jnp.maximum, eigenvalue_moduli)
 
 
 @jax.jit
@@ -214,16 +224,16 @@ def jury_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
     for n > 1, vanishes if a pair crosses the unit circle. For n = 3 the fourth completes the
     criterion.
     """
-    coefficients = characteristic_polynomial(matrix)
-    if len(coefficients) == 1:
-        (a0,) = coefficients
+    polynomial_coefficients = characteristic_polynomial(matrix)
+    if len(polynomial_coefficients) == 1:
+        (a0,) = polynomial_coefficients
         return jnp.stack([1.0 + a0, 1.0 - a0], -1)
-    if len(coefficients) == 2:
-        a0, a1 = coefficients
+    if len(polynomial_coefficients) == 2:
+        a0, a1 = polynomial_coefficients
         return jnp.stack([1.0 + a1 + a0, 1.0 - a1 + a0, 1.0 - a0], -1)
-    a0, a1, a2 = coefficients
-    pair = 1.0 - a0 * a0 - a1 + a0 * a2
-    return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair, 1.0 - a0 * a0], -1)
+    a0, a1, a2 = polynomial_coefficients
+    pair_margins = 1.0 - a0 * a0 - a1 + a0 * a2
+    return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair_margins, 1.0 - a0 * a0], -1)
 
 
 @jax.jit
@@ -236,11 +246,14 @@ def bifurcation_margins(matrix: RealMatrix) -> Float[Array, "... n_margins"]:
     n = matrix.shape[-1]
     if n <= MAX_CLOSED_FORM_SIZE:
         return jury_margins(matrix)[..., :3]
-    identity, values = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
+    identity, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
     first_indices, second_indices = np.triu_indices(n, 1)
-    pairs = jnp.prod(1.0 - values[..., first_indices] * values[..., second_indices], axis=-1).real
+    eigenvalue_products = jnp.prod(
+        1.0 - eigenvalues[..., first_indices] * eigenvalues[..., second_indices], axis=-1
+    ).real
     return jnp.stack(
-        [jnp.linalg.det(identity - matrix), jnp.linalg.det(identity + matrix), pairs], -1
+        [jnp.linalg.det(identity - matrix), jnp.linalg.det(identity + matrix), eigenvalue_products],
+        -1,
     )
 
 
@@ -250,9 +263,9 @@ def stability_margin(matrix: RealMatrix) -> Float[Array, "..."]:
 
     A positive value means that the gait is stable.
     """
-    margins = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
-    lowest_margin = lax.stop_gradient(jnp.min(margins, -1))
-    scaled_excess = jnp.sum(jnp.exp(lowest_margin[..., None] - margins), -1)
+    jury_margin_values = SMOOTH_MIN_SHARPNESS * jury_margins(matrix)
+    lowest_margin = lax.stop_gradient(jnp.min(jury_margin_values, -1))
+    scaled_excess = jnp.sum(jnp.exp(lowest_margin[..., None] - jury_margin_values), -1)
     return (lowest_margin - jnp.log(scaled_excess)) / SMOOTH_MIN_SHARPNESS
 
 
@@ -264,19 +277,19 @@ def has_double_multiplier(matrix: RealMatrix, tolerance: float = 1e-6) -> Bool[A
     The moduli of a complex pair always agree and are smooth, so that a pair counts only if it is
     about to become real.
     """
-    isolated_values, pair = _split_eigenvalues(matrix)
-    if pair is None:
+    isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
+    if remaining_pair is None:
         return jnp.zeros(matrix.shape[:-2], bool)
-    mean, real_offset, imaginary_offset = pair
-    real_values = [*isolated_values, mean + real_offset, mean - real_offset]
+    mean, real_offset, imaginary_offset = remaining_pair
+    real_eigenvalues = [*isolated_values, mean + real_offset, mean - real_offset]
     is_complex_pair = imaginary_offset > 0.0
-    moduli = jnp.sort(jnp.abs(jnp.stack(real_values, -1)), -1)
-    has_equal_real_moduli = moduli[..., -1] - moduli[..., -2] <= tolerance
+    eigenvalue_moduli = jnp.sort(jnp.abs(jnp.stack(real_eigenvalues, -1)), -1)
+    has_equal_real_moduli = eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= tolerance
     has_equal_moduli = jnp.where(
         is_complex_pair, imaginary_offset <= tolerance, has_equal_real_moduli
     )
     for x in isolated_values:
         has_equal_moduli = has_equal_moduli | (
-            is_complex_pair & (jnp.abs(jnp.abs(x) - pair.modulus) <= tolerance)
+            is_complex_pair & (jnp.abs(jnp.abs(x) - remaining_pair.modulus) <= tolerance)
         )
     return has_equal_moduli

@@ -44,11 +44,13 @@ def evaluate_bifurcation_functions(jacobians: np.ndarray) -> np.ndarray:
     `jacobians` have the shape (..., n, n). A function is NaN if matrices of this size cannot have
     its bifurcation.
     """
-    margins = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
-    values = np.full((*margins.shape[:-1], len(BIFURCATION_NAMES)), np.nan)
-    n_margins = min(margins.shape[-1], len(BIFURCATION_NAMES))
-    values[..., :n_margins] = margins[..., :n_margins]
-    return values
+    bifurcation_margin_values = np.asarray(bifurcation_margins(jnp.asarray(jacobians)))
+    bifurcation_values = np.full(
+        (*bifurcation_margin_values.shape[:-1], len(BIFURCATION_NAMES)), np.nan
+    )
+    n_margins = min(bifurcation_margin_values.shape[-1], len(BIFURCATION_NAMES))
+    bifurcation_values[..., :n_margins] = bifurcation_margin_values[..., :n_margins]
+    return bifurcation_values
 
 
 def has_unit_circle_pair(
@@ -59,13 +61,13 @@ def has_unit_circle_pair(
     The product of two multipliers is also 1 if they are real and reciprocal, which is no
     bifurcation.
     """
-    values = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
-    is_pair = np.abs(values.imag) > tolerances.min_imaginary
-    is_on_circle = np.abs(np.abs(values) - 1.0) < tolerances.located_on_circle
-    return bool(np.any(is_on_circle & is_pair))
+    multipliers = np.asarray(floquet_multipliers(jnp.asarray(jacobian)))
+    is_complex_pair = np.abs(multipliers.imag) > tolerances.min_imaginary
+    is_on_circle = np.abs(np.abs(multipliers) - 1.0) < tolerances.located_on_circle
+    return bool(np.any(is_on_circle & is_complex_pair))
 
 
-class SignChange(NamedTuple):
+class QuantitySignChange(NamedTuple):
     """A sign change of the quantity with index `quantity_index` between two points of a branch."""
 
     left_index: int
@@ -73,73 +75,83 @@ class SignChange(NamedTuple):
     quantity_index: int
 
 
-def find_sign_changes(values: np.ndarray) -> list[SignChange]:
-    """Return the sign changes between neighboring points of `values`, an array (point, quantity).
+def find_sign_changes(quantity_values: np.ndarray) -> list[QuantitySignChange]:
+    """Return the sign changes between neighboring points, from an array (point, quantity).
 
     NaN and zero have no sign. Two changes between neighboring points are not detected, so the
     continuation step must be short enough.
     """
-    signs = np.sign(np.nan_to_num(values))
-    signed_points = np.argwhere(signs[:-1] * signs[1:] < 0.0)
+    quantity_signs = np.sign(np.nan_to_num(quantity_values))
+    signed_points = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
     return [
-        SignChange(int(position), int(position) + 1, int(quantity_index))
-        for position, quantity_index in signed_points
+        QuantitySignChange(int(signed_position), int(signed_position) + 1, int(quantity_index))
+        for signed_position, quantity_index in signed_points
     ]
 
 
-class LocatedZeros(NamedTuple):
+class ZeroLocations(NamedTuple):
     """Locations of sign changes in [0, 1], one per bracket."""
 
-    best: np.ndarray  # location of the end with the smaller value
-    left_end: np.ndarray  # end with the sign at location 0
-    right_end: np.ndarray  # end with the sign at location 1
+    best_locations: np.ndarray  # location of the end with the smaller value
+    left_bracket_ends: np.ndarray  # end with the sign at location 0
+    right_bracket_ends: np.ndarray  # end with the sign at location 1
 
 
 def locate_zeros(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     end_values: tuple[np.ndarray, np.ndarray],
-    width: np.ndarray,
+    max_bracket_width: np.ndarray,
     options: ZeroSearchOptions = ZERO_SEARCH_OPTIONS,
-) -> LocatedZeros:
+) -> ZeroLocations:
     """Return the locations of zeros of functions with opposite signs at 0 and 1, by Chandrupatla's
     method.
 
-    `function` takes locations and the indices of their brackets; `end_values` are its values at 0
-    and 1. A round uses inverse quadratic interpolation if it is reliable, and otherwise bisection.
+    `function` takes locations and the indices of their brackets. `end_values` are the values of
+    the function at 0 and 1. A round uses inverse quadratic interpolation if it is reliable, and otherwise bisection.
     A bracket in which the function jumps or stalls is divided into several sections per round, so
     that a jump is located as reliably as a smooth zero. The search ends when each bracket is
-    narrower than `width`, or at an exact zero. A location where the function is NaN counts to the
+    narrower than `max_bracket_width`, or at an exact zero. A location where the function is NaN counts to the
     side of 1.
     """
     values_at_zero, values_at_one = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by
     # the newest one.
-    locations = np.outer((0.0, 1.0, 1.0), np.ones_like(width))
+    locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
     function_values = np.stack([values_at_zero, values_at_one, values_at_one])
-    is_jump, n_rounds, n_sections = np.zeros(len(width), bool), 0, options.n_sections
-    while len(unresolved_indices := np.flatnonzero(np.abs(locations[0] - locations[1]) > width)):
-        smooth_brackets = unresolved_indices[~is_jump[unresolved_indices]]
-        jump_brackets = unresolved_indices[is_jump[unresolved_indices]]
-        proposals = _propose_location(
+    is_sign_jump, n_rounds, n_sections = (
+        np.zeros(len(max_bracket_width), bool),
+        0,
+        options.n_sections,
+    )
+    while len(
+        unresolved_indices := np.flatnonzero(
+            np.abs(locations[0] - locations[1]) > max_bracket_width
+        )
+    ):
+        smooth_brackets = unresolved_indices[~is_sign_jump[unresolved_indices]]
+        jump_brackets = unresolved_indices[is_sign_jump[unresolved_indices]]
+        proposed_locations = _propose_zero_location(
             locations[:, smooth_brackets],
             function_values[:, smooth_brackets],
-            width[smooth_brackets],
+            max_bracket_width[smooth_brackets],
         )
         lower_ends, upper_ends = np.sort(locations[:2, jump_brackets], 0)
         section_ends = np.linspace(lower_ends, upper_ends, n_sections + 1, axis=-1)
         bracket_indices = np.concatenate(
             [smooth_brackets, np.repeat(jump_brackets, n_sections - 1)]
         )
-        values = function(
-            np.concatenate([proposals, section_ends[:, 1:-1].ravel()]), bracket_indices
+        section_values_matrix = function(
+            np.concatenate([proposed_locations, section_ends[:, 1:-1].ravel()]), bracket_indices
         )
-        is_undefined = np.isnan(values)
-        values = np.where(is_undefined, values_at_one[bracket_indices], values)
-        proposal_values = values[: len(smooth_brackets)]
-        section_values = values[len(smooth_brackets) :].reshape(-1, n_sections - 1)
+        is_undefined = np.isnan(section_values_matrix)
+        section_values_matrix = np.where(
+            is_undefined, values_at_one[bracket_indices], section_values_matrix
+        )
+        proposal_values = section_values_matrix[: len(smooth_brackets)]
+        section_values = section_values_matrix[len(smooth_brackets) :].reshape(-1, n_sections - 1)
         has_same_sign = np.sign(proposal_values) == np.sign(function_values[0, smooth_brackets])
         for stored_values, proposed_values in (
-            (locations, proposals),
+            (locations, proposed_locations),
             (function_values, proposal_values),
         ):
             newest_values, opposite_values, _ = stored_values[:, smooth_brackets]
@@ -148,7 +160,9 @@ def locate_zeros(
                 np.where(has_same_sign, opposite_values, newest_values),
                 np.where(has_same_sign, newest_values, opposite_values),
             )
-        locations[1, smooth_brackets[proposal_values == 0.0]] = proposals[proposal_values == 0.0]
+        locations[1, smooth_brackets[proposal_values == 0.0]] = proposed_locations[
+            proposal_values == 0.0
+        ]
         is_left_side = np.sign(section_values) != np.sign(values_at_one[jump_brackets])[:, None]
         # The last location on the side of 0 precedes the first one on the side of 1.
         last_left_index = np.sum(np.cumprod(is_left_side, 1), 1)
@@ -156,28 +170,29 @@ def locate_zeros(
             np.arange(len(jump_brackets)), np.stack([last_left_index, last_left_index + 1])
         ]
         n_rounds += 1
-        is_jump[smooth_brackets] = (
+        is_sign_jump[smooth_brackets] = (
             is_undefined[: len(smooth_brackets)]
             | (proposal_values == function_values[2, smooth_brackets])
             | (n_rounds >= options.max_smooth_rounds)
         )
-    best_location = np.where(
-        is_jump,
+    best_locations = np.where(
+        is_sign_jump,
         np.min(locations[:2], 0),
         np.where(
             np.abs(function_values[0]) < np.abs(function_values[1]), locations[0], locations[1]
         ),
     )
-    return LocatedZeros(best_location, *np.sort(locations[:2], 0))
+    return ZeroLocations(best_locations, *np.sort(locations[:2], 0))
 
 
-def _propose_location(
-    locations: np.ndarray, function_values: np.ndarray, width: np.ndarray
+def _propose_zero_location(
+    bracket_locations: np.ndarray, function_values: np.ndarray, max_bracket_width: np.ndarray
 ) -> np.ndarray:
     """Return the next locations of Chandrupatla's method (1997, doi 10/d9zjj8)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         location_ratio, value_ratio = (
-            (locations[0] - locations[1]) / (locations[2] - locations[1]),
+            (bracket_locations[0] - bracket_locations[1])
+            / (bracket_locations[2] - bracket_locations[1]),
             (function_values[0] - function_values[1]) / (function_values[2] - function_values[1]),
         )
         is_trusted = (1.0 - np.sqrt(1.0 - location_ratio) < value_ratio) & (
@@ -190,17 +205,17 @@ def _propose_location(
             / (function_values[2] - function_values[1])
         )
         interpolated_fraction -= (
-            (locations[2] - locations[0])
-            / (locations[1] - locations[0])
+            (bracket_locations[2] - bracket_locations[0])
+            / (bracket_locations[1] - bracket_locations[0])
             * function_values[0]
             / (function_values[2] - function_values[0])
             * function_values[1]
             / (function_values[1] - function_values[2])
         )
-    bracket_length = locations[1] - locations[0]
-    min_fraction = 0.5 * width / np.abs(bracket_length)
+    bracket_length = bracket_locations[1] - bracket_locations[0]
+    min_fraction = 0.5 * max_bracket_width / np.abs(bracket_length)
     return (
-        locations[0]
+        bracket_locations[0]
         + np.clip(
             np.where(is_trusted, interpolated_fraction, 0.5), min_fraction, 1.0 - min_fraction
         )

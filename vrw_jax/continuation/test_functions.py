@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
     NewtonStep,
+    ProblemUnknowns,
     SectionVector,
-    Unknowns,
 )
 from vrw_jax.continuation.floquet import bifurcation_margins
 from vrw_jax.numerics import Elementwise, Scalar
@@ -29,9 +29,9 @@ ParameterPair = Float[Array, "2"]
 class TestFunctionNewtonStep(NamedTuple):
     """Newton step at a trial (z, p), and the test function whose zero is continued."""
 
-    correction: Unknowns  # correction of z at fixed p
+    correction: ProblemUnknowns  # correction of z at fixed p
     # dz/dp along the curve of fixed points, for both parameters
-    tangents: tuple[Unknowns, Unknowns]
+    tangents: tuple[ProblemUnknowns, ProblemUnknowns]
     jacobian: Float[Array, "n n"]  # Jacobian of the return map
     value: Scalar  # value of the test function at the corrected z
     # derivatives of the value with respect to p along the fixed points
@@ -45,18 +45,18 @@ class AbstractTestFunction(eqx.Module):
     """
 
     @abc.abstractmethod
-    def linearize(self, args: Any, z: Unknowns, p: ParameterPair) -> TestFunctionNewtonStep:
+    def linearize(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> TestFunctionNewtonStep:
         """Return the Newton step; it is not finite if the map is undefined at (z, p)."""
 
     @abc.abstractmethod
-    def section_state(self, z: Unknowns) -> SectionVector:
+    def section_state(self, z: ProblemUnknowns) -> SectionVector:
         """Return the section state, which is a part of z."""
 
-    def correction_norm(self, z: Unknowns, correction: Unknowns) -> Scalar:
+    def correction_norm(self, z: ProblemUnknowns, correction: ProblemUnknowns) -> Scalar:
         """Return the norm of a correction, which is compared with the tolerance."""
         return jnp.max(jnp.abs(correction))
 
-    def is_admissible(self, args: Any, z: Unknowns, p: ParameterPair) -> Bool[Array, ""]:
+    def is_admissible(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> Bool[Array, ""]:
         """Return whether a converged z satisfies the conditions of its branch."""
         return jnp.all(jnp.isfinite(self.section_state(z)))
 
@@ -64,7 +64,7 @@ class AbstractTestFunction(eqx.Module):
 class TestFunctionPoint(NamedTuple):
     """Unknowns of a point of the curve: those of the fixed point, and the second parameter."""
 
-    z: Unknowns
+    z: ProblemUnknowns
     fraction: Elementwise  # second parameter as a fraction of its range
 
 
@@ -95,8 +95,10 @@ class TestFunctionCurve(AbstractContinuationProblem):
         fraction_change = -newton_step.value / derivative_by_fraction
         fraction_tangent = -derivative_by_first_parameter / derivative_by_fraction
         first_tangent, second_tangent = newton_step.tangents
-        add_second_tangent = lambda change: (
-            lambda first_entry, second_entry: first_entry + parameter_range * change * second_entry
+        add_second_tangent = lambda parameter_change: (
+            lambda first_leaf, second_leaf: (
+                first_leaf + parameter_range * parameter_change * second_leaf
+            )
         )
         correction = jax.tree.map(
             add_second_tangent(fraction_change), newton_step.correction, second_tangent
@@ -125,7 +127,7 @@ class TestFunctionCurve(AbstractContinuationProblem):
         )
 
 
-FOLD_MARGIN_OFFSET = 1e-6
+JURY_MARGIN_OFFSET = 1e-6
 """Value of the fold's margin on the curve that represents the fold.
 
 It is chosen above zero because the equations are singular at the fold itself. The parameters turn
@@ -135,4 +137,4 @@ at the fold, so their error is the square of this value.
 
 def offset_bifurcation_margins(jacobian: Float[Array, "n n"]) -> Array:
     """Return the bifurcation margins, each zero where one of `BIFURCATION_NAMES` occurs."""
-    return bifurcation_margins(jacobian).at[0].add(-FOLD_MARGIN_OFFSET)
+    return bifurcation_margins(jacobian).at[0].add(-JURY_MARGIN_OFFSET)

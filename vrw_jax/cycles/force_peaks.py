@@ -132,7 +132,7 @@ def _summarize_force_extrema(
         is_force_trough, jnp.where(is_force_trough, lower_peak, 0.0) - step_extrema.value, 0.0
     )
     first_peak_time = jnp.min(jnp.where(step_extrema.is_maximum, step_extrema.time, jnp.inf))
-    is_later_maximum = step_extrema.is_rate_maximum & (step_extrema.rate_time > first_peak_time)
+    is_later_maximum = step_extrema.is_maximum_of_rate & (step_extrema.rate_time > first_peak_time)
     largest_force_rate = jnp.max(jnp.where(is_later_maximum, step_extrema.rate, -jnp.inf))
     return _ForcePeaks(
         n_peaks=jnp.sum(step_extrema.is_maximum).astype(phase_durations.dtype),

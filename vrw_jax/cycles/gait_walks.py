@@ -167,10 +167,10 @@ def walk_to_gaits(
     of a wheel nearly repeats, the end of its first walk is returned.
 
     Args:
-        finder: finder of gaits, whose model takes the steps.
-        values: values of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
+        gait_finder: finder of gaits, whose model takes the steps.
+        parameter_values: values of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
         compute_starts: function that returns section states of shape (starts, wheels, 3).
-        options: options of the walks.
+        walk_options: options of the walks.
     """
     start_section_states = compute_starts(_split_parameter_values(gait_finder, parameter_values)[1])
     n_wheels, n_coordinates = len(parameter_values), count_section_coordinates(gait_finder)

@@ -42,7 +42,7 @@ DEFAULT_MARGIN_SHARE = 1e-3
 
 @with_default_settings
 def default_margins(params: WheelParams) -> Mapping[str, float]:
-    """Return least values of `MARGIN_NAMES`: a thousandth of each unit's natural scale on this
+    """Return least values of `KEPT_MARGIN_NAMES`: a thousandth of each unit's natural scale on this
     wheel.
 
     The values are not zero because a search needs a distance from the limits. At lambda_4_plus = 0,

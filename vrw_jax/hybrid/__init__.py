@@ -4,7 +4,7 @@ from vrw_jax.hybrid.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.hybrid.minima import (
     GUARD_ROUNDOFF_IN_EPS,
     MonitoredFunctions,
-    StateVector,
+    StateArray,
 )
 from vrw_jax.hybrid.phase_integration import (
     PhaseEnd,

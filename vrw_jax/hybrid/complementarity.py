@@ -30,9 +30,7 @@ class LCPStatus(StatusCode):
 
 
 class LCPSolutions(NamedTuple):
-    """Solutions of an LCP: forces z >= 0 and gaps w = matrix z + free_gap >= 0 with z w = 0 in
-    each contact.
-    """
+    """Solutions of an LCP: forces z >= 0 and gaps w = matrix z + free_gap >= 0 with z w = 0."""
 
     # forces of the solution with most closed contacts; NaN if there is none
     force: Float[Array, " n"]
@@ -47,9 +45,9 @@ def enumerate_lcp_solutions(
 ) -> LCPSolutions:
     """Return all solutions of an LCP with a square matrix, symmetric or not.
 
-    `matrix` has the shape (n, n) and `free_gap` the shape (n,). Signs hold to `tolerance` times the
-    largest entry. Combinations that differ only by contacts without force count once. The result is
-    differentiable as long as the same solution exists.
+    `matrix` has the shape (n, n) and `free_gap` the shape (n,). Signs are accurate to `tolerance`
+    times the largest number of the problem. Combinations that differ only by contacts without force
+    count once. The result is differentiable as long as the same solution exists.
     """
     free_gap = jnp.asarray(free_gap, float)
     matrix = jnp.asarray(matrix, free_gap.dtype)
@@ -76,25 +74,35 @@ def enumerate_lcp_solutions(
         linear_system = jnp.where(closed_pair, matrix, jnp.eye(n, dtype=free_gap.dtype))
         is_singular = jnp.abs(jnp.linalg.det(linear_system)) <= tolerance
         linear_system = jnp.where(is_singular, jnp.eye(n, dtype=free_gap.dtype), linear_system)
-        force = jnp.where(
+        contact_forces = jnp.where(
             is_closed, jnp.linalg.solve(linear_system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
         )
-        gap = jnp.where(is_closed, 0.0, matrix @ force + free_gap)
-        has_valid_forces = jnp.all(force >= -tolerance * jnp.max(jnp.abs(force)))
+        contact_gaps = jnp.where(is_closed, 0.0, matrix @ contact_forces + free_gap)
+        has_valid_forces = jnp.all(contact_forces >= -tolerance * jnp.max(jnp.abs(contact_forces)))
         has_valid_gaps = jnp.all(
-            gap >= -tolerance * (jnp.max(jnp.abs(gap)) + jnp.max(jnp.abs(free_gap)))
+            contact_gaps
+            >= -tolerance * (jnp.max(jnp.abs(contact_gaps)) + jnp.max(jnp.abs(free_gap)))
         )
-        return force, has_valid_forces & has_valid_gaps & ~is_singular
+        return contact_forces, has_valid_forces & has_valid_gaps & ~is_singular
 
     candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
-    match_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))
+    same_solution_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))
     is_same_solution = (
-        jnp.max(jnp.abs(candidate_forces[:, None] - candidate_forces[None]), -1) <= match_tolerance
+        jnp.max(jnp.abs(candidate_forces[:, None] - candidate_forces[None]), -1)
+        <= same_solution_tolerance
     )
     is_duplicate = jnp.any(jnp.tril(is_same_solution & is_solution[None], -1), 1)
     is_solution = is_solution & ~is_duplicate
-    force = jnp.where(jnp.any(is_solution), candidate_forces[jnp.argmax(is_solution)], jnp.nan)
-    status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS)).astype(jnp.int32)
+    contact_forces = jnp.where(
+        jnp.any(is_solution), candidate_forces[jnp.argmax(is_solution)], jnp.nan
+    )
+    solution_status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS)).astype(
+        jnp.int32
+    )
     return LCPSolutions(
-        force, entry_scale * (matrix @ force + free_gap), status, is_solution, candidate_forces
+        contact_forces,
+        entry_scale * (matrix @ contact_forces + free_gap),
+        solution_status,
+        is_solution,
+        candidate_forces,
     )

@@ -1,10 +1,9 @@
-"""Cache of compiled programs, in which equal functions share one program, such as the modes of a
-user.
+"""Cache of compiled programs, in which equal functions share one program.
 
-Outside of `jax.jit` JAX compiles a loop again at each call if its body closes over functions, and
-keeps each program. Here functions are compared by their code and by the values to which they refer.
-Equal functions share a program, whether or not they are the same object. A function with another
-constant has another program.
+Examples are the functions of a user's modes. Outside of `jax.jit` JAX compiles a loop again at each
+call if its body closes over functions, and keeps each program. The cache compares functions by
+their code and by the values to which they refer. Equal functions share a program, whether or not
+they are the same object. A function with another constant has another program.
 """
 
 import dataclasses
@@ -21,20 +20,19 @@ import numpy as np
 
 from vrw_jax.numerics import is_inside_jit
 
-MAX_PROGRAMS = 32
-"""Largest number of programs that are kept, chosen because a program takes some 14 MB."""
+MAX_CACHED_PROGRAMS = 32
+"""Largest number of programs that are kept. The value is chosen because a program takes some
+14 MB."""
 
-MAX_HASHED_BYTES = 1_000_000
-"""Largest size in bytes of a JAX array that is compared by content. It is chosen because a copy
-to the host and its digest then take a millisecond. Larger arrays are compared by identity.
-"""
+MAX_HASHED_ARRAY_BYTES = 1_000_000
+"""Largest size in bytes of a JAX array that is compared by content. The value is chosen because a
+copy to the host and its digest then take a millisecond. Larger arrays are compared by identity."""
 
-FIXED_PACKAGES = frozenset({"jax", "jaxlib", "numpy", "vrw_jax"}) | sys.stdlib_module_names
-"""Packages whose functions, classes and modules are compared by identity, chosen because users
-do not change them while a process runs.
-"""
+UNCHANGING_PACKAGES = frozenset({"jax", "jaxlib", "numpy", "vrw_jax"}) | sys.stdlib_module_names
+"""Packages whose functions, classes and modules are compared by identity. They are chosen because
+users do not change them while a process runs."""
 
-_programs: OrderedDict[Hashable, Callable] = OrderedDict()
+_program_by_key: OrderedDict[Hashable, Callable] = OrderedDict()
 
 
 class _NoKeyError(Exception):
@@ -68,8 +66,8 @@ def call_compiled(function: Callable, constants: Any, *arguments: Any) -> Any:
     """
     if is_inside_jit():
         return function(constants, *arguments)
-    program = find_program(function, constants, *arguments)
-    return (program or jax.jit(functools.partial(function, constants)))(*arguments)
+    compiled_program = find_program(function, constants, *arguments)
+    return (compiled_program or jax.jit(functools.partial(function, constants)))(*arguments)
 
 
 def find_program(function: Callable, constants: Any, *arguments: Any) -> Callable | None:
@@ -81,96 +79,119 @@ def find_program(function: Callable, constants: Any, *arguments: Any) -> Callabl
     """
     if is_inside_jit():
         return None
-    leaves, structure = jax.tree.flatten(arguments)
+    leaves, tree_structure = jax.tree.flatten(arguments)
     try:
-        argument_types = structure, tuple(map(jax.typeof, leaves))
-        key = (function, argument_types, _make_key(constants, frozenset()))
+        argument_type_keys = tree_structure, tuple(map(jax.typeof, leaves))
+        program_key = (function, argument_type_keys, _make_key(constants, frozenset()))
     except _NoKeyError:
         return None
-    if key not in _programs:
-        _programs[key] = jax.jit(functools.partial(function, constants))
-    _programs.move_to_end(key)
-    if len(_programs) > MAX_PROGRAMS:
-        _programs.popitem(last=False)
-    return _programs[key]
+    if program_key not in _program_by_key:
+        _program_by_key[program_key] = jax.jit(functools.partial(function, constants))
+    _program_by_key.move_to_end(program_key)
+    if len(_program_by_key) > MAX_CACHED_PROGRAMS:
+        _program_by_key.popitem(last=False)
+    return _program_by_key[program_key]
 
 
-def _make_key(value: Any, enclosing_ids: frozenset) -> Hashable:
+def _make_key(keyed_value: Any, enclosing_ids: frozenset) -> Hashable:
     """Return a key that is equal for two values only if both lead to the same program.
 
     `enclosing_ids` are the identities of the objects that contain the value; a reference to one of
     them raises an error.
     """
-    if isinstance(value, jax.core.Tracer) or id(value) in enclosing_ids:
+    if isinstance(keyed_value, jax.core.Tracer) or id(keyed_value) in enclosing_ids:
         raise _NoKeyError
-    make_inner_key = lambda x: _make_key(x, enclosing_ids | {id(value)})
-    value_type = type(value)
-    if value is None or isinstance(value, str | bytes | bool | int | complex | types.CodeType):
-        return value_type, value
-    if isinstance(value, float):
-        return value_type, value.hex()
-    if isinstance(value, jax.Array) and value.nbytes <= MAX_HASHED_BYTES:
-        return value_type, value.weak_type, make_inner_key(np.asarray(value))
-    if isinstance(value, np.ndarray | np.generic):
-        if value.dtype == object:
+    make_inner_key = lambda x: _make_key(x, enclosing_ids | {id(keyed_value)})
+    value_type = type(keyed_value)
+    if keyed_value is None or isinstance(
+        keyed_value, str | bytes | bool | int | complex | types.CodeType
+    ):
+        return value_type, keyed_value
+    if isinstance(keyed_value, float):
+        return value_type, keyed_value.hex()
+    if isinstance(keyed_value, jax.Array) and keyed_value.nbytes <= MAX_HASHED_ARRAY_BYTES:
+        return value_type, keyed_value.weak_type, make_inner_key(np.asarray(keyed_value))
+    if isinstance(keyed_value, np.ndarray | np.generic):
+        if keyed_value.dtype == object:
             raise _NoKeyError
-        return value_type, value.shape, value.dtype.str, hashlib.sha256(value.tobytes()).digest()
-    if isinstance(value, tuple | list):
-        return value_type, tuple(map(make_inner_key, value))
-    if isinstance(value, dict):
-        return value_type, tuple(
-            (make_inner_key(dict_key), make_inner_key(x)) for dict_key, x in value.items()
+        return (
+            value_type,
+            keyed_value.shape,
+            keyed_value.dtype.str,
+            hashlib.sha256(keyed_value.tobytes()).digest(),
         )
-    if isinstance(value, types.FunctionType):
-        return value_type, _make_function_key(value, enclosing_ids | {id(value)})
-    if isinstance(value, type):
-        return _make_class_key(value, enclosing_ids | {id(value)})
-    if isinstance(value, types.ModuleType) and _is_fixed(value.__name__):
-        return _IdentityKey(value)
-    if isinstance(value, functools.partial):
-        partial_parts = (value.func, value.args, value.keywords)
+    if isinstance(keyed_value, tuple | list):
+        return value_type, tuple(map(make_inner_key, keyed_value))
+    if isinstance(keyed_value, dict):
+        return value_type, tuple(
+            (make_inner_key(dict_key), make_inner_key(x)) for dict_key, x in keyed_value.items()
+        )
+    if isinstance(keyed_value, types.FunctionType):
+        return value_type, _make_function_key(keyed_value, enclosing_ids | {id(keyed_value)})
+    if isinstance(keyed_value, type):
+        return _make_class_key(keyed_value, enclosing_ids | {id(keyed_value)})
+    if isinstance(keyed_value, types.ModuleType) and _is_in_unchanging_package(
+        keyed_value.__name__
+    ):
+        return _IdentityKey(keyed_value)
+    if isinstance(keyed_value, functools.partial):
+        partial_parts = (keyed_value.func, keyed_value.args, keyed_value.keywords)
         return value_type, tuple(map(make_inner_key, partial_parts))
-    if isinstance(value, types.MethodType):
-        return value_type, make_inner_key(value.__func__), make_inner_key(value.__self__)
+    if isinstance(keyed_value, types.MethodType):
+        return (
+            value_type,
+            make_inner_key(keyed_value.__func__),
+            make_inner_key(keyed_value.__self__),
+        )
     # A function with a derivative rule, as from jax.custom_jvp, refers to the values of the user's
     # function.
-    if hasattr(value, "__wrapped__") and not _is_fixed(value.__module__):
-        return _IdentityKey(value), make_inner_key(value.__wrapped__)
+    if hasattr(keyed_value, "__wrapped__") and not _is_in_unchanging_package(
+        keyed_value.__module__
+    ):
+        return _IdentityKey(keyed_value), make_inner_key(keyed_value.__wrapped__)
     fixed_types = (types.BuiltinFunctionType, jax.Array, np.ufunc, np.dtype)
-    if isinstance(value, fixed_types) or value_type.__module__.startswith(("jax", "numpy")):
-        return _IdentityKey(value)
-    if dataclasses.is_dataclass(value):
-        return make_inner_key(value_type), make_inner_key(vars(value))
+    if isinstance(keyed_value, fixed_types) or value_type.__module__.startswith(("jax", "numpy")):
+        return _IdentityKey(keyed_value)
+    if dataclasses.is_dataclass(keyed_value):
+        return make_inner_key(value_type), make_inner_key(vars(keyed_value))
     raise _NoKeyError
 
 
-def _is_fixed(module: str | None) -> bool:
-    """Return whether the module of this name belongs to a package that users do not change."""
-    return (module or "").split(".")[0] in FIXED_PACKAGES
+def _is_in_unchanging_package(module_name: str | None) -> bool:
+    """Return whether the module of the given name belongs to a package that users do not change."""
+    return (module_name or "").split(".")[0] in UNCHANGING_PACKAGES
 
 
 def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
     """Return the key of a class, with the keys of its methods and constants if a user defines
     it.
     """
-    if _is_fixed(value_type.__module__):
+    if _is_in_unchanging_package(value_type.__module__):
         return _IdentityKey(value_type)
-    attributes = {
-        name: value
-        for name, value in vars(value_type).items()
+    class_attributes = {
+        name: class_attribute
+        for name, class_attribute in vars(value_type).items()
         if not name.startswith("__") or name == "__call__"
     }
-    return _IdentityKey(value_type), _make_key((attributes, value_type.__bases__), enclosing_ids)
+    return _IdentityKey(value_type), _make_key(
+        (class_attributes, value_type.__bases__), enclosing_ids
+    )
 
 
 def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -> Hashable:
     """Return the function's code, and the keys of all values to which it refers."""
-    if _is_fixed(function.__module__) and not function.__closure__:
+    if _is_in_unchanging_package(function.__module__) and not function.__closure__:
         return _IdentityKey(function)
-    names = {name for code in _iterate_codes(function.__code__) for name in code.co_names}
-    global_keys = _make_scope_key(function.__globals__, names, enclosing_ids)
+    global_names = {
+        name
+        for code_object in _iterate_code_objects(function.__code__)
+        for name in code_object.co_names
+    }
+    global_keys = _make_scope_key(function.__globals__, global_names, enclosing_ids)
     try:
-        cell_values = tuple(cell.cell_contents for cell in function.__closure__ or ())
+        cell_values = tuple(
+            closure_cell.cell_contents for closure_cell in function.__closure__ or ()
+        )
     except ValueError:  # A cell of the closure has no value yet.
         raise _NoKeyError from None
     bound_values = (cell_values, function.__defaults__, function.__kwdefaults__)
@@ -183,7 +204,7 @@ def _make_scope_key(scope: dict, names: set[str], enclosing_ids: frozenset) -> H
     """
 
     def make_entry_key(value: Any) -> Hashable:
-        if not isinstance(value, types.ModuleType) or _is_fixed(value.__name__):
+        if not isinstance(value, types.ModuleType) or _is_in_unchanging_package(value.__name__):
             return _make_key(value, enclosing_ids)
         if id(value) in enclosing_ids:
             return _IdentityKey(value)
@@ -192,9 +213,9 @@ def _make_scope_key(scope: dict, names: set[str], enclosing_ids: frozenset) -> H
     return tuple((name, make_entry_key(scope[name])) for name in sorted(names) if name in scope)
 
 
-def _iterate_codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    """Return the code and the codes of all functions that are defined inside it."""
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _iterate_codes(constant)
+def _iterate_code_objects(code_object: types.CodeType) -> Iterator[types.CodeType]:
+    """Return a code object and the code objects of all functions that are defined inside it."""
+    yield code_object
+    for code_constant in code_object.co_consts:
+        if isinstance(code_constant, types.CodeType):
+            yield from _iterate_code_objects(code_constant)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.hybrid.minima import StateVector
+from vrw_jax.hybrid.minima import StateArray
 from vrw_jax.hybrid.simulation import HybridSolution, Mode, Termination, simulate_hybrid
 from vrw_jax.numerics import StepOptions
 
@@ -29,8 +29,8 @@ class ReturnMap:
     """
 
     modes: Sequence[Mode] | Mode
-    embed: Callable[[Float[Array, " n"]], StateVector]
-    project: Callable[[StateVector], Float[Array, " n"]]
+    embed: Callable[[Float[Array, " n"]], StateArray]
+    project: Callable[[StateArray], Float[Array, " n"]]
     events: int = 1
     mode: int = 0
     options: StepOptions | None = None
@@ -44,11 +44,11 @@ class ReturnMap:
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return the next section coordinates, shape (n,); NaN if the simulation ended early."""
-        solution = self.simulate(x)
-        section = self.project(solution.state)
-        return section * jnp.where(
-            solution.termination == Termination.MAX_EVENTS_REACHED, 1.0, jnp.nan
-        ).astype(section.dtype)
+        hybrid_solution = self.simulate(x)
+        section_coordinates = self.project(hybrid_solution.state)
+        return section_coordinates * jnp.where(
+            hybrid_solution.termination == Termination.MAX_EVENTS_REACHED, 1.0, jnp.nan
+        ).astype(section_coordinates.dtype)
 
     def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
         """Return the `Termination` of the first of `period_n` returns that ends early; else that

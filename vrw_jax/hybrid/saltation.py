@@ -1,5 +1,6 @@
-"""Determinant of the flow's Jacobian through modes and events, by Liouville's formula with
-saltation matrices.
+"""Determinant of the flow's Jacobian through modes and events.
+
+It follows from Liouville's formula and from saltation matrices.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from jaxtyping import Array
 
 from vrw_jax.hybrid.phase_integration import sample_phase
 from vrw_jax.hybrid.program_cache import call_compiled
-from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, collect_modes
+from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, normalize_modes
 from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
 from vrw_jax.validation import check_reals
 
@@ -37,16 +38,18 @@ def flow_jacobian_determinant(
     mode.
     """
     options = StepOptions() if options is None else options
-    modes, start = collect_modes(modes), check_reals("start", start)
-    product = call_compiled(_multiply_event_factors, modes, start, solution, options)
-    return forbid_reverse_mode("flow_jacobian_determinant", product)
+    modes, start = normalize_modes(modes), check_reals("start", start)
+    determinant = call_compiled(_multiply_event_determinants, modes, start, solution, options)
+    return forbid_reverse_mode("flow_jacobian_determinant", determinant)
 
 
-def _multiply_event_factors(
+def _multiply_event_determinants(
     modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
 ) -> Scalar:
-    event_factors = [
-        _make_event_factor(mode, guard, options) for mode in modes for guard in mode.guards
+    event_determinant_functions = [
+        _make_event_determinant_function(mode, guard, options)
+        for mode in modes
+        for guard in mode.guards
     ]
     first_guards = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[:-1]
     phase_starts = jnp.concatenate([start[None], solution.states_after[:-1]])
@@ -54,26 +57,41 @@ def _multiply_event_factors(
     next_modes = jnp.append(solution.modes[1:], solution.mode)
     event_indices = jnp.arange(len(solution.times))
     next_modes = jnp.where(event_indices == solution.n_events - 1, solution.mode, next_modes)
-    fields = [mode.field for mode in modes]
+    vector_fields = [mode.field for mode in modes]
 
-    def multiply_event(product: Array, event_data: tuple) -> tuple[Array, None]:
-        event_index, state, state_before, state_after, duration, factor_index, next_mode = (
-            event_data
+    def multiply_event(determinant: Array, event_data: tuple) -> tuple[Array, None]:
+        (
+            event_index,
+            start_state,
+            state_before,
+            state_after,
+            mode_duration,
+            factor_index,
+            next_mode,
+        ) = event_data
+        next_flow = lax.switch(next_mode, vector_fields, state_after)
+        event_determinant = lax.switch(
+            factor_index,
+            event_determinant_functions,
+            start_state,
+            state_before,
+            next_flow,
+            mode_duration,
         )
-        next_flow = lax.switch(next_mode, fields, state_after)
-        factor = lax.switch(factor_index, event_factors, state, state_before, next_flow, duration)
-        return product * jnp.where(event_index < solution.n_events, factor, 1.0), None
+        return determinant * jnp.where(
+            event_index < solution.n_events, event_determinant, 1.0
+        ), None
 
-    event_table = (
+    event_data_by_event = (
         event_indices, phase_starts, solution.states_before, solution.states_after, durations,
         first_guards[solution.modes] + solution.guards,
         next_modes,
     )  # fmt: skip
-    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_table)[0]
+    return lax.scan(multiply_event, jnp.ones((), start.dtype), event_data_by_event)[0]
 
 
-def _make_event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
-    """Return the function that computes the determinant's factor of one mode and the guard that
+def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOptions) -> Callable:
+    """Return the function that computes the determinant's factor of one mode and of the guard that
     ends it.
     """
 
@@ -85,11 +103,11 @@ def _make_event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callab
     def evaluate_factor(
         start: Array, state_before: Array, next_flow: Array, duration: Array
     ) -> Array:
-        end = sample_phase(
+        end_state = sample_phase(
             flow_with_divergence, jnp.append(start, jnp.zeros(2)), duration, 2, options
         )[-1]
-        is_reached = (
-            jnp.abs(end[-1] - duration) <= 1e-9 * duration
+        is_end_reached = (
+            jnp.abs(end_state[-1] - duration) <= 1e-9 * duration
         )  # Otherwise the solver steps were exhausted.
         reset_jacobian = jax.jacfwd(guard.reset)(state_before)
         guard_gradient = jax.jacfwd(guard.value)(state_before)
@@ -97,6 +115,8 @@ def _make_event_factor(mode: Mode, guard: Guard, options: StepOptions) -> Callab
         saltation_matrix = reset_jacobian + jnp.outer(
             next_flow - reset_jacobian @ flow_before, guard_gradient
         ) / (guard_gradient @ flow_before)
-        return jnp.where(is_reached, jnp.exp(end[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan)
+        return jnp.where(
+            is_end_reached, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
+        )
 
     return evaluate_factor

@@ -1,4 +1,4 @@
-"""Integration of phases in units of the system's own size.
+"""Integration of phases in units of the system.
 
 Tolerances, the first step and the time limit of `StepOptions` then hold in these units.
 """
@@ -6,7 +6,7 @@ Tolerances, the first step and the time limit of `StepOptions` then hold in thes
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
+from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase, sample_phase
 from vrw_jax.numerics import Scalar, StepOptions
 
@@ -14,10 +14,10 @@ from vrw_jax.numerics import Scalar, StepOptions
 def integrate_in_units(
     field: VectorField,
     monitored_functions: MonitoredFunctions,
-    start: StateVector,
+    start: StateArray,
     active: Bool[Array, ""],
     options: StepOptions,
-    state_units: StateVector,
+    state_units: StateArray,
     time_unit: Scalar,
 ) -> PhaseEnd:
     """Return the result of `integrate_phase` in SI, integrated in other units.
@@ -27,34 +27,38 @@ def integrate_in_units(
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
     evaluate_in_si = lambda y: monitored_functions.evaluate(y * state_units)
-    end = integrate_phase(
-        _scale_field(field, state_units, time_unit),
+    phase_end = integrate_phase(
+        _make_scaled_field(field, state_units, time_unit),
         monitored_functions._replace(evaluate=evaluate_in_si),
         start / state_units,
         active,
         options,
     )
-    return end._replace(state=end.state * state_units, duration=end.duration * time_unit)
+    return phase_end._replace(
+        state=phase_end.state * state_units, duration=phase_end.duration * time_unit
+    )
 
 
 def sample_in_units(
     field: VectorField,
-    start: StateVector,
+    start: StateArray,
     duration: Scalar,
     n_samples: int,
     options: StepOptions,
-    state_units: StateVector,
+    state_units: StateArray,
     time_unit: Scalar,
 ) -> Float[Array, "n_samples dim"]:
     """Return the states of `sample_phase` in SI, integrated in other units, see
     `integrate_in_units`.
     """
     state_units, time_unit = lax.stop_gradient((state_units, time_unit))
-    scaled_field = _scale_field(field, state_units, time_unit)
+    scaled_field = _make_scaled_field(field, state_units, time_unit)
     start, duration = start / state_units, duration / time_unit
     return sample_phase(scaled_field, start, duration, n_samples, options) * state_units
 
 
-def _scale_field(field: VectorField, state_units: StateVector, time_unit: Scalar) -> VectorField:
+def _make_scaled_field(
+    field: VectorField, state_units: StateArray, time_unit: Scalar
+) -> VectorField:
     rate_factors = time_unit / state_units
     return lambda y: field(y * state_units) * rate_factors

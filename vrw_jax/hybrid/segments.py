@@ -1,9 +1,9 @@
 """Multipliers of a periodic orbit from its segments, without the product of their Jacobians.
 
-A product of matrices keeps what grows and loses what decays: beside a multiplier of 1, one of 1e-20
-has no correct digit. Orthogonal iteration around the period makes every factor triangular instead
-(a periodic Schur form). A multiplier is then a product of diagonal entries, each of which is
-accurate.
+A product of matrices keeps growing directions and loses decaying ones: beside a multiplier of 1,
+one of 1e-20 has no correct digit. Orthogonal iteration around the period makes every factor
+triangular instead (a periodic Schur form). A multiplier is then a product of diagonal elements,
+each of which is accurate.
 """
 
 from collections.abc import Sequence
@@ -65,11 +65,11 @@ def segment_maps(
         )
     constants = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
-    segments = call_compiled(_integrate_segments, constants, start, duration, options)
+    segments = call_compiled(_integrate_flow_segments, constants, start, duration, options)
     return forbid_reverse_mode("segment_maps", segments)
 
 
-def _integrate_segments(
+def _integrate_flow_segments(
     constants: tuple[VectorField, int, int], start: Array, duration: Array, options: StepOptions
 ) -> FlowSegments:
     field, n_segments, n_tangents = constants
@@ -88,9 +88,15 @@ def _integrate_segments(
         )
         normalized_rates = tangent_rates - growth_rates[:, None] * tangents
         unit_rates = jax.vmap(jvp_of_field)(jnp.eye(n_tangents, n_coordinates, dtype=z.dtype))
-        clock = jnp.ones_like(y[:1])
+        clock_rate = jnp.ones_like(y[:1])
         return jnp.concatenate(
-            [field(y), normalized_rates.ravel(), growth_rates, jnp.trace(unit_rates)[None], clock]
+            [
+                field(y),
+                normalized_rates.ravel(),
+                growth_rates,
+                jnp.trace(unit_rates)[None],
+                clock_rate,
+            ]
         )
 
     def integrate_segment(state: Array, _: None) -> tuple[Array, tuple]:
@@ -149,14 +155,14 @@ def product_multipliers(
             "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
         )
     n = jacobians.shape[1]
-    basis = np.eye(jacobians.shape[1])
+    orthonormal_basis = np.eye(jacobians.shape[1])
     closing_matrix = np.eye(jacobians.shape[1])
-    triangles = np.zeros_like(jacobians)
+    triangular_factors = np.zeros_like(jacobians)
     for _ in range(N_SCHUR_SWEEPS):
-        next_basis = basis
+        next_basis = orthonormal_basis
         for i, jacobian in enumerate(jacobians):
-            next_basis, triangles[i] = np.linalg.qr(jacobian @ next_basis)
-        closing_matrix, basis = basis.T @ next_basis, next_basis
+            next_basis, triangular_factors[i] = np.linalg.qr(jacobian @ next_basis)
+        closing_matrix, orthonormal_basis = orthonormal_basis.T @ next_basis, next_basis
         has_coupling = np.abs(np.tril(closing_matrix, -1)) > 1e-14
         if not has_coupling.any():
             break
@@ -165,17 +171,19 @@ def product_multipliers(
         if not has_coupling[block_end:, :block_end].any():
             diagonal_blocks.append(slice(block_start, block_end))
             block_start = block_end
-    norms = np.linalg.norm(jacobians, axis=(1, 2))
+    triangle_norms = np.linalg.norm(jacobians, axis=(1, 2))
     block_results = [
-        _block_multipliers(triangles, closing_matrix, diagonal_block, norms, tolerance)
+        _compute_block_multipliers(
+            triangular_factors, closing_matrix, diagonal_block, triangle_norms, tolerance
+        )
         for diagonal_block in diagonal_blocks
     ]
-    values, logarithms, relative_error = (
+    multipliers, logarithms, relative_error = (
         np.concatenate(x) for x in zip(*block_results, strict=True)
     )
     is_known = relative_error <= accuracy
     descending_order = np.argsort(-logarithms, kind="stable")
-    known_values = np.where(is_known, values, np.nan)
+    known_values = np.where(is_known, multipliers, np.nan)
     return ProductMultipliers(
         known_values[descending_order],
         logarithms[descending_order],
@@ -184,18 +192,18 @@ def product_multipliers(
     )
 
 
-def _block_multipliers(
-    triangles: np.ndarray,
+def _compute_block_multipliers(
+    triangular_factors: np.ndarray,
     closing_matrix: np.ndarray,
     block_slice: slice,
     norms: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the multipliers of one diagonal block, the logarithms of their moduli, and their
-    relative errors.
+    """Return the multipliers of one diagonal block, the logarithms of their moduli, and relative
+    errors.
     """
     diagonal_blocks, block_size = (
-        triangles[:, block_slice, block_slice],
+        triangular_factors[:, block_slice, block_slice],
         block_slice.stop - block_slice.start,
     )
     diagonal = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
@@ -206,14 +214,14 @@ def _block_multipliers(
         scaled_product = np.eye(block_size)
         log_scale = 0.0
         log_spread = np.ptp(np.sum(log_diagonal, axis=0)) if block_size > 1 else 0.0
-        for factor in diagonal_blocks:
-            scaled_product = factor @ scaled_product
+        for scaled_block in diagonal_blocks:
+            scaled_product = scaled_block @ scaled_product
             max_entry = np.max(np.abs(scaled_product)) or 1.0
             scaled_product, log_scale = scaled_product / max_entry, log_scale + np.log(max_entry)
         values = np.linalg.eigvals(closing_matrix[block_slice, block_slice] @ scaled_product)
         logarithms = np.log(np.abs(values)) + log_scale
         if block_size == 1:
             logarithms = np.sum(log_diagonal, axis=0)
-        phases = np.where(values == 0.0, 1.0, values / np.abs(values))
-        multipliers = phases * np.exp(logarithms)
+        multiplier_phases = np.where(values == 0.0, 1.0, values / np.abs(values))
+        multipliers = multiplier_phases * np.exp(logarithms)
     return multipliers, logarithms, np.full(block_size, relative_error * np.exp(log_spread))

@@ -17,7 +17,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.hybrid.minima import MonitoredFunctions, StateVector
+from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
 from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.numerics import Scalar, StatusCode, StepOptions, forbid_reverse_mode, opaque_condition
@@ -26,20 +26,19 @@ from vrw_jax.runtime import with_default_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
-"""Largest amount of numbers stored in the events of a simulation. It is chosen because times,
-states before and states after then take 2.4 GB.
-"""
+"""Largest amount of numbers stored in the events of a simulation. The value is chosen because
+times, states before and states after then take 2.4 GB."""
 
 
 class Guard(NamedTuple):
-    """A function `value` of the state, positive inside its mode, that ends the mode when it falls
-    to zero.
+    """Function `value` of the state, positive inside its mode, that ends the mode when it falls to
+    zero.
 
     Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
     """
 
-    value: Callable[[StateVector], Scalar]
-    reset: Callable[[StateVector], StateVector] = lambda y: y
+    value: Callable[[StateArray], Scalar]
+    reset: Callable[[StateArray], StateArray] = lambda y: y
     target_mode: int | None = None  # index of the next mode; None stands for the same mode
 
 
@@ -53,7 +52,7 @@ class Mode(NamedTuple):
     field: VectorField
     guards: tuple[Guard, ...]
 
-    def guard_values(self, y: StateVector) -> Array:
+    def guard_values(self, y: StateArray) -> Array:
         """Return the values of all guards at the state `y`, shape (guards,)."""
         return jnp.stack([guard.value(y) for guard in self.guards])
 
@@ -75,7 +74,7 @@ class Termination(StatusCode):
     )
 
 
-RUNNING_CODE = -1
+STATUS_RUNNING_CODE = -1
 """Code of a simulation that has not ended, stored in place of its `Termination`."""
 
 
@@ -95,14 +94,14 @@ class HybridSolution(NamedTuple):
     guards: Int[Array, " events"]  # indices of the guards that ended them
     n_events: Int[Array, ""]
     time: Scalar  # time of the last state
-    state: StateVector  # state at the end of the simulation
+    state: StateArray  # state at the end of the simulation
     mode: Int[Array, ""]
     solver_steps: Int[Array, ""]
     termination: Int[Array, ""]  # a Termination
 
     @property
     def ending(self) -> Any:
-        """Return why the simulation ended, as a sentence; for a batch, an array of sentences."""
+        """Return a sentence about the end of the simulation; for a batch, an array of sentences."""
         return describe_ending(self.termination, Termination)
 
 
@@ -129,11 +128,11 @@ def simulate_hybrid(
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     start, events = check_reals("start", start), check_int("events", events)
-    modes = collect_modes(modes)
-    _check_arguments(modes, start, events, mode)
+    modes = normalize_modes(modes)
+    _check_simulation_arguments(modes, start, events, mode)
     options.check_tolerances(start.dtype)
     mode_index = jnp.asarray(mode, jnp.int32)
-    solution = call_compiled(_simulate, (modes, events), options, start, mode_index)
+    solution = call_compiled(_simulate_modes, (modes, events), options, start, mode_index)
     return forbid_reverse_mode("simulate_hybrid", solution)
 
 
@@ -157,7 +156,7 @@ def time_errors(
     does not reach. It is measured, not proved. `options` are those of the simulation.
     """
     options = StepOptions() if options is None else options
-    modes = collect_modes(modes)
+    modes = normalize_modes(modes)
     start, solution = lax.stop_gradient((check_reals("start", start), solution))
     return call_compiled(_estimate_time_errors, modes, start, solution, options)
 
@@ -168,10 +167,12 @@ def _estimate_time_errors(
     """Return `time_errors` for modes that are tuples."""
     event_indices = jnp.arange(len(solution.times))
 
-    def compute_time_change(factor: Array) -> Array:
-        looser_options = options.with_tightened_tolerances(factor)
+    def compute_time_change(tolerance_factor: Array) -> Array:
+        looser_options = options.with_tightened_tolerances(tolerance_factor)
         modes_and_events = (modes, len(event_indices))
-        looser_solution = _simulate(modes_and_events, looser_options, start, solution.modes[0])
+        looser_solution = _simulate_modes(
+            modes_and_events, looser_options, start, solution.modes[0]
+        )
         is_same_event = (looser_solution.guards == solution.guards) & (
             looser_solution.modes == solution.modes
         )
@@ -185,23 +186,27 @@ def _estimate_time_errors(
     accumulated_roundoff = accumulated_roundoff + jnp.finfo(start.dtype).eps * jnp.abs(
         solution.times
     )
-    changes_at_ten, changes_at_hundred = lax.stop_gradient(
+    changes_at_tenfold_tolerance, changes_at_hundredfold_tolerance = lax.stop_gradient(
         lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
     )
     max_change = (
         jnp.maximum(
-            changes_at_ten, jnp.where(jnp.isinf(changes_at_hundred), 0.0, changes_at_hundred)
+            changes_at_tenfold_tolerance,
+            jnp.where(
+                jnp.isinf(changes_at_hundredfold_tolerance), 0.0, changes_at_hundredfold_tolerance
+            ),
         )
         / solution.time_tolerance
     )
     max_change = lax.cummax(jnp.where(jnp.isnan(max_change), jnp.inf, jnp.maximum(max_change, 1.0)))
-    errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, accumulated_roundoff)
-    return jnp.where(event_indices < solution.n_events, errors, 0.0)
+    time_errors = jnp.maximum(2.0 * max_change * solution.time_tolerance, accumulated_roundoff)
+    return jnp.where(event_indices < solution.n_events, time_errors, 0.0)
 
 
-def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
-    """Return the modes as a tuple whose guards are tuples; a single mode or guard may be given
-    without.
+def normalize_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
+    """Return the modes as a tuple whose guards are tuples.
+
+    A single mode or guard may be given without a tuple.
     """
     if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
         modes = (modes,)  # type: ignore[assignment]
@@ -217,7 +222,9 @@ def collect_modes(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     return tuple(normalized_modes)
 
 
-def _check_arguments(modes: tuple[Mode, ...], start: Array, events: int, mode: int) -> None:
+def _check_simulation_arguments(
+    modes: tuple[Mode, ...], start: Array, events: int, mode: int
+) -> None:
     """Raise a ValueError unless start, events, mode and all functions of the modes fit together."""
     if start.ndim != 1 or not start.size:
         raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
@@ -267,66 +274,76 @@ def _integrate_mode(
 ) -> tuple[PhaseEnd, Array]:
     """Return the end of a mode, and whether a guard is violated at its start."""
     guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
-    values = mode.guard_values(state)
-    rates, curvatures = jax.jvp(guard_rates, (state,), (mode.field(state),))
-    values, rates, curvatures = lax.stop_gradient((values, rates, curvatures))
+    guard_values = mode.guard_values(state)
+    guard_rate_values, guard_curvatures = jax.jvp(guard_rates, (state,), (mode.field(state),))
+    guard_values, guard_rate_values, guard_curvatures = lax.stop_gradient(
+        (guard_values, guard_rate_values, guard_curvatures)
+    )
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
-    is_near_zero = -values <= jnp.abs(rates) * time_resolution
-    is_violated = jnp.any((values < 0.0) & ~is_near_zero)
-    guard_offset = jnp.where((values < 0.0) & is_near_zero & (rates > 0.0), -values, 0.0)
+    is_guard_near_zero = -guard_values <= jnp.abs(guard_rate_values) * time_resolution
+    is_guard_violated = jnp.any((guard_values < 0.0) & ~is_guard_near_zero)
+    guard_offset = jnp.where(
+        (guard_values < 0.0) & is_guard_near_zero & (guard_rate_values > 0.0), -guard_values, 0.0
+    )
     # For a guard at rest the second derivative decides: the guard does not end the mode if it will
     # rise.
-    will_rise = (values == 0.0) & (rates == 0.0) & (curvatures > 0.0)
-    guard_offset = jnp.where(will_rise, jnp.finfo(state.dtype).tiny, guard_offset)
-    is_zero = (values <= 0.0) & is_near_zero & ~will_rise
+    will_guard_rise = (guard_values == 0.0) & (guard_rate_values == 0.0) & (guard_curvatures > 0.0)
+    guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
+    is_guard_zero = (guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise
     monitored_functions = MonitoredFunctions(
-        lambda y: mode.guard_values(y) + guard_offset, len(mode.guards), is_zero_at_start=is_zero
+        lambda y: mode.guard_values(y) + guard_offset,
+        len(mode.guards),
+        is_zero_at_start=is_guard_zero,
     )
     return integrate_phase(
-        mode.field, monitored_functions, state, ~is_violated, options
-    ), is_violated
+        mode.field, monitored_functions, state, ~is_guard_violated, options
+    ), is_guard_violated
 
 
-def _event_time_scales(mode: Mode, end: PhaseEnd, options: StepOptions) -> tuple[Array, Array]:
-    """Return the errors of the event time, s, that correspond to the tolerance and to the round-off
-    of the state.
+def _compute_event_time_errors(
+    mode: Mode, phase_end: PhaseEnd, options: StepOptions
+) -> tuple[Array, Array]:
+    """Return the errors of the event time, s, due to the tolerance and the round-off of the state.
 
-    They are large if the guard is grazed.
+    The errors are large if the guard is grazed.
     """
-    state = lax.stop_gradient(end.state)
-    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(end.guard, 0)]
+    state = lax.stop_gradient(phase_end.state)
+    guard_gradient = jax.jacfwd(mode.guard_values)(state)[jnp.maximum(phase_end.guard, 0)]
     state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(state)
     state_tolerance = options.atol + options.rtol * jnp.abs(state)
     rate = jnp.abs(guard_gradient @ mode.field(state))
     time_scales = [
-        jnp.abs(guard_gradient) @ error / rate for error in (state_tolerance, state_roundoff)
+        jnp.abs(guard_gradient) @ state_error / rate
+        for state_error in (state_tolerance, state_roundoff)
     ]
     return lax.stop_gradient((time_scales[0], time_scales[1]))
 
 
-def _add_exactly(time: Scalar, duration: Scalar) -> tuple[Scalar, Scalar]:
+def _add_with_roundoff(first_time: Scalar, second_time: Scalar) -> tuple[Scalar, Scalar]:
     """Return the rounded sum of two times and its rounding error (D. E. Knuth's two-sum)."""
-    rounded_sum = time + duration
-    added_duration = rounded_sum - time
-    return rounded_sum, (time - (rounded_sum - added_duration)) + (duration - added_duration)
+    rounded_sum = first_time + second_time
+    added_duration = rounded_sum - first_time
+    return rounded_sum, (first_time - (rounded_sum - added_duration)) + (
+        second_time - added_duration
+    )
 
 
-def _simulate(
+def _simulate_modes(
     modes_and_events: tuple[tuple[Mode, ...], int], options: StepOptions, start: Array, mode: Array
 ) -> HybridSolution:
-    """Return the simulation; `modes_and_events` contains the modes and the number of events."""
+    """Return the simulation. `modes_and_events` contains the modes and the number of events."""
     modes, events = modes_and_events
 
     def make_mode_branch(mode_index: int) -> Callable:
         def run_mode(state: Array, time: Array) -> tuple:
-            end, is_violated = _integrate_mode(modes[mode_index], state, time, options)
-            time_scales = _event_time_scales(modes[mode_index], end, options)
-            guards, guard = modes[mode_index].guards, jnp.maximum(end.guard, 0)
-            next_state = lax.switch(guard, [g.reset for g in guards], end.state)
+            phase_end, is_guard_violated = _integrate_mode(modes[mode_index], state, time, options)
+            time_scales = _compute_event_time_errors(modes[mode_index], phase_end, options)
+            guards, guard = modes[mode_index].guards, jnp.maximum(phase_end.guard, 0)
+            next_state = lax.switch(guard, [g.reset for g in guards], phase_end.state)
             next_modes = [mode_index if g.target_mode is None else g.target_mode for g in guards]
             next_mode = jnp.asarray(next_modes, jnp.int32)[guard]
-            return end, is_violated, time_scales, next_state, next_mode
+            return phase_end, is_guard_violated, time_scales, next_state, next_mode
 
         return run_mode
 
@@ -334,54 +351,62 @@ def _simulate(
     # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
     max_simultaneous = sum(len(mode.guards) ** 2 for mode in modes)
 
-    def advance_event(carry: tuple) -> tuple:
-        solution, n_events_without_progress, remainder = carry
-        end, is_violated, time_scales, next_state, next_mode = lax.switch(
+    def advance_event(loop_carry: tuple) -> tuple:
+        solution, n_events_without_progress, time_remainder = loop_carry
+        phase_end, is_guard_violated, time_scales, next_state, next_mode = lax.switch(
             solution.mode, mode_branches, solution.state, solution.time
         )
-        has_event = ~is_violated & (end.guard >= 0)
-        time, remainder = _add_exactly(solution.time, end.duration + remainder)
+        has_event = ~is_guard_violated & (phase_end.guard >= 0)
+        time, time_remainder = _add_with_roundoff(
+            solution.time, phase_end.duration + time_remainder
+        )
         n_events_without_progress = jnp.where(
             time > solution.time, 0, n_events_without_progress + 1
         )
-        has_exhausted_steps = end.solver_steps >= options.max_solver_steps
+        has_exhausted_steps = phase_end.solver_steps >= options.max_solver_steps
         termination = jnp.where(
-            solution.n_events + 1 >= events, int(Termination.MAX_EVENTS_REACHED), RUNNING_CODE
+            solution.n_events + 1 >= events,
+            int(Termination.MAX_EVENTS_REACHED),
+            STATUS_RUNNING_CODE,
         )
         termination = jnp.where(
             n_events_without_progress > max_simultaneous, int(Termination.ZENO), termination
         )
         failure_code = jnp.where(
-            end.timed_out, int(Termination.MAX_TIME_REACHED), int(Termination.STEP_SIZE_UNDERFLOW)
+            phase_end.timed_out,
+            int(Termination.MAX_TIME_REACHED),
+            int(Termination.STEP_SIZE_UNDERFLOW),
         )
         failure_code = jnp.where(
-            end.gave_up & has_exhausted_steps, int(Termination.MAX_STEPS_REACHED), failure_code
+            phase_end.gave_up & has_exhausted_steps,
+            int(Termination.MAX_STEPS_REACHED),
+            failure_code,
         )
         termination = jnp.where(
             has_event,
             termination,
-            jnp.where(is_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_code),
+            jnp.where(is_guard_violated, int(Termination.GUARD_VIOLATED_AT_ENTRY), failure_code),
         )
         event_index = jnp.where(has_event, solution.n_events, events)
-        write_event = lambda row, value: row.at[event_index].set(value, mode="drop")
+        write_event_row = lambda row, value: row.at[event_index].set(value, mode="drop")
         return (
             HybridSolution(
-                times=write_event(solution.times, time),
-                time_tolerance=write_event(solution.time_tolerance, time_scales[0]),
-                time_roundoff=write_event(solution.time_roundoff, time_scales[1]),
-                states_before=write_event(solution.states_before, end.state),
-                states_after=write_event(solution.states_after, next_state),
-                modes=write_event(solution.modes, solution.mode),
-                guards=write_event(solution.guards, end.guard),
+                times=write_event_row(solution.times, time),
+                time_tolerance=write_event_row(solution.time_tolerance, time_scales[0]),
+                time_roundoff=write_event_row(solution.time_roundoff, time_scales[1]),
+                states_before=write_event_row(solution.states_before, phase_end.state),
+                states_after=write_event_row(solution.states_after, next_state),
+                modes=write_event_row(solution.modes, solution.mode),
+                guards=write_event_row(solution.guards, phase_end.guard),
                 n_events=solution.n_events + has_event,
                 time=time,
-                state=jnp.where(has_event, next_state, end.state),
+                state=jnp.where(has_event, next_state, phase_end.state),
                 mode=jnp.where(has_event, next_mode, solution.mode).astype(jnp.int32),
-                solver_steps=solution.solver_steps + end.solver_steps,
+                solver_steps=solution.solver_steps + phase_end.solver_steps,
                 termination=termination.astype(jnp.int32),
             ),
             n_events_without_progress,
-            remainder,
+            time_remainder,
         )
 
     zero_count, traced_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
@@ -396,9 +421,9 @@ def _simulate(
         states_before=zero_states, states_after=zero_states,
         modes=zero_indices, guards=zero_indices, n_events=zero_count, time=traced_zero, state=start,
         mode=zero_count + mode,
-        solver_steps=zero_count, termination=zero_count + RUNNING_CODE,
+        solver_steps=zero_count, termination=zero_count + STATUS_RUNNING_CODE,
     )  # fmt: skip
     is_running = lambda carry: opaque_condition(
-        carry[0].termination == RUNNING_CODE, carry[0].n_events
+        carry[0].termination == STATUS_RUNNING_CODE, carry[0].n_events
     )
     return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, traced_zero))[0]

@@ -14,10 +14,10 @@ from vrw_jax.integrator.tableaus import (
     ButcherTableau,
     StageAcceleration,
     StageState,
+    compute_real_stability_limit,
+    compute_step_size_factor,
     find_guard_minimum,
     fit_guard_parabola,
     load_explicit_tableau,
-    real_stability_limit,
-    step_size_factor,
 )
 from vrw_jax.integrator.tangents import ImplicitDynamics, with_batched_jvp

@@ -1,4 +1,4 @@
-"""Integration of one phase for a batch, each element with its own step size, to the earliest event.
+"""Integration of one phase for a batch to the earliest event, with a step size for each element.
 
 The elements are integrated together until each has ended or has a step that crosses a guard. Then
 all events are located together: the crossing step is repeated with its length corrected by Newton's
@@ -21,26 +21,26 @@ from vrw_jax.integrator.minima import (
     MarginFunctions,
     MinimaResult,
     MinimaState,
+    compute_minima_jvp,
     evaluate_with_rates,
-    init_minima,
-    minima_jvp,
+    init_minima_state,
     refine_minima,
-    update_minima,
+    update_minima_state,
 )
 from vrw_jax.integrator.tableaus import (
-    AccelerationFn,
     ButcherTableau,
+    EvaluateAcceleration,
     RKStep,
     StageState,
-    StepFn,
-    earliest_guard_minimum_fraction,
+    TakeStep,
+    compute_step_size_factor,
+    find_earliest_guard_minimum_fraction,
     rk_step,
-    step_size_factor,
 )
 from vrw_jax.integrator.tangents import (
     ImplicitDynamics,
     PhaseTangents,
-    batched_jvp_rule,
+    apply_batched_jvp_rule,
     stack_directions,
 )
 from vrw_jax.numerics import StepOptions, Vector, tree_where, zero_tangent
@@ -49,24 +49,23 @@ from vrw_jax.simd import noinline
 
 
 class BatchPhase(NamedTuple):
-    """A phase as functions that are elementwise over the batch.
+    """Phase as functions that are elementwise over the batch.
 
     `evaluate` returns the accelerations of a state. The `guards` are positive inside the phase, and
-    an event is a zero crossed from above. The earliest event ends the phase; of two at the same
-    time, the first in the list.
+    an event is a zero crossed from above. The earliest event ends the phase. Of two events at the
+    same time, the first guard in the list ends the phase.
     """
 
-    evaluate: AccelerationFn
+    evaluate: EvaluateAcceleration
     guards: Callable[[StageState], Vector]
     margins: MarginFunctions | None = None  # margins whose minima are computed
     # equations of motion in implicit form, for derivatives
     implicit_dynamics: ImplicitDynamics | None = None
     is_noinline: bool = False
-    """Whether machine code calls the phase's functions instead of inlining them at each use. The
-    code then compiles in half of the time and runs a sixth slower.
-    """
+    """Whether machine code calls the phase's functions instead of inlining them at each use. With
+    calls, the code compiles in half of the time and runs a sixth slower than with inlining."""
     state_units: Vector | None = None
-    """Units of q and of v for the absolute tolerance; the default is SI."""
+    """Units of q and of v for the absolute tolerance. The default is SI."""
 
 
 class BatchPhaseEnd(NamedTuple):
@@ -113,18 +112,17 @@ class IntegrationStatus(IntEnum):
     IDLE = 4  # The element is inactive, or its start is already an event.
 
 
-STRAGGLER_FACTOR = 2
-"""Ratio of the iterations after which stragglers are cut off to the iterations after which half
-of the batch had ended. It is chosen because a ratio near 1 would cut off regular elements.
-"""
+STRAGGLER_ITERATION_FACTOR = 2
+"""Ratio of the iterations after which stragglers are cut off to the iterations after which half of
+the batch had ended. The value is chosen because a ratio near 1 would cut off regular elements."""
 
 
-BatchPhaseFn = Callable[[Any, Vector], BatchPhase]
-"""A function of constants that returns a phase, see `tangents.ImplicitDynamicsFn`."""
+MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
+"""Function of constants that returns a phase, see `tangents.ImplicitDynamicsFn`."""
 
 
 def integrate_batch_phase(
-    make_phase: BatchPhaseFn,
+    make_phase: MakeBatchPhase,
     constants: Any,
     held_constants: Vector,
     tableau: ButcherTableau,
@@ -139,16 +137,16 @@ def integrate_batch_phase(
 
     Each active element is integrated to its earliest event. Errors are those of
     `hybrid.integrate_phase`. In a large batch, as on a GPU, the last `straggler_count` elements are
-    cut off if they take `STRAGGLER_FACTOR` times as many iterations as half of the batch. They are
+    cut off if they take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. They are
     marked unfinished, and the caller integrates them again together with other stragglers. The
     result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
     `tangents`.
     """
-    integrate = jax.custom_jvp(
+    integrate_with_rule = jax.custom_jvp(
         lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments).phase_end
     )
 
-    @integrate.defjvp
+    @integrate_with_rule.defjvp
     @with_default_settings
     def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
         def make_implicit_dynamics(*constants: Any) -> ImplicitDynamics:
@@ -165,20 +163,20 @@ def integrate_batch_phase(
                 make_implicit_dynamics, primals[0], primals[1], constants_tangents, start_tangents
             )
             phase_run = _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
-            return phase_run.phase_end, _phase_end_jvp(
+            return phase_run.phase_end, _compute_phase_end_jvp(
                 make_phase, tableau, phase_tangents, phase_run
             )
 
-        end, (q, v, event_time_tangent, minima) = batched_jvp_rule(
+        phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             evaluate_with_tangents, primals, tangents[:4]
         )
-        zero_end = zero_tangent(end)
-        state_tangent = zero_end.state._replace(q=q, v=v)
-        return end, zero_end._replace(
-            state=state_tangent, duration=event_time_tangent, minima=minima
+        zero_phase_end = zero_tangent(phase_end)
+        state_tangent = zero_phase_end.state._replace(q=q, v=v)
+        return phase_end, zero_phase_end._replace(
+            state=state_tangent, duration=event_time_tangent, minima=minima_tangents
         )
 
-    return integrate(
+    return integrate_with_rule(
         constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
     )
 
@@ -186,7 +184,7 @@ def integrate_batch_phase(
 class _PhaseRun(NamedTuple):
     """End of a phase with the intermediate results that its tangents require."""
 
-    step_function: StepFn
+    step_function: TakeStep
     start: StageState
     phase_end: BatchPhaseEnd
     integrator_state: _IntegratorState
@@ -194,44 +192,46 @@ class _PhaseRun(NamedTuple):
     minima_result: MinimaResult | None
 
 
-def _phase_end_jvp(
-    make_phase: BatchPhaseFn,
+def _compute_phase_end_jvp(
+    make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
     phase_run: _PhaseRun,
 ) -> tuple[Vector, Vector, Array, Array | None]:
     """Return the tangents of a phase's end for tangents of its start and constants.
 
-    They are the tangents of positions, rates, duration and minima of the margins, directions first.
+    The tangents belong to positions, rates, duration and minima of the margins. Directions are the
+    first axis.
     """
     step_function, start, phase_end, integrator_state, minima, minima_result = phase_run
     n, has_crossed = len(start.q), integrator_state.status == IntegrationStatus.CROSSED
     last_length = jnp.where(has_crossed, phase_end.duration - integrator_state.time, 0.0)
     rk_step = step_function(integrator_state.state, last_length)
     assert integrator_state.tangents is not None
-    tangents = phase_tangents.propagate(
+    end_state_tangents = phase_tangents.propagate(
         tableau, rk_step.stage_states, integrator_state.tangents, last_length
     )
 
-    end_state, tangent_rows = rk_step.end, tuple(jnp.moveaxis(tangents, 1, 0))
-    event_time_tangent = _event_time_jvp(
-        make_phase, phase_tangents, end_state, tangents, integrator_state, phase_end.guard
+    end_state, stacked_tangents = rk_step.end, tuple(jnp.moveaxis(end_state_tangents, 1, 0))
+    event_time_tangent = _compute_event_time_jvp(
+        make_phase, phase_tangents, end_state, end_state_tangents, integrator_state, phase_end.guard
     )
     motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
     state_tangents = tuple(
-        x + event_time_tangent * y for x, y in zip(tangent_rows[: 2 * n], motion_rates, strict=True)
+        x + event_time_tangent * y
+        for x, y in zip(stacked_tangents[: 2 * n], motion_rates, strict=True)
     )
     minima_tangents = None
     if minima is not None and minima_result is not None:
 
-        def make_margins(*constants: Any) -> tuple[MarginFunctions, AccelerationFn]:
+        def make_margins(*constants: Any) -> tuple[MarginFunctions, EvaluateAcceleration]:
             phase = make_phase(*constants)
             assert phase.margins is not None
             return phase.margins, phase.evaluate
 
         phase_ends = start, phase_end.state
-        end_tangents = jnp.stack([*state_tangents, *tangent_rows[2 * n :]], 1)
-        minima_tangents = minima_jvp(
+        end_tangents = jnp.stack([*state_tangents, *stacked_tangents[2 * n :]], 1)
+        minima_tangents = compute_minima_jvp(
             make_margins,
             step_function,
             tableau,
@@ -244,16 +244,17 @@ def _phase_end_jvp(
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
 
 
-def _event_time_jvp(
-    make_phase: BatchPhaseFn,
+def _compute_event_time_jvp(
+    make_phase: MakeBatchPhase,
     phase_tangents: PhaseTangents,
     end_state: StageState,
     tangents: Array,
     integrator_state: _IntegratorState,
     event_guard: Array,
 ) -> Array:
-    """Return the tangent of the event's time, s, from the condition that the guard vanishes
-    along the perturbed motion.
+    """Return the tangent of the event's time, s.
+
+    It follows from the condition that the guard vanishes along the perturbed motion.
     """
 
     def evaluate_guards(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Vector:
@@ -261,20 +262,24 @@ def _event_time_jvp(
         return phase.guards(StageState(q, v, phase.evaluate(q, v)))
 
     phase = make_phase(phase_tangents.constants, phase_tangents.held_constants)
-    _, rates = evaluate_with_rates(phase.guards, phase.evaluate, end_state)
+    _, guard_rates = evaluate_with_rates(phase.guards, phase.evaluate, end_state)
     guard_tangents = phase_tangents.evaluate_tangents(evaluate_guards, end_state, tangents)
     has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     time_tangent = jnp.zeros_like(integrator_state.dt)
-    for index, (rate, guard_tangent) in enumerate(zip(rates, guard_tangents, strict=True)):
-        is_event_guard = has_crossed & (event_guard == index) & (rate < 0.0)
+    for guard_number, (guard_rate, guard_tangent) in enumerate(
+        zip(guard_rates, guard_tangents, strict=True)
+    ):
+        is_event_guard = has_crossed & (event_guard == guard_number) & (guard_rate < 0.0)
         time_tangent = jnp.where(
-            is_event_guard, -guard_tangent / jnp.where(is_event_guard, rate, -1.0), time_tangent
+            is_event_guard,
+            -guard_tangent / jnp.where(is_event_guard, guard_rate, -1.0),
+            time_tangent,
         )
     return time_tangent
 
 
 def _integrate_to_event(
-    make_phase: BatchPhaseFn,
+    make_phase: MakeBatchPhase,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents | None,
     constants: Any,
@@ -288,26 +293,26 @@ def _integrate_to_event(
 ) -> _PhaseRun:
     """Integrate a phase, locate its event and the minima of its margins, and return all results."""
     phase = make_phase(constants, held_constants)
-    phase = _wrap_phase_functions(phase, noinline if phase.is_noinline else jax.jit)
+    phase = _wrap_each_phase_function(phase, noinline if phase.is_noinline else jax.jit)
     step_function = _make_step_function(phase, tableau)
-    start = StageState(q, v, phase.evaluate(q, v))
-    values, rates = evaluate_with_rates(phase.guards, phase.evaluate, start)
-    is_met_at_start = tuple(
+    start_state = StageState(q, v, phase.evaluate(q, v))
+    guard_values, guard_rates = evaluate_with_rates(phase.guards, phase.evaluate, start_state)
+    is_guard_met_at_start = tuple(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
-        for guard_value, guard_rate in zip(values, rates, strict=True)
+        for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
     )
     # The index is that of the first guard whose event is the start itself; -1 if there is none.
-    start_guard = jnp.full(is_met_at_start[0].shape, -1, jnp.int32)
-    for guard_index in range(len(is_met_at_start) - 1, -1, -1):
-        start_guard = jnp.where(is_met_at_start[guard_index], guard_index, start_guard)
+    start_guard = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
+    for guard_index in range(len(is_guard_met_at_start) - 1, -1, -1):
+        start_guard = jnp.where(is_guard_met_at_start[guard_index], guard_index, start_guard)
     is_started = is_active & (start_guard < 0)
 
     integrator_state = _integrate_until_crossing(
         phase,
         step_function,
         tableau,
-        start,
-        values,
+        start_state,
+        guard_values,
         is_started,
         initial_dt,
         options,
@@ -317,7 +322,7 @@ def _integrate_to_event(
     has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     if phase.margins is not None or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
-        phase = _wrap_phase_functions(phase, noinline)
+        phase = _wrap_each_phase_function(phase, noinline)
         step_function = _make_step_function(phase, tableau)
     crossing_step = CrossingStep(
         *integrator_state[:2],
@@ -327,28 +332,32 @@ def _integrate_to_event(
         integrator_state.crossing_bits,
         has_crossed,
     )
-    search = locate_event(
+    event_search = locate_event(
         phase.guards, phase.evaluate, step_function, tableau, crossing_step, options
     )
-    is_event_unresolved = has_crossed & search.is_unresolved
-    duration = integrator_state.time + jnp.where(has_crossed, search.length, 0.0)
-    end_state = tree_where(has_crossed, search.end, integrator_state.state)
+    is_event_unresolved = has_crossed & event_search.is_unresolved
+    duration = integrator_state.time + jnp.where(has_crossed, event_search.length, 0.0)
+    end_state = tree_where(has_crossed, event_search.end, integrator_state.state)
     minima, minima_result = integrator_state.minima, None
     if phase.margins is not None and minima is not None:
         margin_arguments = phase.margins, phase.evaluate
         accepted_step = AcceptedStep(
-            integrator_state.state, end_state, search.length, has_crossed, integrator_state.tangents
+            integrator_state.state,
+            end_state,
+            event_search.length,
+            has_crossed,
+            integrator_state.tangents,
         )
-        minima = update_minima(*margin_arguments, minima, accepted_step)
-        start_margins = jnp.stack(phase.margins.evaluate_margins(start))
+        minima = update_minima_state(*margin_arguments, minima, accepted_step)
+        start_margins = jnp.stack(phase.margins.evaluate_margins(start_state))
         minima_result = refine_minima(
             phase.margins, step_function, phase.evaluate, minima, start_margins, options
         )
-    is_straggler = has_crossed & ~search.is_unresolved & (duration > options.max_phase_time)
+    is_straggler = has_crossed & ~event_search.is_unresolved & (duration > options.max_phase_time)
     event_guard = jnp.where(
         is_active & (start_guard >= 0),
         start_guard,
-        jnp.where(has_crossed, search.guard, -1),
+        jnp.where(has_crossed, event_search.guard, -1),
     )
     phase_end = BatchPhaseEnd(
         state=end_state,
@@ -357,23 +366,25 @@ def _integrate_to_event(
         timed_out=(integrator_state.status == IntegrationStatus.TIMED_OUT) | is_straggler,
         is_unfinished=integrator_state.status == IntegrationStatus.RUNNING,
         n_tried_steps=integrator_state.n_tried_steps
-        + jnp.where(has_crossed, search.n_tried_steps, 0),
+        + jnp.where(has_crossed, event_search.n_tried_steps, 0),
         next_dt=integrator_state.dt,
         minima=None if minima_result is None else minima_result.phase_minima,
     )
-    return _PhaseRun(step_function, start, phase_end, integrator_state, minima, minima_result)
+    return _PhaseRun(step_function, start_state, phase_end, integrator_state, minima, minima_result)
 
 
-def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> StepFn:
-    """Return the phase's Runge-Kutta step as a function of state and length, traced once for all
-    its calls.
+def _make_step_function(phase: BatchPhase, tableau: ButcherTableau) -> TakeStep:
+    """Return the phase's Runge-Kutta step as a function of state and length.
+
+    The function is traced once for all its calls.
     """
     return jax.jit(lambda state, h: rk_step(tableau, phase.evaluate, state, h))
 
 
-def _wrap_phase_functions(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
-    """Return the phase with its functions wrapped by `wrap_function`, so that each is traced once
-    for all its calls.
+def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
+    """Return the phase with each function wrapped by `wrap_function`.
+
+    Each function is then traced once for all its calls.
     """
     margins = phase.margins
     if margins is not None:
@@ -385,7 +396,7 @@ def _wrap_phase_functions(phase: BatchPhase, wrap_function: Callable) -> BatchPh
 
 def _integrate_until_crossing(
     phase: BatchPhase,
-    step_function: StepFn,
+    step_function: TakeStep,
     tableau: ButcherTableau,
     start: StageState,
     guard_values: Vector,
@@ -395,25 +406,28 @@ def _integrate_until_crossing(
     straggler_count: Array | None,
     phase_tangents: PhaseTangents | None,
 ) -> _IntegratorState:
-    """Take adaptive steps until each element has crossed a guard, reached the time limit or
-    failed, and return the state.
+    """Take adaptive steps until each element has crossed a guard, reached the time limit or failed.
+
+    Return the state of the loop.
     """
 
     def take_one_step(integrator_state: _IntegratorState) -> _IntegratorState:
         rk_step = step_function(integrator_state.state, integrator_state.dt)
         stage_values = [phase.guards(rk_step.stage_states[i]) for i in tableau.guard_stages]
         end_values = phase.guards(rk_step.end)
-        squared_error = _mean_squared_error(
+        squared_error = _compute_mean_squared_error(
             rk_step, integrator_state.state, end_values, options, phase.state_units
         )
-        guard_minimum_fraction = earliest_guard_minimum_fraction(
+        guard_minimum_fraction = find_earliest_guard_minimum_fraction(
             tableau, [integrator_state.guard_values, *stage_values, end_values]
         )
         is_within_tolerance = squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
         may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
         is_rejected = may_cross_inside | ~is_within_tolerance
-        controller_factor = step_size_factor(tableau, squared_error, guard_minimum_fraction.dtype)
+        controller_factor = compute_step_size_factor(
+            tableau, squared_error, guard_minimum_fraction.dtype
+        )
         length_factor = jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor)
         status, crossing_bits, is_accepted, time, length = _classify_step(
             options, integrator_state, length_factor, is_rejected, end_values
@@ -445,7 +459,7 @@ def _integrate_until_crossing(
                 is_accepted,
                 integrator_state.tangents,
             )
-            minima = update_minima(*margin_arguments, minima, accepted_step)
+            minima = update_minima_state(*margin_arguments, minima, accepted_step)
         if phase_tangents is not None and tangents is not None:
             tangents = phase_tangents.propagate_if_accepted(
                 tableau, rk_step.stage_states, tangents, integrator_state.dt, is_accepted
@@ -479,11 +493,13 @@ def _integrate_until_crossing(
         if straggler_count is None:
             return jnp.any(is_running)
         n_running = jnp.sum(is_running, dtype=jnp.int32)
-        max_iterations = STRAGGLER_FACTOR * integrator_state.iterations_until_half_ended + 8
+        max_iterations = (
+            STRAGGLER_ITERATION_FACTOR * integrator_state.iterations_until_half_ended + 8
+        )
         exceeds_iteration_limit = integrator_state.n_iterations > max_iterations
         return (n_running > 0) & ~((n_running <= straggler_count) & exceeds_iteration_limit)
 
-    initial_minima = phase.margins and init_minima(
+    initial_minima = phase.margins and init_minima_state(
         phase.margins, phase.evaluate, start, phase_tangents
     )
     zero_counts, zero_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
@@ -523,17 +539,21 @@ def _classify_step(
     is_running = integrator_state.status == IntegrationStatus.RUNNING
     is_valid_step = is_running & ~is_rejected
     crossing_bits = jnp.zeros_like(integrator_state.crossing_bits)
-    for index, value in enumerate(end_values):
-        crossing_bits = crossing_bits | jnp.where(value <= 0.0, 1 << index, 0)
+    for guard_number, end_value in enumerate(end_values):
+        crossing_bits = crossing_bits | jnp.where(end_value <= 0.0, 1 << guard_number, 0)
     has_crossed = is_valid_step & (crossing_bits > 0)
     is_accepted = is_valid_step & ~has_crossed
-    dt, time, time_limit = integrator_state.dt, integrator_state.time, options.max_phase_time
-    end_time = jnp.where(dt == time_limit - time, time_limit, time + dt)
-    time = jnp.where(is_accepted, end_time, time)
-    next_length = jnp.minimum(dt * length_factor, time_limit - time)
-    has_timed_out = is_accepted & (time >= time_limit)
+    dt, elapsed_time, time_limit = (
+        integrator_state.dt,
+        integrator_state.time,
+        options.max_phase_time,
+    )
+    end_time = jnp.where(dt == time_limit - elapsed_time, time_limit, elapsed_time + dt)
+    elapsed_time = jnp.where(is_accepted, end_time, elapsed_time)
+    next_length = jnp.minimum(dt * length_factor, time_limit - elapsed_time)
+    has_timed_out = is_accepted & (elapsed_time >= time_limit)
     is_stuck = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
-        time + next_length == time
+        elapsed_time + next_length == elapsed_time
     )
     status = jnp.where(is_stuck, IntegrationStatus.FAILED, IntegrationStatus.RUNNING)
     status = jnp.where(
@@ -545,37 +565,37 @@ def _classify_step(
         jnp.where(is_running, status, integrator_state.status).astype(jnp.int32),
         jnp.where(is_running, crossing_bits, integrator_state.crossing_bits),
         is_accepted,
-        time,
+        elapsed_time,
         jnp.where(is_running & ~has_crossed, next_length, dt),
     )
 
 
-def _mean_squared_error(
+def _compute_mean_squared_error(
     rk_step: RKStep,
     start: StageState,
-    guards: Vector,
+    guard_weights: Vector,
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
     """Return the mean square of the step's error over its tolerance; infinity if the step is not
     finite.
 
-    It is computed in float32, because an error estimate needs no more precision.
+    The mean is computed in float32, because an error estimate needs no more precision.
     """
     start_numbers, end_numbers = (*start.q, *start.v), (*rk_step.end.q, *rk_step.end.v)
     to_float32 = lambda x: x.astype(jnp.float32)
     sum_of_squares: Any = 0.0
     units_of_state: Any = (1.0,) * len(start_numbers) if state_units is None else state_units
-    for error, start_value, end_value, state_unit in zip(
+    for coordinate_error, start_value, end_value, state_unit in zip(
         rk_step.error, start_numbers, end_numbers, units_of_state, strict=True
     ):
-        tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
+        error_tolerance = options.atol * state_unit + options.rtol * jnp.maximum(
             jnp.abs(start_value), jnp.abs(end_value)
         )
-        ratio = to_float32(error) / to_float32(tolerance)
-        sum_of_squares = sum_of_squares + ratio * ratio
-    for value in guards:
-        sum_of_squares = sum_of_squares + to_float32(0.0 * value)
+        error_ratio = to_float32(coordinate_error) / to_float32(error_tolerance)
+        sum_of_squares = sum_of_squares + error_ratio * error_ratio
+    for coordinate_value in guard_weights:
+        sum_of_squares = sum_of_squares + to_float32(0.0 * coordinate_value)
     return jnp.where(jnp.isfinite(sum_of_squares), sum_of_squares / len(start_numbers), jnp.inf)
 
 
@@ -588,15 +608,16 @@ def sample_batch_phase(
     n_samples: int,
     options: StepOptions,
 ) -> Array:
-    """Return positions, then rates, at `n_samples` equal times of a phase, ends included, as an
-    array (samples, 2 coordinates, batch).
+    """Return positions, then rates, at `n_samples` equal times of a phase, both ends included.
+
+    The shape is (samples, 2 coordinates, batch).
     """
 
     def step_function(state: StageState, length: Array) -> tuple[StageState, Array]:
         step = rk_step(tableau, phase.evaluate, state, length)
-        return step.end, _mean_squared_error(step, state, (), options, phase.state_units)
+        return step.end, _compute_mean_squared_error(step, state, (), options, phase.state_units)
 
-    pack_sample = lambda state: jnp.stack([*state.q, *state.v])
+    pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
     start = StageState(q, v, phase.evaluate(q, v))
     return sample_at_equal_times(
         step_function, pack_sample, start, tableau, duration, n_samples, options
@@ -615,16 +636,16 @@ def sample_at_equal_times(
     """Return `pack_sample` of the states at `n_samples` equal times, ends included, on the first
     axis.
 
-    `step_function(state, length)` returns the end of a step of the tableau, and the square of its
-    error over its tolerance.
+    `step_function(state, length)` returns the end of a step, and the square of its error over its
+    tolerance.
     """
     zero_count = jnp.zeros((), jnp.int32)
 
-    def take_sample_step(carry: tuple) -> tuple:
-        state, h, time_left, n_tried_steps = carry
+    def take_sample_step(loop_carry: tuple) -> tuple:
+        sample_state, h, time_left, n_tried_steps = loop_carry
         length = jnp.minimum(h, time_left)
-        end, squared_error = step_function(state, length)
-        length_factor = step_size_factor(tableau, squared_error, length.dtype)
+        step_end, squared_error = step_function(sample_state, length)
+        length_factor = compute_step_size_factor(tableau, squared_error, length.dtype)
         is_within_tolerance = squared_error <= 1.0
         # A step that was shortened to end at a sample does not reduce the next step's length.
         h = jnp.where(
@@ -634,8 +655,8 @@ def sample_at_equal_times(
         )
         is_running = time_left > 0.0
         return (
-            tree_where(is_running & is_within_tolerance, end, state),
-            jnp.where(is_running, h, carry[1]),
+            tree_where(is_running & is_within_tolerance, step_end, sample_state),
+            jnp.where(is_running, h, loop_carry[1]),
             jnp.where(
                 is_running & is_within_tolerance,
                 jnp.where(length == time_left, 0.0, time_left - length),
@@ -644,11 +665,13 @@ def sample_at_equal_times(
             n_tried_steps + 1,
         )
 
-    def integrate_to_next(carry: tuple, _: None) -> tuple[tuple, Array]:
-        needs_step = lambda carry: jnp.any(carry[2] > 0.0) & (carry[3] < options.max_solver_steps)
-        initial_carry = (*carry, duration / (n_samples - 1), zero_count)
-        state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_carry)
-        return (state, h), pack_sample(state)
+    def integrate_to_next(loop_carry: tuple, _: None) -> tuple[tuple, Array]:
+        needs_step = lambda loop_carry: (
+            jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
+        )
+        initial_carry = (*loop_carry, duration / (n_samples - 1), zero_count)
+        sample_state, h, _, _ = lax.while_loop(needs_step, take_sample_step, initial_carry)
+        return (sample_state, h), pack_sample(sample_state)
 
     initial_carry = start, options.dt0 + jnp.zeros_like(duration)
     later_samples = lax.scan(integrate_to_next, initial_carry, None, length=n_samples - 1)[1]

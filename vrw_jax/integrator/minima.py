@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.integrator.tableaus import AccelerationFn, ButcherTableau, StageState, StepFn
+from vrw_jax.integrator.tableaus import ButcherTableau, EvaluateAcceleration, StageState, TakeStep
 from vrw_jax.integrator.tangents import PhaseTangents
 from vrw_jax.numerics import (
     MINIMUM_LOCATION_TOLERANCE,
@@ -35,7 +35,7 @@ class MarginFunctions(NamedTuple):
 
 
 class MinimaState(NamedTuple):
-    """Margins at the present state, and the step that contains the lowest minimum of each so
+    """Margins at the present state, and the step that contains the lowest minimum of each margin so
     far.
     """
 
@@ -52,43 +52,51 @@ class MinimaState(NamedTuple):
 
 
 def evaluate_with_rates(
-    function: Callable[[StageState], Vector], evaluate: AccelerationFn, state: StageState
+    evaluate_functions: Callable[[StageState], Vector],
+    evaluate_acceleration: EvaluateAcceleration,
+    motion_state: StageState,
 ) -> tuple[Vector, Vector]:
-    """Return the values of `function` at a state, and their time derivatives along the motion."""
-    n = len(state.q)
+    """Return the values of `evaluate_functions` at a state, and their time derivatives along the motion."""
+    n = len(motion_state.q)
 
     def evaluate_along_motion(q: Vector, v: Vector) -> Vector:
-        return function(StageState(q, v, evaluate(q, v)))
+        return evaluate_functions(StageState(q, v, evaluate_acceleration(q, v)))
 
     return jax.jvp(
-        evaluate_along_motion, (state.q, state.v), (state.v, state.acceleration.acceleration[:n])
+        evaluate_along_motion,
+        (motion_state.q, motion_state.v),
+        (motion_state.v, motion_state.acceleration.acceleration[:n]),
     )
 
 
-def init_minima(
+def init_minima_state(
     margins: MarginFunctions,
-    evaluate: AccelerationFn,
-    state: StageState,
+    evaluate_acceleration: EvaluateAcceleration,
+    start_state: StageState,
     phase_tangents: PhaseTangents | None,
 ) -> MinimaState:
     """Return the state of the search for minima before the first step.
 
-    A margin that is zero at the start by construction has no negative rate there except round-off,
-    so a negative rate counts as zero.
+    A margin that is zero at the start by construction has no negative rate at the start except
+    round-off. A negative rate therefore counts as zero.
     """
-    values, rates = map(jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate, state))
+    margin_values, margin_rates = map(
+        jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate_acceleration, start_state)
+    )
     includes_start = jnp.asarray(margins.includes_start)[:, None]
-    infinite_minima = jnp.zeros_like(values)
-    zero_starts = jnp.zeros((len(values), len(state.q), values.shape[-1]), values.dtype)
-    rates = jnp.where(includes_start, rates, jnp.maximum(rates, 0.0))
+    infinite_minima = jnp.zeros_like(margin_values)
+    zero_starts = jnp.zeros(
+        (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
+    )
+    margin_rates = jnp.where(includes_start, margin_rates, jnp.maximum(margin_rates, 0.0))
     zero_tangents = (
         None
         if phase_tangents is None
-        else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(values))
+        else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(margin_values))
     )
     return MinimaState(
-        values,
-        rates,
+        margin_values,
+        margin_rates,
         infinite_minima + jnp.inf,
         zero_starts,
         zero_starts,
@@ -100,7 +108,7 @@ def init_minima(
 
 
 class AcceptedStep(NamedTuple):
-    """A solver step, and which batch elements accepted it."""
+    """Solver step, and the batch elements that accepted it."""
 
     start: StageState
     end: StageState
@@ -109,39 +117,47 @@ class AcceptedStep(NamedTuple):
     start_tangents: Array | None  # tangents of the step's start
 
 
-def update_minima(
+def update_minima_state(
     margins: MarginFunctions,
-    evaluate: AccelerationFn,
-    minima: MinimaState,
+    evaluate_acceleration: EvaluateAcceleration,
+    minima_state: MinimaState,
     accepted_step: AcceptedStep,
 ) -> MinimaState:
-    """Return the minima, updated with those inside an accepted step."""
-    start, end, length, is_accepted, _ = accepted_step
-    values, rates = map(jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate, end))
-    location, value = find_cubic_minimum(
-        minima.values, minima.rates * length, values, rates * length
+    """Return the minima, updated with the minima inside an accepted step."""
+    step_start, step_end, length, is_accepted, _ = accepted_step
+    margin_values, margin_rates = map(
+        jnp.stack, evaluate_with_rates(margins.evaluate_margins, evaluate_acceleration, step_end)
     )
-    value = jnp.where(jnp.isfinite(value), value, jnp.minimum(minima.values, values))
-    has_minimum = (minima.rates < 0.0) & (rates >= 0.0)
-    is_lower = is_accepted & has_minimum & (value < minima.lowest_values)
-    replace_if_lower = lambda new_value, old_value: jnp.where(is_lower, new_value, old_value)
+    minimum_location, minimum_value = find_cubic_minimum(
+        minima_state.values, minima_state.rates * length, margin_values, margin_rates * length
+    )
+    minimum_value = jnp.where(
+        jnp.isfinite(minimum_value), minimum_value, jnp.minimum(minima_state.values, margin_values)
+    )
+    has_interior_minimum = (minima_state.rates < 0.0) & (margin_rates >= 0.0)
+    is_minimum_lower = (
+        is_accepted & has_interior_minimum & (minimum_value < minima_state.lowest_values)
+    )
+    replace_if_lower = lambda new_value, old_value: jnp.where(
+        is_minimum_lower, new_value, old_value
+    )
     replace_start_if_lower = lambda new_value, old_value: jnp.where(
-        is_lower[:, None], jnp.stack(new_value), old_value
+        is_minimum_lower[:, None], jnp.stack(new_value), old_value
     )
-    start_tangents = minima.start_tangents
+    start_tangents = minima_state.start_tangents
     if start_tangents is not None and accepted_step.start_tangents is not None:
         start_tangents = jnp.where(
-            is_lower[:, None, None], accepted_step.start_tangents[None], start_tangents
+            is_minimum_lower[:, None, None], accepted_step.start_tangents[None], start_tangents
         )
     return MinimaState(
-        values=jnp.where(is_accepted, values, minima.values),
-        rates=jnp.where(is_accepted, rates, minima.rates),
-        lowest_values=replace_if_lower(value, minima.lowest_values),
-        start_q=replace_start_if_lower(start.q, minima.start_q),
-        start_v=replace_start_if_lower(start.v, minima.start_v),
-        step_length=replace_if_lower(length, minima.step_length),
-        minimum_offset=replace_if_lower(location * length, minima.minimum_offset),
-        start_rates=replace_if_lower(minima.rates, minima.start_rates),
+        values=jnp.where(is_accepted, margin_values, minima_state.values),
+        rates=jnp.where(is_accepted, margin_rates, minima_state.rates),
+        lowest_values=replace_if_lower(minimum_value, minima_state.lowest_values),
+        start_q=replace_start_if_lower(step_start.q, minima_state.start_q),
+        start_v=replace_start_if_lower(step_start.v, minima_state.start_v),
+        step_length=replace_if_lower(length, minima_state.step_length),
+        minimum_offset=replace_if_lower(minimum_location * length, minima_state.minimum_offset),
+        start_rates=replace_if_lower(minima_state.rates, minima_state.start_rates),
         start_tangents=start_tangents,
     )
 
@@ -167,62 +183,71 @@ class _MinimumSearch(NamedTuple):
 
 def refine_minima(
     margins: MarginFunctions,
-    step_function: StepFn,
-    evaluate: AccelerationFn,
-    minima: MinimaState,
+    step_function: TakeStep,
+    evaluate_acceleration: EvaluateAcceleration,
+    minima_state: MinimaState,
     start_values: Array,
     options: StepOptions,
 ) -> MinimaResult:
-    """Return the minima of the margins over the phase; `start_values` are the margins at its start.
+    """Return the minima of the margins over the phase.
 
-    Each minimum takes at most `max_margin_search_iterations` secant steps. All of them begin at the
-    start of the step that contains the minimum.
+    `start_values` are the margins at the start of the phase. Each minimum takes at most
+    `max_margin_search_iterations` secant steps. Each secant step begins at the start of the solver
+    step that contains the minimum.
     """
 
-    def refine_margin(_: None, inputs: tuple) -> tuple[None, tuple[Array, Array]]:
-        index, margin_state = inputs
+    def refine_margin(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
+        margin_index, margin_state = margin_inputs
         q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
-        start = StageState(q, v, evaluate(q, v))
+        minimum_start = StageState(q, v, evaluate_acceleration(q, v))
 
         def selected_margin(state: StageState) -> Array:
-            is_selected = jnp.arange(len(margins.includes_start)) == index
+            is_selected = jnp.arange(len(margins.includes_start)) == margin_index
             return jnp.sum(
                 jnp.where(is_selected[:, None], jnp.stack(margins.evaluate_margins(state)), 0.0), 0
             )
 
-        def improve(search: _MinimumSearch) -> _MinimumSearch:
-            end = step_function(start, search.length).end
-            (value,), (rate,) = evaluate_with_rates(
-                lambda state: (selected_margin(state),), evaluate, end
+        def improve(minimum_search: _MinimumSearch) -> _MinimumSearch:
+            step_end = step_function(minimum_start, minimum_search.length).end
+            (margin_value,), (margin_rate,) = evaluate_with_rates(
+                lambda state: (selected_margin(state),), evaluate_acceleration, step_end
             )
-            length_change = search.length - search.best_length
-            rate_derivative = (rate - search.best_rate) / jnp.where(
+            length_change = minimum_search.length - minimum_search.best_length
+            rate_derivative = (margin_rate - minimum_search.best_rate) / jnp.where(
                 length_change == 0.0, 1.0, length_change
             )
-            is_usable = (length_change != 0.0) & (rate_derivative > 0.0)
-            change = jnp.where(is_usable, -rate / jnp.where(is_usable, rate_derivative, 1.0), 0.0)
-            length = jnp.clip(search.length + change, 0.0, margin_state.step_length)
+            is_secant_usable = (length_change != 0.0) & (rate_derivative > 0.0)
+            length_correction = jnp.where(
+                is_secant_usable,
+                -margin_rate / jnp.where(is_secant_usable, rate_derivative, 1.0),
+                0.0,
+            )
+            length = jnp.clip(
+                minimum_search.length + length_correction, 0.0, margin_state.step_length
+            )
             has_converged = (
-                jnp.abs(length - search.length)
+                jnp.abs(length - minimum_search.length)
                 <= MINIMUM_LOCATION_TOLERANCE * margin_state.step_length
             )
-            is_better = jnp.abs(rate) < jnp.abs(search.best_rate)
+            has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_rate)
             improved_search = _MinimumSearch(
                 length=length,
-                best_length=jnp.where(is_better, search.length, search.best_length),
-                best_rate=jnp.where(is_better, rate, search.best_rate),
-                value=value,
-                is_unresolved=search.is_unresolved & ~has_converged,
-                n_iterations=search.n_iterations,
+                best_length=jnp.where(
+                    has_smaller_rate, minimum_search.length, minimum_search.best_length
+                ),
+                best_rate=jnp.where(has_smaller_rate, margin_rate, minimum_search.best_rate),
+                value=margin_value,
+                is_unresolved=minimum_search.is_unresolved & ~has_converged,
+                n_iterations=minimum_search.n_iterations,
             )
-            return tree_where(search.is_unresolved, improved_search, search)._replace(
-                n_iterations=search.n_iterations + 1
-            )
+            return tree_where(
+                minimum_search.is_unresolved, improved_search, minimum_search
+            )._replace(n_iterations=minimum_search.n_iterations + 1)
 
         has_minimum = jnp.isfinite(margin_state.lowest_values)
         zero_length = jnp.zeros_like(margin_state.step_length)
         n_iterations = jnp.zeros((), jnp.int32)
-        search = _MinimumSearch(
+        minimum_search = _MinimumSearch(
             margin_state.minimum_offset,
             zero_length,
             margin_state.start_rates,
@@ -230,29 +255,29 @@ def refine_minima(
             has_minimum,
             n_iterations,
         )
-        needs_iteration = lambda search: (
-            jnp.any(search.is_unresolved)
-            & (search.n_iterations < options.max_margin_search_iterations)
+        needs_iteration = lambda minimum_search: (
+            jnp.any(minimum_search.is_unresolved)
+            & (minimum_search.n_iterations < options.max_margin_search_iterations)
         )
-        final_search = lax.while_loop(needs_iteration, improve, search)
+        final_search = lax.while_loop(needs_iteration, improve, minimum_search)
         return None, (final_search.value, final_search.length)
 
     includes_start = np.asarray(margins.includes_start)[:, None]
-    end_minima = jnp.minimum(jnp.where(includes_start, start_values, jnp.inf), minima.values)
+    end_minima = jnp.minimum(jnp.where(includes_start, start_values, jnp.inf), minima_state.values)
     margin_indices = jnp.arange(len(includes_start), dtype=jnp.int32)
-    interior_minima, length = lax.scan(
-        refine_margin, None, (margin_indices, minima._replace(start_tangents=None))
+    interior_minima, minimum_length = lax.scan(
+        refine_margin, None, (margin_indices, minima_state._replace(start_tangents=None))
     )[1]
-    return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, length)
+    return MinimaResult(jnp.minimum(interior_minima, end_minima), interior_minima, minimum_length)
 
 
-def minima_jvp(
-    make_margins: Callable[..., tuple[MarginFunctions, AccelerationFn]],
-    step_function: StepFn,
+def compute_minima_jvp(
+    make_margins: Callable[..., tuple[MarginFunctions, EvaluateAcceleration]],
+    step_function: TakeStep,
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    minima: MinimaState,
-    result: MinimaResult,
+    minima_state: MinimaState,
+    minima_result: MinimaResult,
     phase_ends: tuple[StageState, StageState],
     end_tangents: Array,
 ) -> Array:
@@ -262,38 +287,49 @@ def minima_jvp(
     has no first-order effect. `phase_ends` are the start and the end of the phase, and
     `end_tangents` the tangents of the end state.
     """
-    margins, evaluate = make_margins(phase_tangents.constants, phase_tangents.held_constants)
+    margins, evaluate_acceleration = make_margins(
+        phase_tangents.constants, phase_tangents.held_constants
+    )
 
     def evaluate_margins(constants: Any, held_constants: Vector, q: Vector, v: Vector) -> Array:
         margin_functions, acceleration_of = make_margins(constants, held_constants)
         return jnp.stack(margin_functions.evaluate_margins(StageState(q, v, acceleration_of(q, v))))
 
-    tangents_of_margins = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
+    compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
-    def tangent_of_margin(_: None, inputs: tuple) -> tuple[None, Array]:
-        index, margin_state, length = inputs
+    def compute_margin_tangent(_: None, margin_inputs: tuple) -> tuple[None, Array]:
+        margin_index, margin_state, length = margin_inputs
         q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
-        start = StageState(q, v, evaluate(q, v))
-        rk_step = step_function(start, length)
-        tangents = phase_tangents.propagate(
+        minimum_start = StageState(q, v, evaluate_acceleration(q, v))
+        rk_step = step_function(minimum_start, length)
+        state_tangents = phase_tangents.propagate(
             tableau, rk_step.stage_states, margin_state.start_tangents, length
         )
-        is_selected = jnp.arange(len(margins.includes_start)) == index
+        is_selected = jnp.arange(len(margins.includes_start)) == margin_index
         return None, jnp.sum(
-            jnp.where(is_selected[:, None], tangents_of_margins(rk_step.end, tangents), 0.0), 1
+            jnp.where(
+                is_selected[:, None], compute_margin_tangents(rk_step.end, state_tangents), 0.0
+            ),
+            1,
         )
 
-    margin_indices = jnp.arange(len(result.phase_minima), dtype=jnp.int32)
+    margin_indices = jnp.arange(len(minima_result.phase_minima), dtype=jnp.int32)
     interior_tangents = jnp.moveaxis(
-        lax.scan(tangent_of_margin, None, (margin_indices, minima, result.length_to_minimum))[1],
+        lax.scan(
+            compute_margin_tangent,
+            None,
+            (margin_indices, minima_state, minima_result.length_to_minimum),
+        )[1],
         0,
         1,
     )
-    start_tangents = tangents_of_margins(phase_ends[0], phase_tangents.start_tangents)
-    end_margin_tangents = tangents_of_margins(phase_ends[1], end_tangents)
+    start_tangents = compute_margin_tangents(phase_ends[0], phase_tangents.start_tangents)
+    end_margin_tangents = compute_margin_tangents(phase_ends[1], end_tangents)
     end_minima_tangents = jnp.where(
-        minima.values <= result.phase_minima, end_margin_tangents, start_tangents
+        minima_state.values <= minima_result.phase_minima, end_margin_tangents, start_tangents
     )
     return jnp.where(
-        result.interior_minima <= result.phase_minima, interior_tangents, end_minima_tangents
+        minima_result.interior_minima <= minima_result.phase_minima,
+        interior_tangents,
+        end_minima_tangents,
     )

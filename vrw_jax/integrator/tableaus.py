@@ -1,8 +1,9 @@
 """One explicit Runge-Kutta step for a batch, with a separate array for each component.
 
 The equations of motion are of second order, q'' = f(q, q'), so a step stores only the accelerations
-of its stages. Rates follow from them by the tableau's matrix, positions by its square. The method
-is the same with half of the stored derivatives. The tableaus are those of diffrax.
+of its stages. Rates follow from the accelerations by the tableau's matrix, positions by its square.
+The method is the same as for the first-order system, with half of the stored derivatives. The
+tableaus are those of diffrax.
 """
 
 import functools
@@ -25,8 +26,8 @@ from vrw_jax.numerics import Vector, run_if_any
 
 
 class ButcherTableau(NamedTuple):
-    """An explicit Runge-Kutta method whose last stage is the step's end and the first stage of
-    the next step.
+    """Explicit Runge-Kutta method whose last stage is the end of the step and the first stage of
+    the next.
     """
 
     order: int
@@ -55,34 +56,34 @@ class ButcherTableau(NamedTuple):
 
 
 @functools.cache
-def load_explicit_tableau(name: str) -> ButcherTableau | None:
-    """Return diffrax's tableau of that name; None if the method is not an explicit Runge-Kutta
+def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
+    """Return diffrax's tableau of the given name; None if the method is not an explicit Runge-Kutta
     method.
 
     The numbers are stored beside this file, because loading diffrax takes a fifth of a cached
     start.
     """
     tableaus = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
-    if name not in tableaus:
+    if solver_name not in tableaus:
         return None
-    entry = tableaus[name]
-    n, has_step_end_stage = len(entry["b_sol"]), entry["ssal"]
+    tableau_entry = tableaus[solver_name]
+    n, has_step_end_stage = len(tableau_entry["b_sol"]), tableau_entry["ssal"]
     matrix = np.zeros((n + (not has_step_end_stage), n + (not has_step_end_stage)))
-    for i, row in enumerate(entry["a_lower"]):
-        matrix[i + 1, : i + 1] = row
+    for i, matrix_row in enumerate(tableau_entry["a_lower"]):
+        matrix[i + 1, : i + 1] = matrix_row
     b_error = np.zeros(len(matrix))
-    b_error[:n] = entry["b_error"]
+    b_error[:n] = tableau_entry["b_error"]
     if not has_step_end_stage:
-        matrix[n, :n] = entry["b_sol"]
+        matrix[n, :n] = tableau_entry["b_sol"]
     nodes = matrix.sum(axis=1)
     guard_stages = _choose_guard_stages(nodes)
     return ButcherTableau(
-        order=entry["order"],
+        order=tableau_entry["order"],
         nodes=nodes,
         matrix=matrix,
-        matrix_squared=_zero_roundoff(matrix @ matrix),
+        matrix_squared=_set_roundoff_to_zero(matrix @ matrix),
         b_error=b_error,
-        b_error_position=_zero_roundoff(b_error @ matrix),
+        b_error_position=_set_roundoff_to_zero(b_error @ matrix),
         middle_stage=min(guard_stages, key=lambda i: abs(nodes[i] - 0.45), default=0),
         guard_stages=guard_stages,
         bernstein_matrix=_make_bernstein_matrix(np.array([0.0, *nodes[list(guard_stages)], 1.0])),
@@ -100,15 +101,22 @@ or before the end is the hardest to detect.
 def _choose_guard_stages(nodes: np.ndarray) -> tuple[int, ...]:
     """Return the indices of the stages nearest to GUARD_STAGE_NODES.
 
-    Of several stages at one node the last one is returned, because it is the most accurate.
+    Of several stages at one node the last stage is returned, because it is the most accurate.
     """
-    last_stage = {round(float(node), 3): i for i, node in enumerate(nodes) if 0.05 < node < 0.95}
+    last_stage = {
+        round(float(target_stage_node), 3): i
+        for i, target_stage_node in enumerate(nodes)
+        if 0.05 < target_stage_node < 0.95
+    }
     nearest_nodes = {
-        min((abs(node - target_node), node) for node in last_stage)[1]
+        min(
+            (abs(target_stage_node - target_node), target_stage_node)
+            for target_stage_node in last_stage
+        )[1]
         for target_node in GUARD_STAGE_NODES
         if last_stage
     }
-    return tuple(last_stage[node] for node in sorted(nearest_nodes))
+    return tuple(last_stage[target_stage_node] for target_stage_node in sorted(nearest_nodes))
 
 
 def _make_bernstein_matrix(nodes: np.ndarray) -> np.ndarray:
@@ -123,8 +131,7 @@ def _make_bernstein_matrix(nodes: np.ndarray) -> np.ndarray:
 def fit_guard_parabola(
     tableau: ButcherTableau, start_value: Array, middle_value: Array, end_value: Array
 ) -> tuple[Array, Array]:
-    """Return curvature and rate at the start, in step lengths, of the parabola through a guard's
-    values.
+    """Return curvature and start rate of the parabola through a guard's values, in step lengths.
 
     `middle_value` is the guard at the stage `middle_stage`.
     """
@@ -135,76 +142,87 @@ def fit_guard_parabola(
     return curvature, end_value - start_value - curvature
 
 
-def _bernstein_coefficients(tableau: ButcherTableau, values: list[Array]) -> list[Array]:
-    """Return a guard's Bernstein coefficients except the last; the guard is positive if all of them
-    are.
+def _compute_bernstein_coefficients(
+    tableau: ButcherTableau, guard_values: list[Array]
+) -> list[Array]:
+    """Return a guard's Bernstein coefficients except the last one.
 
-    `values` are the guard's values at the start, at the `guard_stages`, and at the end.
+    The guard is positive if all coefficients are positive. `guard_values` are the guard's values at
+    the start, at the `guard_stages`, and at the end.
     """
-    return [values[0], *(_weighted_sum(row, values) for row in tableau.bernstein_matrix)]
+    return [
+        guard_values[0],
+        *(_weighted_sum(matrix_row, guard_values) for matrix_row in tableau.bernstein_matrix),
+    ]
 
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
-def _may_cross_inside(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
+def _may_cross_inside_step(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
     """Return whether a guard may fall below zero inside a step and be positive again at its end."""
-    coefficients = _bernstein_coefficients(tableau, guard_values)
-    return (functools.reduce(jnp.minimum, coefficients) <= 0.0) & (guard_values[-1] > 0.0)
+    bernstein_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
+    return (functools.reduce(jnp.minimum, bernstein_coefficients) <= 0.0) & (guard_values[-1] > 0.0)
 
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
-def find_guard_minimum(tableau: ButcherTableau, values: list[Array]) -> tuple[Array, Array]:
-    """Return whether a guard may have a negative minimum inside a step, and the fraction of the
-    step to that minimum.
+def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
+    """Return whether a guard may have a negative minimum inside a step, and the fraction to the
+    minimum.
 
-    The fraction is the node of the lowest Bernstein coefficient. A guard that only decreases has no
-    minimum. `values` are the guard's values at the start, at the `guard_stages`, and at the end.
+    The fraction of the step is the node of the lowest Bernstein coefficient. A guard that only
+    decreases has no minimum. `guard_values` are the guard's values at the start, at the
+    `guard_stages`, and at the end.
     """
-    min_coefficient, *inner_coefficients = _bernstein_coefficients(tableau, values)
+    min_coefficient, *inner_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
     minimum_fraction = jnp.zeros_like(min_coefficient)
-    for i, coefficient in enumerate(inner_coefficients):
+    for i, inner_coefficient in enumerate(inner_coefficients):
         minimum_fraction = jnp.where(
-            coefficient < min_coefficient, (i + 1) / len(values[1:]), minimum_fraction
+            inner_coefficient < min_coefficient, (i + 1) / len(guard_values[1:]), minimum_fraction
         )
-        min_coefficient = jnp.minimum(coefficient, min_coefficient)
-    is_rising = inner_coefficients[-1] < values[-1]
-    for preceding_coefficient, following_coefficient in itertools.pairwise(values):
+        min_coefficient = jnp.minimum(inner_coefficient, min_coefficient)
+    is_rising = inner_coefficients[-1] < guard_values[-1]
+    for preceding_coefficient, following_coefficient in itertools.pairwise(guard_values):
         is_rising = is_rising | (preceding_coefficient < following_coefficient)
     has_guard_minimum = (
-        (min_coefficient <= 0.0) & (minimum_fraction > 0.0) & is_rising & (values[-1] > 0.0)
+        (min_coefficient <= 0.0) & (minimum_fraction > 0.0) & is_rising & (guard_values[-1] > 0.0)
     )
     return has_guard_minimum, minimum_fraction
 
 
-def earliest_guard_minimum_fraction(tableau: ButcherTableau, guard_values: list[Vector]) -> Array:
-    """Return the fraction of the step to the earliest minimum at which some guard may be negative;
-    1 if there is none.
+def find_earliest_guard_minimum_fraction(
+    tableau: ButcherTableau, guard_values: list[Vector]
+) -> Array:
+    """Return the fraction of the step to the earliest minimum at which some guard may be negative.
 
-    `guard_values` are the guards at the start, at the `guard_stages` and at the end. The minimum is
-    located only if some batch element of the group may have one.
+    The result is 1 if there is no such minimum. `guard_values` are the guards at the start, at the
+    `guard_stages` and at the end. The minimum is located only if some batch element of the group
+    may have one.
     """
-    values_by_guard = [list(values) for values in zip(*guard_values, strict=True)]
+    values_by_guard = [list(guard_values) for guard_values in zip(*guard_values, strict=True)]
     may_cross_inside = functools.reduce(
-        operator.or_, (_may_cross_inside(tableau, values) for values in values_by_guard)
+        operator.or_,
+        (_may_cross_inside_step(tableau, guard_values) for guard_values in values_by_guard),
     )
 
-    def find_first_minimum(fraction: Array) -> Array:
-        for values in values_by_guard:
-            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, values)
-            fraction = jnp.where(
-                has_guard_minimum, jnp.minimum(fraction, minimum_fraction), fraction
+    def find_first_minimum(earliest_fraction: Array) -> Array:
+        for guard_values in values_by_guard:
+            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, guard_values)
+            earliest_fraction = jnp.where(
+                has_guard_minimum,
+                jnp.minimum(earliest_fraction, minimum_fraction),
+                earliest_fraction,
             )
-        return fraction
+        return earliest_fraction
 
-    whole_step = jnp.ones_like(guard_values[0][0])
-    return run_if_any(jnp.any(may_cross_inside), find_first_minimum, whole_step)
+    whole_step_fraction = jnp.ones_like(guard_values[0][0])
+    return run_if_any(jnp.any(may_cross_inside), find_first_minimum, whole_step_fraction)
 
 
 @dataclass(frozen=True)
 class StepSizeController:
     """Parameters of the step-size controller.
 
-    They are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner, Solving
-    Ordinary Differential Equations I, Section II.4).
+    The values are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner,
+    Solving Ordinary Differential Equations I, Section II.4).
     """
 
     safety_factor: float = 0.9
@@ -218,28 +236,28 @@ class StepSizeController:
 STEP_SIZE_CONTROLLER = StepSizeController()
 
 
-def step_size_factor(
+def compute_step_size_factor(
     tableau: ButcherTableau,
     squared_error: Array,
-    dtype: Any,
-    controller: StepSizeController = STEP_SIZE_CONTROLLER,
+    float_dtype: Any,
+    step_size_controller: StepSizeController = STEP_SIZE_CONTROLLER,
 ) -> Array:
-    """Return the ratio of the next step's length to this one's.
+    """Return the ratio of the next step's length to the present length.
 
     `squared_error` is the mean square of the step's error over its tolerance.
     """
     error_power = jnp.exp(
         jnp.log(jnp.clip(squared_error, 1e-20, 1e20)) * (-0.5 / tableau.order)
-    ).astype(dtype)
+    ).astype(float_dtype)
     return jnp.clip(
-        controller.safety_factor * error_power,
-        controller.min_factor,
-        jnp.where(squared_error <= 1.0, controller.max_factor, 1.0),
+        step_size_controller.safety_factor * error_power,
+        step_size_controller.min_factor,
+        jnp.where(squared_error <= 1.0, step_size_controller.max_factor, 1.0),
     )
 
 
-def _zero_roundoff(x: np.ndarray) -> np.ndarray:
-    """Return the matrix with entries that are only round-off set to zero."""
+def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
+    """Return the matrix with zeros in place of numbers that are only round-off."""
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
@@ -251,16 +269,24 @@ class StageAcceleration(NamedTuple):
     acceleration: Vector  # accelerations of all three coordinates, those of the phase first
 
 
-def real_stability_limit(tableau: ButcherTableau) -> float:
+def compute_real_stability_limit(tableau: ButcherTableau) -> float:
     """Return the largest z with |R(-z)| <= 1, where R is the method's stability function.
 
     A mode that decays at the rate r allows steps up to z / r.
     """
-    z, stages, amplification = np.linspace(0.01, 20.0, 2000), np.ones(len(tableau.nodes)), 1.0
-    for matrix_power in range(1, len(stages) + 1):  # R is the polynomial 1 - z w (1 - z A + ...).
-        amplification = amplification + (-z) ** matrix_power * (tableau.matrix[-1] @ stages)
-        stages = tableau.matrix @ stages
-    return float(z[np.argmax(np.abs(amplification) > 1.0 + 1e-12)])
+    z, stage_values, stability_polynomial = (
+        np.linspace(0.01, 20.0, 2000),
+        np.ones(len(tableau.nodes)),
+        1.0,
+    )
+    for matrix_power in range(
+        1, len(stage_values) + 1
+    ):  # R is the polynomial 1 - z w (1 - z A + ...).
+        stability_polynomial = stability_polynomial + (-z) ** matrix_power * (
+            tableau.matrix[-1] @ stage_values
+        )
+        stage_values = tableau.matrix @ stage_values
+    return float(z[np.argmax(np.abs(stability_polynomial) > 1.0 + 1e-12)])
 
 
 class StageState(NamedTuple):
@@ -272,36 +298,36 @@ class StageState(NamedTuple):
 
 
 class RKStep(NamedTuple):
-    """A Runge-Kutta step: its end, the error estimate, and its stages."""
+    """Runge-Kutta step: its end, the error estimate, and its stages."""
 
     end: StageState
     error: Vector  # error estimates of the positions, then of the rates
     stage_states: list[StageState]  # the start first, the end last
 
 
-AccelerationFn = Callable[[Vector, Vector], StageAcceleration]
-StepFn = Callable[[StageState, Array], RKStep]
+EvaluateAcceleration = Callable[[Vector, Vector], StageAcceleration]
+TakeStep = Callable[[StageState, Array], RKStep]
 
 
 def rk_step(
     tableau: ButcherTableau,
-    evaluate: AccelerationFn,
-    start: StageState,
+    evaluate_acceleration: EvaluateAcceleration,
+    start_state: StageState,
     h: Array,
     with_error: bool = True,
 ) -> RKStep:
-    """Take one Runge-Kutta step of length `h`, s, from `start`, and return its end, error and
-    stages.
+    """Return end, error estimate and stages of one Runge-Kutta step of length `h`, s, from a
+    state.
     """
-    n = len(start.q)
-    stage_states, stage_accelerations = [start], [start.acceleration.acceleration[:n]]
+    n = len(start_state.q)
+    stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
     for i in range(1, len(tableau.nodes)):
-        q, v = evaluate_stage(tableau, i, start.q, start.v, stage_accelerations, h)
-        stage_acceleration = evaluate(q, v)
+        q, v = evaluate_stage(tableau, i, start_state.q, start_state.v, stage_accelerations, h)
+        stage_acceleration = evaluate_acceleration(q, v)
         stage_states.append(StageState(q, v, stage_acceleration))
         stage_accelerations.append(stage_acceleration.acceleration[:n])
 
-    error: Vector = ()
+    error_estimate: Vector = ()
     if with_error:
         accelerations_by_coordinate = [
             [stage_acceleration[coordinate] for stage_acceleration in stage_accelerations]
@@ -315,8 +341,8 @@ def rk_step(
             h * _weighted_sum(tableau.b_error, accelerations)
             for accelerations in accelerations_by_coordinate
         ]
-        error = (*position_errors, *rate_errors)
-    return RKStep(stage_states[-1], error, stage_states)
+        error_estimate = (*position_errors, *rate_errors)
+    return RKStep(stage_states[-1], error_estimate, stage_states)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))  # The function is traced once for all steps.
@@ -328,10 +354,10 @@ def evaluate_stage(
     stage_accelerations: list[Vector],
     h: Array,
 ) -> tuple[Vector, Vector]:
-    """Return positions and rates of the stage `stage_index` from the accelerations of the
-    earlier stages.
+    """Return positions and rates of the stage `stage_index` from the accelerations of the earlier
+    stages.
     """
-    position, rate = [], []
+    stage_positions, stage_rates = [], []
     for coordinate in range(len(q0)):
         coordinate_accelerations = [
             stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
@@ -339,7 +365,7 @@ def evaluate_stage(
         double_sum = _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations)
         single_sum = _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations)
         displacement_at_constant_rate = float(tableau.nodes[stage_index]) * v0[coordinate]
-        position.append(
+        stage_positions.append(
             q0[coordinate]
             + h
             * (
@@ -348,16 +374,16 @@ def evaluate_stage(
                 else displacement_at_constant_rate + h * double_sum
             )
         )
-        rate.append(v0[coordinate] + h * single_sum)
-    return tuple(position), tuple(rate)
+        stage_rates.append(v0[coordinate] + h * single_sum)
+    return tuple(stage_positions), tuple(stage_rates)
 
 
-def _weighted_sum(weights: np.ndarray, terms: list[Array]) -> Any:
-    """Return the sum of `weights` times `terms`; None if all weights vanish.
+def _weighted_sum(weights: np.ndarray, summands: list[Array]) -> Any:
+    """Return the sum of `weights` times `summands`; None if all weights vanish.
 
-    The sum is formed by functions of `lax`, which are traced in a third of the time of Python's
+    Functions of `lax` form the sum, because they are traced in a third of the time of Python's
     operators. Half of a step's operations are such sums.
     """
-    pairs = zip(weights, terms, strict=False)
-    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in pairs if w != 0.0]
+    weights_and_terms = zip(weights, summands, strict=False)
+    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -1,5 +1,4 @@
-"""Tangents of a phase's end with respect to its start and the constants of its equations, for each
-batch element.
+"""Tangents of a phase's end by its start and the constants of its equations, for a batch.
 
 Each Runge-Kutta step is repeated for the linearized equations, for all requested directions. The
 Jacobians at the stages are the same for all directions and computed once; each direction then costs
@@ -7,8 +6,8 @@ some hundred products. Step sizes and the iterations of an event search are not 
 derivative is that of the discrete flow with the step lengths that were taken, and of the time at
 which the guard vanishes.
 
-`jax.vmap` around a derivative supplies its directions. Here they become the first axis of arrays,
-so that loops are traced once, not again for the vmap.
+`jax.vmap` around a derivative supplies its directions. This module makes them the first axis of
+arrays, so that loops are traced once, not again for the vmap.
 """
 
 import functools
@@ -35,12 +34,11 @@ from vrw_jax.runtime import with_default_settings
 
 
 class ImplicitDynamics(NamedTuple):
-    """The equations of motion near a state whose accelerations are known."""
+    """Equations of motion near a state whose accelerations are known."""
 
     residual: Callable[[StageState], Vector]
-    """Function that returns the left side of the equations at the state's accelerations minus
-    their right side.
-    """
+    """Function that returns the left side minus the right side of the equations at the state's
+    accelerations."""
     solve: Callable[[StageState, Vector], Vector]
     """Function that returns the accelerations for which the left side equals the given values."""
 
@@ -53,54 +51,58 @@ as the start of a phase.
 """
 
 
-def batched_jvp_rule(
-    function: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
+def apply_batched_jvp_rule(
+    evaluate_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
 ) -> tuple[Any, Any]:
-    """Return (values, tangents) of a JVP rule from a `function` that takes all directions together.
+    """Return (values, tangents) of a JVP rule from a function that takes all directions together.
 
-    `primals` and `tangents` are the arguments of the rule. `function` takes tangents with the axis
-    of directions first; its length is 1 if all directions agree. It returns the values, and
-    tangents in the same form.
+    `primals` and `tangents` are the arguments of the rule. `evaluate_rule` takes tangents with the
+    axis of directions first. The length of the axis is 1 if all directions agree. `evaluate_rule`
+    returns the values, and tangents in the same form.
     """
-    leaves, structure = jax.tree.flatten((primals, tangents))
+    leaves, tree_structure = jax.tree.flatten((primals, tangents))
     n_primal_leaves, n_directions = (
         len(jax.tree.leaves(primals)),
         len(_count_vmapped_directions(tangents)),
     )
     if n_directions == 0:
-        values, output_tangents = function(primals, jax.tree.map(lambda x: x[None], tangents))
-        return values, jax.tree.map(lambda x: x[0], output_tangents)
+        rule_values, output_tangents = evaluate_rule(
+            primals, jax.tree.map(lambda x: x[None], tangents)
+        )
+        return rule_values, jax.tree.map(lambda x: x[0], output_tangents)
     output_structure: Any = None
 
     def evaluate_batched(leaves: Any, axes: Any) -> tuple[list, list]:
         nonlocal output_structure
-        if any(axis is not None for axis in axes[:n_primal_leaves]):
+        if any(leaf_axis is not None for leaf_axis in axes[:n_primal_leaves]):
             raise NotImplementedError(
                 "jax.vmap around a derivative of lanes maps its directions only: put batches of "
                 "values on the lanes' axis, the last one."
             )
         leaves_and_axes = zip(leaves[n_primal_leaves:], axes[n_primal_leaves:], strict=True)
         direction_leaves = [
-            x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in leaves_and_axes
+            x[None] if leaf_axis is None else jnp.moveaxis(x, leaf_axis, 0)
+            for x, leaf_axis in leaves_and_axes
         ]
-        values, output_tangents = function(
-            *jax.tree.unflatten(structure, [*leaves[:n_primal_leaves], *direction_leaves])
+        rule_values, output_tangents = evaluate_rule(
+            *jax.tree.unflatten(tree_structure, [*leaves[:n_primal_leaves], *direction_leaves])
         )
         output_tangents = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
         )
-        results, output_structure = jax.tree.flatten((values, output_tangents))
-        n_values = len(jax.tree.leaves(values))
-        return results, [None] * n_values + [0] * (len(results) - n_values)
+        flat_results, output_structure = jax.tree.flatten((rule_values, output_tangents))
+        n_values = len(jax.tree.leaves(rule_values))
+        return flat_results, [None] * n_values + [0] * (len(flat_results) - n_values)
 
-    results = _HOIST_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
-    return jax.tree.unflatten(output_structure, results)
+    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(*leaves, mapped=evaluate_batched)
+    return jax.tree.unflatten(output_structure, flat_results)
 
 
 @custom_vmap
 def _count_vmapped_directions(_: Any) -> Array:
-    """Return an array of zeros whose length is the number of directions of an enclosing
-    `jax.vmap`; without one it is 0.
+    """Return zeros whose length is the number of directions of an enclosing `jax.vmap`.
+
+    Without such a vmap, the array is empty.
     """
     return jnp.zeros(0)
 
@@ -111,27 +113,29 @@ def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) ->
     return jnp.zeros(n_directions), False
 
 
-_HOIST_PRIMITIVE = Primitive("beyond")
-_HOIST_PRIMITIVE.multiple_results = True
-batching.primitive_batchers[_HOIST_PRIMITIVE] = lambda values, axes, mapped: mapped(values, axes)
+_HOIST_OUT_OF_VMAP_PRIMITIVE = Primitive("beyond")
+_HOIST_OUT_OF_VMAP_PRIMITIVE.multiple_results = True
+batching.primitive_batchers[_HOIST_OUT_OF_VMAP_PRIMITIVE] = lambda values, axes, mapped: mapped(
+    values, axes
+)
 """Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
 loops again.
 """
 
 
-def _map_sequentially(function: Callable[[Any], Any], directions: Any) -> Any:
-    """Return `function` of each direction, computed in a loop so that each direction stays in
+def _map_sequentially(evaluate_direction: Callable[[Any], Any], directions: Any) -> Any:
+    """Return the function of each direction, computed in a loop so that a direction stays in
     registers.
     """
-    leaves, structure = jax.tree.flatten(directions)
+    leaves, tree_structure = jax.tree.flatten(directions)
     has_several_directions = [len(x) > 1 for x in leaves]
 
     def evaluate_one(varying_leaves: list[Array]) -> Any:
         remaining_leaves = iter(varying_leaves)
         leaves_and_flags = zip(leaves, has_several_directions, strict=True)
-        return function(
+        return evaluate_direction(
             jax.tree.unflatten(
-                structure,
+                tree_structure,
                 [
                     next(remaining_leaves) if has_several else x[0]
                     for x, has_several in leaves_and_flags
@@ -162,7 +166,7 @@ class StageJacobians(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _stage_jacobians(
+def _compute_stage_jacobians(
     make_dynamics: ImplicitDynamicsFn,
     constants: Any,
     constants_directions: Any,
@@ -172,26 +176,35 @@ def _stage_jacobians(
     """Return the Jacobians of the accelerations at all stages of a step except the last."""
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
-        state, dynamics = _unpack_state(packed_state), make_dynamics(constants, held_constants)
-        dynamics = ImplicitDynamics(jax.jit(dynamics.residual), jax.jit(dynamics.solve))
-        n = len(state.q)
-        residual = lambda constants, held_constants: make_dynamics(
+        stage_state, implicit_dynamics = (
+            _unpack_state(packed_state),
+            make_dynamics(constants, held_constants),
+        )
+        implicit_dynamics = ImplicitDynamics(
+            jax.jit(implicit_dynamics.residual), jax.jit(implicit_dynamics.solve)
+        )
+        n = len(stage_state.q)
+        evaluate_residual = lambda constants, held_constants: make_dynamics(
             constants, held_constants
-        ).residual(state)
-        acceleration_along = lambda *tangent: _solve_acceleration(
-            dynamics, state, jax.jvp(residual, *tangent)[1]
+        ).residual(stage_state)
+        compute_acceleration_along = lambda *tangent: _solve_acceleration(
+            implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
         zero_constants = jax.tree.map(jnp.zeros_like, constants)
         jacobian_columns = [
-            jnp.stack(_acceleration_tangent(dynamics, state, unit_vector[:n], unit_vector[n:]))
-            for unit_vector in _unit_vectors((*state.q, *state.v))
+            jnp.stack(
+                _compute_acceleration_tangent(
+                    implicit_dynamics, stage_state, unit_vector[:n], unit_vector[n:]
+                )
+            )
+            for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v))
         ]
         jacobian_columns += [
-            acceleration_along((constants, held_constants), (zero_constants, unit_vector))
-            for unit_vector in _unit_vectors(held_constants)
+            compute_acceleration_along((constants, held_constants), (zero_constants, unit_vector))
+            for unit_vector in _make_unit_vectors(held_constants)
         ]
         zero_held = tuple(jnp.zeros_like(x) for x in held_constants)
-        acceleration_by_constants = lambda constants_direction: acceleration_along(
+        acceleration_by_constants = lambda constants_direction: compute_acceleration_along(
             (constants, held_constants), (constants_direction, zero_held)
         )
         return jnp.stack(jacobian_columns, 1), _map_unrolled(
@@ -203,16 +216,18 @@ def _stage_jacobians(
     )
 
 
-def _map_unrolled(function: Callable[[Any], Array], directions: Any) -> Array:
-    """Return `function` of each direction without a loop, so that the compiler removes known
+def _map_unrolled(evaluate_direction: Callable[[Any], Array], directions: Any) -> Array:
+    """Return the function of each direction without a loop, so that the compiler removes known
     zeros.
     """
-    leaves, structure = jax.tree.flatten(directions)
+    leaves, tree_structure = jax.tree.flatten(directions)
     if all(len(x) == 1 for x in leaves):
-        return function(jax.tree.unflatten(structure, [x[0] for x in leaves]))[None]
-    axes = [0 if len(x) > 1 else None for x in leaves]
-    inputs = [x if len(x) > 1 else x[0] for x in leaves]
-    return jax.vmap(lambda *x: function(jax.tree.unflatten(structure, x)), axes)(*inputs)
+        return evaluate_direction(jax.tree.unflatten(tree_structure, [x[0] for x in leaves]))[None]
+    leaf_axes = [0 if len(x) > 1 else None for x in leaves]
+    direction_leaves = [x if len(x) > 1 else x[0] for x in leaves]
+    return jax.vmap(
+        lambda *x: evaluate_direction(jax.tree.unflatten(tree_structure, x)), leaf_axes
+    )(*direction_leaves)
 
 
 def _pack_state(state: StageState) -> Array:
@@ -232,13 +247,13 @@ def _unpack_state(packed_state: Array) -> StageState:
     return StageState(components[:n], components[n : 2 * n], acceleration)
 
 
-def _unit_vectors(template: Vector) -> list[Vector]:
+def _make_unit_vectors(template: Vector) -> list[Vector]:
     """Return the unit vectors of the space of `template`, each with the same component arrays."""
     n = len(template)
     return [tuple(jnp.full_like(template[j], float(i == j)) for j in range(n)) for i in range(n)]
 
 
-def _acceleration_tangent(
+def _compute_acceleration_tangent(
     dynamics: ImplicitDynamics, state: StageState, dq: Vector, dv: Vector
 ) -> Vector:
     """Return the tangent of the accelerations along a direction (dq, dv) of positions and rates."""
@@ -269,8 +284,8 @@ def _propagate_tangents(
     """
     state_jacobian, n = stage_jacobians.state_jacobian, stage_jacobians.state_jacobian.shape[1]
 
-    def propagate_one(direction: tuple[Array, Array]) -> Array:
-        constants_tangent, start = direction
+    def propagate_direction(tangent_direction: tuple[Array, Array]) -> Array:
+        constants_tangent, start = tangent_direction
         q0, v0, held_tangents = tuple(start[:n]), tuple(start[n : 2 * n]), tuple(start[2 * n :])
         stage_tangents: list[Vector] = []
         for i in range(len(tableau.nodes) - 1):
@@ -284,17 +299,21 @@ def _propagate_tangents(
                 for coordinate in range(n)
             ]
             stage_tangents.append(
-                tuple(functools.reduce(lax.add, terms) for terms in acceleration_terms)
+                tuple(
+                    functools.reduce(lax.add, weighted_terms)
+                    for weighted_terms in acceleration_terms
+                )
             )
         q, v = evaluate_stage(tableau, len(tableau.nodes) - 1, q0, v0, stage_tangents, h)
         return jnp.stack([*q, *v, *held_tangents])
 
     return _map_sequentially(
-        propagate_one, (jnp.moveaxis(stage_jacobians.constants_tangents, 1, 0), start_tangents)
+        propagate_direction,
+        (jnp.moveaxis(stage_jacobians.constants_tangents, 1, 0), start_tangents),
     )
 
 
-def jvp_each(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
+def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
     """Return `jax.jvp` along each of the directions, without the value.
 
     The program is as short as for one direction.
@@ -303,15 +322,15 @@ def jvp_each(function: Callable[..., Any], primals: tuple, directions: tuple) ->
 
 
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` of trees, whose derivatives with respect to their floats are computed by
-    `jvp_each`.
-    """
+    """Return `function` of trees, with derivatives by its floats from `compute_each_jvp`."""
 
     def call_with_batched_jvp(*arguments: Any) -> Any:
-        floats, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
-        evaluate_combined = lambda *floats: function(*eqx.combine(floats, other_arguments))
-        evaluate_floats = lambda *floats: eqx.filter(
-            evaluate_combined(*floats), eqx.is_inexact_array
+        float_arguments, other_arguments = eqx.partition(arguments, eqx.is_inexact_array)
+        evaluate_combined = lambda *float_arguments: function(
+            *eqx.combine(float_arguments, other_arguments)
+        )
+        evaluate_floats = lambda *float_arguments: eqx.filter(
+            evaluate_combined(*float_arguments), eqx.is_inexact_array
         )
         differentiable_function = jax.custom_jvp(evaluate_combined)
 
@@ -320,19 +339,21 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
         def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_combined(*primals),
-                jvp_each(evaluate_floats, primals, directions),
+                compute_each_jvp(evaluate_floats, primals, directions),
             )
-            outputs, float_tangents = batched_jvp_rule(evaluate_with_tangents, primals, tangent)
+            outputs, float_tangents = apply_batched_jvp_rule(
+                evaluate_with_tangents, primals, tangent
+            )
             return outputs, eqx.combine(float_tangents, zero_tangent(outputs))
 
-        return differentiable_function(*floats)
+        return differentiable_function(*float_arguments)
 
     return call_with_batched_jvp
 
 
 class PhaseTangents(NamedTuple):
-    """Tangent directions of a phase: those of its constants, of its start and of the constants
-    held since then.
+    """Tangent directions of a phase: of its constants, of its start and of the constants held since
+    then.
     """
 
     make_dynamics: ImplicitDynamicsFn
@@ -346,7 +367,7 @@ class PhaseTangents(NamedTuple):
         self, tableau: ButcherTableau, stages: list[StageState], start_tangents: Array, h: Array
     ) -> Array:
         """Return the tangents at a step's start, propagated to its end."""
-        stage_jacobians = _stage_jacobians(
+        stage_jacobians = _compute_stage_jacobians(
             self.make_dynamics, self.constants, self.constants_tangents, self.held_constants, stages
         )
         return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
@@ -359,8 +380,8 @@ class PhaseTangents(NamedTuple):
         h: Array,
         is_accepted: Array,
     ) -> Array:
-        """Return the tangents, propagated over the step in batch elements that accepted it and
-        unchanged in others.
+        """Return the tangents after a step in batch elements that accepted it, and unchanged in
+        others.
 
         A group without accepted steps skips the computation.
         """
@@ -380,7 +401,7 @@ class PhaseTangents(NamedTuple):
         """
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
         primals = self.constants, self.held_constants, state.q, state.v
-        return jvp_each(
+        return compute_each_jvp(
             evaluate,
             primals,
             (

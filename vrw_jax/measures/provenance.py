@@ -1,4 +1,4 @@
-"""Provenance of results: versions, device, number format, tolerances, parameters."""
+"""Provenance of results: versions, device, number format, tolerances and parameters."""
 
 import functools
 import importlib.metadata
@@ -27,7 +27,8 @@ def provenance(
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
         "versions": ", ".join(
-            f"{library_name} {_installed_version(library_name)}" for library_name in library_names
+            f"{library_name} {_find_installed_version(library_name)}"
+            for library_name in library_names
         )
         + f", python {platform.python_version()}",
         "device": jax.devices()[0].device_kind,
@@ -39,7 +40,7 @@ def provenance(
 
 
 @functools.cache  # Reading the metadata takes longer than the steps of a walk.
-def _installed_version(library_name: str) -> str:
+def _find_installed_version(library_name: str) -> str:
     """Return the version of an installed library, or "not installed"."""
     try:
         return importlib.metadata.version(library_name)

@@ -1,6 +1,6 @@
 """Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
 
-Every labeled result takes its units and long names from here, so that scans, trajectories and
+Every labeled result takes its units and long names from this table, so that scans, trajectories and
 figures use the same names. In the frame, x points downhill along the slope and z is normal to the
 slope.
 """
@@ -75,19 +75,19 @@ class Measure:
         return f"{float(np.asarray(value)):.6g} {self.display_unit}".strip()
 
 
-def _make_table(*measures: Measure) -> dict[str, Measure]:
+def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
     """Return the measures by name.
 
-    Raises `ValueError` if two measures have the same name.
+    Raise `ValueError` if two measures have the same name.
     """
-    table = {measure.name: measure for measure in measures}
-    if len(table) != len(measures):
+    measure_by_name = {measure.name: measure for measure in measures}
+    if len(measure_by_name) != len(measures):
         raise ValueError("Two measures share one name: give each its own.")
-    return table
+    return measure_by_name
 
 
 # fmt: off
-STEP_MEASURES = _make_table(
+STEP_MEASURES = _index_measures_by_name(
     Measure("dls_fraction", "1", "T_DLS/T", "DLS fraction",
             "Share of the step spent in double-limb support.", is_shared=True, is_ratio=True),
     Measure("period", "s", "T", "step period", "Duration of the step from touchdown to touchdown.",
@@ -139,7 +139,7 @@ STEP_MEASURES = _make_table(
 )
 """Measures of one step."""
 
-MARGIN_MEASURES = _make_table(
+MARGIN_MEASURES = _index_measures_by_name(
     Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
             "Negative if the ground would have to pull on Leg 1.",
             violation="fore foot pulls"),
@@ -187,7 +187,7 @@ MARGIN_MEASURES = _make_table(
 )
 """Margins of the model over one step, signed, negative where violated: `Margins`."""
 
-UNILATERAL_STEP_MEASURES = _make_table(
+UNILATERAL_STEP_MEASURES = _index_measures_by_name(
     Measure("duration_single", "s", "t₁", "time on one foot", "Time with one loaded foot."),
     Measure("duration_flight", "s", "t₀", "time of flight", "Time with no loaded foot."),
     Measure("slip", "m", "s", "slip per step", "Sum of the sliding distances of all feet."),
@@ -200,7 +200,7 @@ UNILATERAL_STEP_MEASURES = _make_table(
 )
 """Measures of a step with unilateral contact, beside those of `STEP_MEASURES` that it shares."""
 
-STOPPER_MARGIN_MEASURES = _make_table(
+STOPPER_MARGIN_MEASURES = _index_measures_by_name(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
             "Negative if a stopper has to pull on a leg.",
             violation="a leg in the air leaves its stopper"),
@@ -229,7 +229,7 @@ UNILATERAL_DIFFERENTIABLE_NAMES = tuple(
 )
 """Names of the measures of a step with unilateral contact that have derivatives."""
 
-LIMIT_CYCLE_MEASURES = _make_table(
+LIMIT_CYCLE_MEASURES = _index_measures_by_name(
     Measure("spectral_radius", "1", "ρ", "spectral radius",
             "Largest magnitude of a multiplier of the limit cycle; the gait is stable below 1."),
     Measure("spectral_margin", "1", "1 - ρ", "spectral margin",
@@ -240,7 +240,7 @@ LIMIT_CYCLE_MEASURES = _make_table(
 )
 """Measures of a limit cycle."""
 
-GAIT_SENSITIVITY_MEASURES = _make_table(
+GAIT_SENSITIVITY_MEASURES = _index_measures_by_name(
     Measure("gait_sensitivity_dls_fraction", "1/rad", "G_DLS", "gait sensitivity of DLS fraction",
             "Standard deviation of the DLS fraction on uneven ground divided by that of the "
             "slopes."),
@@ -251,7 +251,7 @@ GAIT_SENSITIVITY_MEASURES = _make_table(
 )
 """Gait sensitivity norms of a limit cycle, for independent slopes of small standard deviation."""
 
-FORCE_PEAK_MEASURES = _make_table(
+FORCE_PEAK_MEASURES = _index_measures_by_name(
     Measure("n_force_peaks", "1", "n_F", "number of force peaks",
             "Smooth maxima of the fore foot's normal force inside the phases of a step."),
     Measure("peak_force", "N", "F_max", "peak force",
@@ -269,10 +269,11 @@ FORCE_PEAK_MEASURES = _make_table(
     Measure("landing_impulse", "N s", "λ_I2", "impulse of the landing",
             "Normal impulse of the ground on the fore foot in the landing.", "(18)"),
 )
-"""Peaks of the ground's normal force in a step of a gait: inside the phases, without impacts and
-changes of phase. For gaits of several steps, the largest over the steps."""
+"""Measures of the peaks of the ground's normal force in a step of a gait. Peaks lie inside the
+phases; impacts and changes of phase are no peaks. For gaits of several steps, the measures are the
+largest over the steps."""
 
-PASSAGE_MEASURES = _make_table(
+PASSAGE_MEASURES = _index_measures_by_name(
     Measure("mean_steps", "1", "M", "mean number of steps until failure",
             "On random slopes, from their quasi-stationary distribution; infinite if no failure "
             "was found."),
@@ -283,7 +284,7 @@ PASSAGE_MEASURES = _make_table(
 )
 """Measures of walks over random slopes of a given standard deviation."""
 
-TRAJECTORY_MEASURES = _make_table(
+TRAJECTORY_MEASURES = _index_measures_by_name(
     Measure("time", "s", "t", "time", "Time since the landing at the start of the first step."),
     Measure("step", "1", "step", "step", "Number of the step, starting from 0."),
     Measure("phase", "1", "phase", "phase", "Phase of the step."),
@@ -326,7 +327,7 @@ TRAJECTORY_MEASURES = _make_table(
 )
 """Coordinates and variables of a trajectory."""
 
-CONTACT_MEASURES = _make_table(
+CONTACT_MEASURES = _index_measures_by_name(
     Measure("length", "m", "L", "length of the leg", "Distance from the hub to the foot.",
             dimension="leg"),
     Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Rate of the distance.",
@@ -345,7 +346,7 @@ CONTACT_MEASURES = _make_table(
 """Variables of a trajectory with unilateral contact, of each leg 1..n."""
 
 # fmt: on
-PARAMETER_MEASURES = _make_table(
+PARAMETER_MEASURES = _index_measures_by_name(
     *(
         Measure(name, domain.unit or "1", domain.symbol, name.replace("_", " "), domain.description)
         for name, domain in PARAMETER_DOMAINS.items()
@@ -389,7 +390,9 @@ def get_measure(name: str) -> Measure:
     return MEASURES[name.removeprefix("-").partition("[")[0]]
 
 
-def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[str, xr.Variable]:
+def make_variables(
+    columns_by_name: Mapping[str, np.ndarray], dimension: str
+) -> dict[str, xr.Variable]:
     """Return the labeled variables of columns over one dimension, and over `leg` for measures per
     leg.
     """
@@ -398,7 +401,7 @@ def make_variables(columns: Mapping[str, np.ndarray], dimension: str) -> dict[st
     )
     return {
         name: xr.Variable(select_dimensions(name), x, measure_attrs(name))
-        for name, x in columns.items()
+        for name, x in columns_by_name.items()
     }
 
 

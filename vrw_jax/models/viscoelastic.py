@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.hybrid import (
     MonitoredFunctions,
-    StateVector,
+    StateArray,
     VectorField,
     integrate_in_units,
     sample_in_units,
@@ -55,7 +55,7 @@ from vrw_jax.wheel import (
 class DiffraxPhase(NamedTuple):
     """Functions of a phase for the diffrax integrator, of the state y = (q, v) as one vector."""
 
-    unpack_motion: Callable[[StateVector], Motion]
+    unpack_motion: Callable[[StateArray], Motion]
     vector_field: VectorField
     guards: MonitoredFunctions
 
@@ -66,14 +66,14 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     - `records_margins`: whether margins are evaluated in addition to guards.
     """
 
-    def unpack_motion(y: StateVector) -> Motion:
+    def unpack_motion(y: StateArray) -> Motion:
         coordinates = tuple(y)
         return phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
 
-    def vector_field(y: StateVector) -> StateVector:
+    def vector_field(y: StateArray) -> StateArray:
         return jnp.stack([*y[phase.n_dof :], *phase.acceleration(unpack_motion(y))[: phase.n_dof]])
 
-    def monitored_values(y: StateVector) -> Array:
+    def monitored_values(y: StateArray) -> Array:
         phase_instant = PhaseInstant(phase, unpack_motion(y), None)
         return jnp.stack(
             [

@@ -1,9 +1,9 @@
 """Derivatives of any order and mode of a function that supports only forward-mode AD.
 
-Loops of unknown length, such as adaptive steps until an event, have no reverse mode. The rule here
-computes the Jacobian in forward mode, with respect to the inputs that are perturbed, and returns
-Jacobian times tangent. The product is linear in the tangent, so `jax.grad` transposes a small
-matrix instead of a loop. The Jacobian itself has the same rule, so Hessians work in every
+Loops of unknown length, such as adaptive steps until an event, have no reverse mode. The rule of
+this module computes the Jacobian in forward mode, with respect to the inputs that are perturbed,
+and returns Jacobian times tangent. The product is linear in the tangent, so `jax.grad` transposes a
+small matrix instead of a loop. The Jacobian itself has the same rule, so Hessians work in every
 combination of modes.
 """
 
@@ -23,7 +23,7 @@ from vrw_jax.numerics.batching import BatchFunction, unbatch
 from vrw_jax.runtime import with_default_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
-"""A function of float arrays that returns (float outputs, other outputs without derivatives)."""
+"""Function of float arrays that returns (float outputs, other outputs without derivatives)."""
 
 
 def enable_all_ad_modes(
@@ -47,8 +47,8 @@ def enable_all_ad_modes(
     wrapped_function = jax.custom_jvp(compiled_function)
 
     @functools.cache
-    def get_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        forward_jacobian = _jacobian_function(differentiable_function, argnums)
+    def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
+        forward_jacobian = _make_forward_jacobian(differentiable_function, argnums)
         return (
             enable_all_ad_modes(forward_jacobian)
             if make_jacobian is None
@@ -58,16 +58,20 @@ def enable_all_ad_modes(
     @with_default_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
         argnums = tuple(
-            i for i, entry in enumerate(tangents) if not isinstance(entry, SymbolicZero)
+            i
+            for i, tangent_or_zero in enumerate(tangents)
+            if not isinstance(tangent_or_zero, SymbolicZero)
         )
         if not argnums:
             outputs = wrapped_function(*primals)
             return outputs, zero_tangent(outputs)
-        (jacobian, float_outputs), other_outputs = get_jacobian(argnums)(*primals)
-        tangent = _apply_argument_jacobians(
-            float_outputs, jacobian, tuple(tangents[i] for i in argnums)
+        (argument_jacobians, float_outputs), other_outputs = get_differentiable_jacobian(argnums)(
+            *primals
         )
-        return (float_outputs, other_outputs), (tangent, zero_tangent(other_outputs))
+        output_tangent = _apply_argument_jacobians(
+            float_outputs, argument_jacobians, tuple(tangents[i] for i in argnums)
+        )
+        return (float_outputs, other_outputs), (output_tangent, zero_tangent(other_outputs))
 
     wrapped_function.defjvp(wrapped_jvp, symbolic_zeros=True)
 
@@ -79,16 +83,18 @@ def enable_all_ad_modes(
     return call_function
 
 
-def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
-    """Return a function that returns (Jacobian for each argument, value) of the float outputs,
-    and the other outputs.
+def _make_forward_jacobian(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
+    """Return a function of the Jacobians of the float outputs, one for each differentiated
+    argument.
+
+    Its result is (Jacobians, float outputs), and the other outputs.
     """
 
     def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
         float_outputs, other_outputs = function(*arrays)
         return float_outputs, (float_outputs, other_outputs)
 
-    def jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
+    def evaluate_jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
         argument_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
@@ -104,7 +110,7 @@ def _jacobian_function(function: ForwardFunction, argnums: tuple[int, ...]) -> F
         )
         return (jacobians_by_argument, float_outputs), other_outputs
 
-    return jacobian
+    return evaluate_jacobian
 
 
 @jax.jit
@@ -125,9 +131,7 @@ def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tup
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
-"""A function that selects how a batch function is executed, given the order of the derivative
-that it computes.
-"""
+"""Function that selects how a batch function is executed, given the order of its derivative."""
 
 
 def with_implicit_derivative(
@@ -168,12 +172,13 @@ def implicit_jacobian(
     """Return a function that computes d function(p, z(p)) / dp, with a leading axis over p.
 
     The result is differentiable as in `with_implicit_derivative`. `make_jacobian(p, (z, dz/dp))`
-    may be a faster evaluation of it.
+    may compute the same Jacobian faster.
     """
 
     def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
-        """Return the derivatives over a batch, computed one direction after another so that the
-        code is short.
+        """Return the derivatives over a batch, computed one direction after another.
+
+        The code is then as short as for one direction.
         """
         n_parameters, (z, dz) = p.shape[0], z_and_jacobian
         unit_tangents = jnp.broadcast_to(
@@ -181,22 +186,24 @@ def implicit_jacobian(
         )
         return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, dz))
 
-    def tangents_of_known(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+    def compute_known_tangents(
+        p: Array, z_and_jacobian: tuple[PyTree, PyTree]
+    ) -> tuple[PyTree, PyTree]:
         z, dz = z_and_jacobian
         second_derivatives = jax.jacfwd(compute_tangents)(p, z)
         return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
 
     jacobian_function = with_implicit_derivative(
-        make_jacobian or jvp_sequentially, tangents_of_known, wrap_execution, order
+        make_jacobian or jvp_sequentially, compute_known_tangents, wrap_execution, order
     )
     return lambda p, z: jacobian_function(p, lax.stop_gradient((z, compute_tangents(p, z))))
 
 
 def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
-    """Return the outputs of `function`, and the derivatives of its float outputs on last axes, in
-    one program.
+    """Return the outputs of `function`, and the derivatives of its float outputs on last axes.
 
-    With several arguments, the derivatives of a leaf are a tuple with one entry for each argument.
+    One program computes both. With several arguments, the derivatives of a leaf are a tuple with
+    one derivative for each argument.
     """
 
     def select_float_outputs(*arguments: Array) -> tuple:
@@ -204,22 +211,22 @@ def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]
         return float_outputs, (float_outputs, other_outputs)
 
     argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    jacobian, (float_jacobians, other_outputs) = jax.jacfwd(
+    output_jacobian, (float_jacobians, other_outputs) = jax.jacfwd(
         select_float_outputs, argnums, has_aux=True
     )(*arguments)
-    return eqx.combine(float_jacobians, other_outputs), jacobian
+    return eqx.combine(float_jacobians, other_outputs), output_jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
     """Return the Jacobian (leading axis: inputs) times the tangent, leaf by leaf."""
-    return jax.tree.map(lambda leaf: jnp.tensordot(tangent, leaf, 1), jacobian)
+    return jax.tree.map(lambda jacobian_leaf: jnp.tensordot(tangent, jacobian_leaf, 1), jacobian)
 
 
 def zero_tangent(tree: PyTree) -> PyTree:
     """Return the zero tangent of any tree of outputs."""
-    zero = lambda x: (
+    make_zero = lambda x: (
         jnp.zeros_like(x)
         if jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         else np.zeros(jnp.shape(x), jax.dtypes.float0)
     )
-    return jax.tree.map(zero, tree)
+    return jax.tree.map(make_zero, tree)

@@ -1,8 +1,8 @@
 """Linear algebra of many small systems together, batch last, as sums of elementwise products.
 
 XLA on CPU computes inexpensive intermediate results again for each use, which costs more than all
-arithmetic here. A `lax.cond` prevents this: its predicate is always true, but XLA cannot know it at
-compile time.
+arithmetic of this module. A `lax.cond` prevents this: its predicate is always true, but XLA cannot
+prove that at compile time.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,17 +42,17 @@ def fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
 
 def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
     """Return a matrix product over the leading axis as a sum of elementwise products."""
-    shape = (-1,) + (1,) * (x.ndim - 1)
+    broadcast_shape = (-1,) + (1,) * (x.ndim - 1)
     weighted_terms = [
-        x[j] * matrix[:, j].astype(x.dtype).reshape(shape) for j in range(matrix.shape[1])
+        x[j] * matrix[:, j].astype(x.dtype).reshape(broadcast_shape) for j in range(matrix.shape[1])
     ]
     return sum(weighted_terms[1:], start=weighted_terms[0])
 
 
 def weighted_sum(weights: np.ndarray, x: Array) -> Array:
     """Return the weighted sum over the leading axis."""
-    terms = [float(weights[j]) * x[j] for j in range(len(weights))]
-    return sum(terms[1:], start=terms[0])
+    weighted_terms = [float(weights[j]) * x[j] for j in range(len(weights))]
+    return sum(weighted_terms[1:], start=weighted_terms[0])
 
 
 def contract_axes(left_array: Array, right_array: Array) -> Array:
@@ -60,36 +60,47 @@ def contract_axes(left_array: Array, right_array: Array) -> Array:
     batch.
     """
     new_axes = (slice(None),) * (left_array.ndim - 2) + (None,) * (right_array.ndim - 2)
-    terms = [
+    product_terms = [
         left_array[..., s, :][(*new_axes, slice(None))] * right_array[s]
         for s in range(right_array.shape[0])
     ]
-    return sum(terms[1:], start=terms[0])
+    return sum(product_terms[1:], start=product_terms[0])
 
 
 def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Return the inverse of each 1x1, 2x2 or 3x3 matrix by cofactors."""
-    entries = matrix
-    if entries.shape[0] == 1:
-        return 1.0 / entries
-    if entries.shape[0] == 2:
-        determinant = entries[0, 0] * entries[1, 1] - entries[0, 1] * entries[1, 0]
+    matrix_entries = matrix
+    if matrix_entries.shape[0] == 1:
+        return 1.0 / matrix_entries
+    if matrix_entries.shape[0] == 2:
+        determinant = (
+            matrix_entries[0, 0] * matrix_entries[1, 1]
+            - matrix_entries[0, 1] * matrix_entries[1, 0]
+        )
         adjugate_2x2 = jnp.stack(
-            [jnp.stack([entries[1, 1], -entries[0, 1]]), jnp.stack([-entries[1, 0], entries[0, 0]])]
+            [
+                jnp.stack([matrix_entries[1, 1], -matrix_entries[0, 1]]),
+                jnp.stack([-matrix_entries[1, 0], matrix_entries[0, 0]]),
+            ]
         )
         return adjugate_2x2 / determinant
-    if entries.shape[0] != 3:
-        raise ValueError(f"the matrix has {entries.shape[0]} rows, but only 1, 2 or 3 are built.")
+    if matrix_entries.shape[0] != 3:
+        raise ValueError(
+            f"the matrix has {matrix_entries.shape[0]} rows, but only 1, 2 or 3 are built."
+        )
 
     def cofactor(i: int, j: int) -> Array:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
-        return entries[a, c] * entries[b, d] - entries[a, d] * entries[b, c]
+        return (
+            matrix_entries[a, c] * matrix_entries[b, d]
+            - matrix_entries[a, d] * matrix_entries[b, c]
+        )
 
     adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
     determinant = (
-        entries[0, 0] * adjugate[0][0]
-        + entries[0, 1] * adjugate[1][0]
-        + entries[0, 2] * adjugate[2][0]
+        matrix_entries[0, 0] * adjugate[0][0]
+        + matrix_entries[0, 1] * adjugate[1][0]
+        + matrix_entries[0, 2] * adjugate[2][0]
     )
     return jnp.stack([jnp.stack(row) for row in adjugate]) / determinant
 
@@ -100,43 +111,46 @@ def solve_node_equations(
     rhs: Float[Array, "nodes dim columns lanes"],
     barrier_values: LaneArray,
 ) -> Float[Array, "nodes dim columns lanes"]:
-    """Return the solution of the node equations of one mesh interval, by block elimination without
-    pivoting.
+    """Return the solution of the node equations of one mesh interval.
 
-    The matrix is the mass matrix plus terms of order h, so its diagonal blocks stay regular.
-    `barrier_values` is the argument of `fusion_barrier`.
+    The method is block elimination without pivoting. The matrix is the mass matrix plus terms of
+    order h, so its diagonal blocks stay regular. `barrier_values` is the argument of
+    `fusion_barrier`.
     """
     prevent_fusion = fusion_barrier(barrier_values)
-    n_nodes, dim = matrix.shape[:2]
+    n_nodes, n_coordinates = matrix.shape[:2]
     remaining_system = jnp.concatenate(
-        [matrix.reshape(n_nodes, dim, n_nodes * dim, -1), rhs], axis=2
+        [matrix.reshape(n_nodes, n_coordinates, n_nodes * n_coordinates, -1), rhs], axis=2
     )
-    rows: list[Array] = []
+    eliminated_rows: list[Array] = []
     for _ in range(n_nodes):
         pivot_block = remaining_system[0]
-        block_row = contract_axes(invert_small(pivot_block[:, :dim]), pivot_block[:, dim:])
-        if len(rows) < n_nodes - 1:
+        block_row = contract_axes(
+            invert_small(pivot_block[:, :n_coordinates]), pivot_block[:, n_coordinates:]
+        )
+        if len(eliminated_rows) < n_nodes - 1:
             block_row = prevent_fusion(block_row)
             remaining_system = prevent_fusion(
-                remaining_system[1:, :, dim:]
-                - contract_axes(remaining_system[1:, :, :dim], block_row)
+                remaining_system[1:, :, n_coordinates:]
+                - contract_axes(remaining_system[1:, :, :n_coordinates], block_row)
             )
-        rows.append(block_row)
-    solution = rows[-1]
-    for block_row in rows[-2::-1]:
+        eliminated_rows.append(block_row)
+    solution = eliminated_rows[-1]
+    for block_row in eliminated_rows[-2::-1]:
         n_solved_blocks = solution.shape[0]
         block_solution = block_row[:, n_solved_blocks:] - contract_axes(
             block_row[:, :n_solved_blocks], solution
         )
         solution = jnp.concatenate([block_solution, solution])
-    return solution.reshape(n_nodes, dim, *solution.shape[1:])
+    return solution.reshape(n_nodes, n_coordinates, *solution.shape[1:])
 
 
 @solve_node_equations.defjvp
 @with_default_settings
-def _eliminate_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Return the solution and its tangent, by a second solve; differentiating the elimination
-    would double its work.
+def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return the solution and its tangent, by a second solve.
+
+    Differentiation of the elimination would double its work.
     """
     (matrix, _, barrier_values), (d_matrix, d_rhs, _) = primals, tangents
     solution = solve_node_equations(*primals)
@@ -155,14 +169,14 @@ def value_and_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple
 def value_and_partials(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Return the value of an elementwise function, and each output's derivatives with respect to
-    all arguments.
+    """Return the value of an elementwise function, and the derivatives of each output by all
+    arguments.
 
     The derivatives use reverse mode, because a phase has fewer equations than arguments.
     """
-    value, apply_jvp = jax.linearize(function, *arguments)
+    function_values, apply_jvp = jax.linearize(function, *arguments)
     partials_by_output = []
-    for i, output in enumerate(value):
+    for i, output_value in enumerate(function_values):
         apply_transpose = jax.linear_transpose(lambda *t, i=i: apply_jvp(*t)[i], *arguments)
-        partials_by_output.append(apply_transpose(jnp.ones_like(output)))
-    return value, partials_by_output
+        partials_by_output.append(apply_transpose(jnp.ones_like(output_value)))
+    return function_values, partials_by_output

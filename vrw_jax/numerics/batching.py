@@ -1,8 +1,7 @@
-"""Batch functions with the batch on the last axis, converted to functions of one element under
-`jax.vmap`.
+"""Batch functions with the batch on the last axis, as functions of one element for `jax.vmap`.
 
 Code with independent wheels on the last axis runs several times faster than the same code for one
-wheel under `jax.vmap`. Here every `vmap`, including nested ones, is merged into that axis.
+wheel under `jax.vmap`. `unbatch` merges every `vmap`, including nested ones, into that axis.
 """
 
 import bisect
@@ -19,12 +18,13 @@ from jaxtyping import Array, PyTree
 from vrw_jax.runtime import with_default_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
-"""A function of arrays that all have the batch on their last axis."""
+"""Function of arrays that all have the batch on their last axis."""
 
 
 def unbatch(function: BatchFunction) -> BatchFunction:
-    """Return `function` for arrays without the batch axis; under `vmap` it is `function` over
-    the batch.
+    """Return `function` for arrays without the batch axis.
+
+    Under `jax.vmap` the result calls `function` for the whole batch.
     """
     batched_function = custom_vmap(function)
 
@@ -35,14 +35,20 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
         def merge_into_lanes(x: Array, is_batched: bool) -> Array:
             x = x if is_batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-            transposed = jnp.moveaxis(x, 0, -2)
-            return transposed.reshape(*transposed.shape[:-2], axis_size * n_lanes)
+            array_with_lanes_last = jnp.moveaxis(x, 0, -2)
+            return array_with_lanes_last.reshape(
+                *array_with_lanes_last.shape[:-2], axis_size * n_lanes
+            )
 
         def split_lanes(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
-        outputs = batched_function(*jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_tree)))
-        return jax.tree.map(split_lanes, outputs), jax.tree.map(lambda _: True, outputs)
+        batched_outputs = batched_function(
+            *jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_tree))
+        )
+        return jax.tree.map(split_lanes, batched_outputs), jax.tree.map(
+            lambda _: True, batched_outputs
+        )
 
     def evaluate_single(*arrays: PyTree) -> PyTree:
         outputs = batched_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
@@ -52,18 +58,18 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
 
 def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
-    """Return `function` applied to `block_size` batch elements at a time, so that its arrays stay
-    in cache.
+    """Return `function` applied to `block_size` batch elements at a time, so that arrays stay in
+    cache.
 
     The first array has the batch axis; scalars are the same for all elements.
     """
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
-        leaves, structure = jax.tree.flatten(arrays)
+        leaves, tree_structure = jax.tree.flatten(arrays)
         n_lanes = leaves[0].shape[-1]
         if n_lanes <= block_size:
             return function(*arrays)
-        has_lanes = [jnp.ndim(x) > 0 for x in leaves]
+        has_lane_axis_by_leaf = [jnp.ndim(x) > 0 for x in leaves]
 
         def split_blocks(x: Array) -> Array:  # The last element pads the last block.
             n_padding = -n_lanes % block_size
@@ -74,41 +80,47 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
             remaining_leaves = iter(batched_leaves)
             block_leaves = [
                 next(remaining_leaves) if has_lane_axis else x
-                for x, has_lane_axis in zip(leaves, has_lanes, strict=True)
+                for x, has_lane_axis in zip(leaves, has_lane_axis_by_leaf, strict=True)
             ]
-            return function(*jax.tree.unflatten(structure, block_leaves))
+            return function(*jax.tree.unflatten(tree_structure, block_leaves))
 
         def merge_blocks(x: Array) -> Array:
-            transposed = jnp.moveaxis(x, 0, -2)
-            return transposed.reshape(*transposed.shape[:-2], -1)[..., :n_lanes]
+            array_with_blocks_last = jnp.moveaxis(x, 0, -2)
+            return array_with_blocks_last.reshape(*array_with_blocks_last.shape[:-2], -1)[
+                ..., :n_lanes
+            ]
 
-        blocks = [
+        split_leaves = [
             split_blocks(x)
-            for x, has_lane_axis in zip(leaves, has_lanes, strict=True)
+            for x, has_lane_axis in zip(leaves, has_lane_axis_by_leaf, strict=True)
             if has_lane_axis
         ]
-        return jax.tree.map(merge_blocks, lax.map(evaluate_block, blocks))
+        return jax.tree.map(merge_blocks, lax.map(evaluate_block, split_leaves))
 
     return evaluate_blockwise
 
 
 def is_inside_jit() -> bool:
-    """Return whether an enclosing `jit` compiles the calls made here.
+    """Return whether an enclosing `jax.jit` compiles the present calls.
 
     A nested jit would only trace the function once more, which is wasted under a derivative.
     """
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def run_if_any(is_needed: Array, function: Callable[[PyTree], PyTree], fallback: PyTree) -> PyTree:
-    """Return `function(fallback)` if `is_needed` is set, otherwise `fallback`.
+def run_if_any(
+    is_needed: Array, function: Callable[[PyTree], PyTree], fallback_value: PyTree
+) -> PyTree:
+    """Return `function(fallback_value)` if `is_needed` is set, otherwise `fallback_value`.
 
     `is_needed` is one flag for the whole batch.
 
     The call is a loop of at most one iteration, which machine code skips if the flag is not set.
     """
-    run_once = lambda carry: (jnp.zeros((), bool), function(carry[1]))
-    return lax.while_loop(lambda carry: carry[0], run_once, (is_needed, fallback))[1]
+    call_once = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
+    return lax.while_loop(lambda loop_carry: loop_carry[0], call_once, (is_needed, fallback_value))[
+        1
+    ]
 
 
 def opaque_condition(condition: Array, count: Array) -> Array:
@@ -120,9 +132,9 @@ def opaque_condition(condition: Array, count: Array) -> Array:
     return condition & (count >= 0)
 
 
-def tree_where(condition: Array, if_true: PyTree, if_false: PyTree) -> PyTree:
+def tree_where(condition: Array, tree_if_true: PyTree, tree_if_false: PyTree) -> PyTree:
     """Return `jnp.where(condition, if_true, if_false)` of each pair of leaves."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree_if_true, tree_if_false)
 
 
 def zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
@@ -144,38 +156,43 @@ def concat_rows(*trees: PyTree) -> PyTree:
     )
 
 
-def map_in_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Return `function` of trees with a leading axis, computed in batches padded to one of `sizes`.
+def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
+    """Return `function` of trees with a leading axis, in batches padded to one of `batch_sizes`.
 
     The function is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
     """
-    if len(jax.tree.leaves(trees)[0]) in sizes:
+    if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))
     call_on_device = lambda *rows: function(*jax.device_put(rows))
-    return jax.device_put(map_in_numpy_batches(call_on_device, sizes, *trees))
+    return jax.device_put(map_in_numpy_batches(call_on_device, batch_sizes, *trees))
 
 
-def map_in_numpy_batches(function: Callable, sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Return a compiled function of trees as `map_in_batches` does; inputs and outputs are NumPy
-    arrays.
+def map_in_numpy_batches(
+    function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree
+) -> PyTree:
+    """Return the result of `map_in_batches` for a compiled function, with NumPy arrays as input and
+    output.
 
-    For small batches this takes a fraction of the time.
+    For small batches this takes a fraction of the time of `map_in_batches`.
     """
-    n_rows, results = len(jax.tree.leaves(trees)[0]), []
+    n_rows, batch_results = len(jax.tree.leaves(trees)[0]), []
     first_row = 0
     while first_row < n_rows:
-        batch_size = _choose_batch_size(n_rows - first_row, sizes)
+        batch_size = _choose_batch_size(n_rows - first_row, batch_sizes)
         last_row = min(first_row + batch_size, n_rows)
         row_indices = np.minimum(np.arange(first_row, first_row + batch_size), n_rows - 1)
-        batch = function(*take_rows(trees, row_indices))
-        results.append(take_rows(batch, slice(0, last_row - first_row)))
+        batch_result = function(*take_rows(trees, row_indices))
+        batch_results.append(take_rows(batch_result, slice(0, last_row - first_row)))
         first_row = last_row
-    return concat_rows(*results) if len(results) > 1 else results[0]
+    return concat_rows(*batch_results) if len(batch_results) > 1 else batch_results[0]
 
 
 def _choose_batch_size(n_rows: int, sizes: tuple[int, ...]) -> int:
-    """Return the smallest of `sizes` that holds all rows, or the next smaller one if several
-    batches of that size have at most half of its elements."""
+    """Return the batch size for a number of rows.
+
+    It is the smallest of `sizes` that holds all rows. The next smaller size is chosen if several
+    batches of that size have at most half as many elements.
+    """
     i = min(bisect.bisect_left(sizes, n_rows), len(sizes) - 1)
     if i > 0 and -(-n_rows // sizes[i - 1]) * sizes[i - 1] <= sizes[i] // 2:
         return sizes[i - 1]

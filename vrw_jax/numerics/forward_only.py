@@ -1,4 +1,4 @@
-"""A clear error for reverse mode through a loop of unknown length."""
+"""Clear error for reverse mode through a loop of unknown length."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ _FORWARD_ONLY = Primitive("forward_only")
 
 
 def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, name: str) -> None:
-    """Raise the error of reverse mode."""
+    """Raise the ValueError that explains the missing reverse mode."""
     raise ValueError(
         f"hybrid.{name} has no derivative in reverse mode, since the number of its solver steps "
         "is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of jax.grad, "

@@ -34,25 +34,24 @@ EngineName = Literal["auto", "lanes", "diffrax"]
 TIGHTENING_FLOOR_IN_EPS = 90.0
 """Smallest tightened tolerance, in units of round-off (2e-14 in float64).
 
-It is chosen because a walk of many steps gains nothing below it.
-"""
+The value is chosen because a walk of many steps gains nothing below it."""
 MIN_TOLERANCE_IN_EPS = 4.5
 """Smallest tolerance allowed in float64, in units of round-off.
 
-It is chosen because a walk of few steps that grazes a guard gains accuracy down to it.
-"""
+The value is chosen because a walk of few steps that grazes a guard gains accuracy down to this
+tolerance."""
 
 
 REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", "dt0")
 """Names of the options that are real numbers."""
 
 
-def _positive_field(name: str, default: float) -> Any:
+def _make_positive_field(name: str, default: float) -> Any:
     """Return a field of a dataclass for a positive number."""
     return eqx.field(converter=functools.partial(check_reals, name), default=default)
 
 
-def _int_field(name: str, default: int) -> Any:
+def _make_positive_int_field(name: str, default: int) -> Any:
     """Return a field of a dataclass for a positive integer."""
     return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
 
@@ -90,14 +89,14 @@ class StepOptions(AbstractPrintable):
 
     solver: str = eqx.field(static=True, default="Dopri8")
     engine: EngineName = eqx.field(static=True, default="auto")
-    rtol: Scalar = _positive_field("rtol", 1e-10)
-    atol: Scalar = _positive_field("atol", 1e-10)
-    derivative_tightening: Scalar = _positive_field("derivative_tightening", 20.0)
-    max_phase_time: Scalar = _positive_field("max_phase_time", 20.0)
-    max_solver_steps: int = _int_field("max_solver_steps", 20_000)
-    dt0: Scalar = _positive_field("dt0", 5e-3)
-    max_event_iterations: int = _int_field("max_event_iterations", 100)
-    max_margin_search_iterations: int = _int_field("max_margin_search_iterations", 5)
+    rtol: Scalar = _make_positive_field("rtol", 1e-10)
+    atol: Scalar = _make_positive_field("atol", 1e-10)
+    derivative_tightening: Scalar = _make_positive_field("derivative_tightening", 20.0)
+    max_phase_time: Scalar = _make_positive_field("max_phase_time", 20.0)
+    max_solver_steps: int = _make_positive_int_field("max_solver_steps", 20_000)
+    dt0: Scalar = _make_positive_field("dt0", 5e-3)
+    max_event_iterations: int = _make_positive_int_field("max_event_iterations", 100)
+    max_margin_search_iterations: int = _make_positive_int_field("max_margin_search_iterations", 5)
 
     if TYPE_CHECKING:
 
@@ -164,26 +163,28 @@ class StepOptions(AbstractPrintable):
                     "map over the options with jax.vmap."
                 )
 
-    def check_tolerances(self, dtype: np.dtype) -> None:
+    def check_tolerances(self, float_dtype: np.dtype) -> None:
         """Raise a ValueError for an `rtol` below the resolution of the number format.
 
         `atol` has no such limit, because states may be as small as their units make them. 64-bit
         arrays that were made before `jax_enable_x64` was switched off count as 32-bit ones.
         """
-        dtype = jax.dtypes.canonicalize_dtype(dtype)
+        float_dtype = jax.dtypes.canonicalize_dtype(float_dtype)
         min_tolerance = (
-            MIN_TOLERANCE_IN_EPS if dtype == np.float64 else TIGHTENING_FLOOR_IN_EPS
-        ) * float(jnp.finfo(dtype).eps)
+            MIN_TOLERANCE_IN_EPS if float_dtype == np.float64 else TIGHTENING_FLOOR_IN_EPS
+        ) * float(jnp.finfo(float_dtype).eps)
         rtol = self.rtol
         if isinstance(rtol, jax.core.Tracer) or np.ndim(rtol) or np.asarray(rtol) >= min_tolerance:
             return
-        hint = f"ask for no less, as with StepOptions(rtol={1e2 * min_tolerance:.0e})"
-        if dtype == np.float32:
-            start_hint = "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
-            hint = f"{start_hint}, or {hint}"
+        remedy_text = f"ask for no less, as with StepOptions(rtol={1e2 * min_tolerance:.0e})"
+        if float_dtype == np.float32:
+            start_remedy_text = (
+                "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
+            )
+            remedy_text = f"{start_remedy_text}, or {remedy_text}"
         raise ValueError(
-            f"rtol is {float(rtol):g}, but {np.dtype(dtype).name} numbers can't resolve less than "
-            f"{min_tolerance:.0e}: {hint}."
+            f"rtol is {float(rtol):g}, but {np.dtype(float_dtype).name} numbers can't resolve less "
+            f"than {min_tolerance:.0e}: {remedy_text}."
         )
 
 

@@ -17,37 +17,42 @@ it exceeds pi/2, the limit of the angle of a valid start.
 """
 
 
-def _economize_series(offset: int) -> tuple[float, ...]:
-    """Return nine coefficients of the cosine, or of the sine over the angle, as a polynomial in the
-    squared angle.
+def _compute_economized_coefficients(odd_offset: int) -> tuple[float, ...]:
+    """Return nine coefficients of a polynomial in the squared angle, for the cosine or for sine
+    over angle.
 
-    `offset` is 0 for the cosine and 1 for the sine. The coefficients are those of Taylor's series,
-    whose last terms are replaced by Chebyshev polynomials of lower degree. Three terms fewer then
-    give the same error.
+    `odd_offset` is 0 for the cosine and 1 for the sine. The coefficients are those of Taylor's
+    series, whose last terms are replaced by Chebyshev polynomials of lower degree. Three terms
+    fewer then give the same error.
     """
     factorial, squared_angle_limit = math.factorial, MAX_EXACT_ANGLE * MAX_EXACT_ANGLE
-    coefficients = [(-1) ** order / factorial(2 * order + offset) for order in range(1, 14)]
-    while len(coefficients) > 8:
-        degree, last_coefficient = len(coefficients) - 1, coefficients.pop()
+    series_coefficients = [
+        (-1) ** order / factorial(2 * order + odd_offset) for order in range(1, 14)
+    ]
+    while len(series_coefficients) > 8:
+        degree, last_coefficient = len(series_coefficients) - 1, series_coefficients.pop()
         # These are coefficients of Chebyshev's polynomial over the range of the squared angle,
         # scaled to end with 1.
         for order in range(degree):
-            chebyshev = (
+            chebyshev_coefficient = (
                 degree
                 * factorial(degree + order - 1)
                 / (factorial(degree - order) * factorial(2 * order))
             )
-            coefficients[order] -= (
+            series_coefficients[order] -= (
                 last_coefficient
                 * (-1) ** (degree - order)
-                * chebyshev
+                * chebyshev_coefficient
                 * (squared_angle_limit / 4.0) ** (degree - order)
                 * 2.0
             )
-    return 1.0, *coefficients
+    return 1.0, *series_coefficients
 
 
-_SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = _economize_series(1), _economize_series(0)
+_SINE_COEFFICIENTS, _COSINE_COEFFICIENTS = (
+    _compute_economized_coefficients(1),
+    _compute_economized_coefficients(0),
+)
 
 
 def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
@@ -58,11 +63,13 @@ def sine_cosine(angle: Elementwise) -> tuple[Elementwise, Elementwise]:
     arrays and plain numbers the results are NumPy, in a tenth of the time of single JAX calls.
     """
     is_concrete = isinstance(angle, (float, np.ndarray))
-    return _evaluate_series(np, angle) if is_concrete else _differentiable_sine_cosine(angle)
+    return (
+        _evaluate_sine_and_cosine(np, angle) if is_concrete else _differentiable_sine_cosine(angle)
+    )
 
 
-def _evaluate_series(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
-    """Return both polynomials, evaluated by NumPy or JAX."""
+def _evaluate_sine_and_cosine(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
+    """Return sine and cosine by their polynomials, evaluated by NumPy or JAX."""
     squared_angle = angle * angle
 
     def evaluate_polynomial(coefficients: tuple[float, ...]) -> Any:
@@ -77,7 +84,9 @@ def _evaluate_series(array_module: ModuleType, angle: Any) -> tuple[Any, Any]:
 
 
 # The jit makes JAX trace the polynomials once.
-_differentiable_sine_cosine = jax.custom_jvp(jax.jit(lambda angle: _evaluate_series(jnp, angle)))
+_differentiable_sine_cosine = jax.custom_jvp(
+    jax.jit(lambda angle: _evaluate_sine_and_cosine(jnp, angle))
+)
 
 
 @_differentiable_sine_cosine.defjvp

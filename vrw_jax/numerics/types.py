@@ -10,14 +10,14 @@ if TYPE_CHECKING:
     Elementwise = Array
 else:
     Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
-"""A quantity with any leading axes, because formulas below `scans` act element by element.
+"""Quantity with any leading axes, because formulas below `scans` act element by element.
 
 Complex numbers are allowed too, because a complex-step derivative needs them.
 """
 
 Vector = tuple[Elementwise, ...]
-"""A tuple with one array for each component."""
+"""Tuple with one array for each component."""
 
 
 RealInput = float | Array | np.ndarray
-"""A real number as a caller gives it, or an array of numbers."""
+"""Real number as a caller gives it, or an array of numbers."""

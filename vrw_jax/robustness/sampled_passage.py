@@ -201,9 +201,9 @@ def sample_passage(
     Args:
         walker_groups: groups of walkers at the gait.
         spectral_radius: of the gait.
-        tol: relative error.
+        relative_tolerance: relative error at which the walks end.
         max_steps: number of steps after which no further walks begin.
-        options: numerical choices.
+        sampling_options: options of the sampling.
 
     Raises:
         ExtinctGroupError: no walker of a group survived a step.

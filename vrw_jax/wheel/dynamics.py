@@ -337,14 +337,14 @@ def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
 
 
 def stopper_force(
-    s: Symbols, motion: Motion, acceleration: Acceleration, legs: range
+    s: Symbols, motion: Motion, acceleration: Acceleration, leg_numbers: range
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the force of the stopper that keeps each of `legs` at L0, N.
+    """Return the force of the stopper that keeps each of `leg_numbers` at L0, N.
 
     The force is negative if the leg would leave its stopper. The spring presses with k (L* - L0).
     The weight and the acceleration of the leg's mass reduce the force.
     """
-    leg_angles = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
+    leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     radial_acceleration = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
     tangential_acceleration = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.

@@ -119,7 +119,7 @@ def _parameter_field(name: str, default_value: float) -> Any:
     return eqx.field(converter=functools.partial(check_reals, name), default=default_value)
 
 
-_convert_n_legs = functools.partial(
+_check_n_legs = functools.partial(
     check_int,
     "n_legs",
     min_value=5,
@@ -164,7 +164,7 @@ class WheelParams(AbstractPrintable):
     damping: Scalar = _parameter_field("damping", 200.0)
     slope: Scalar = _parameter_field("slope", 0.30)
     gravity: Scalar = _parameter_field("gravity", 9.81)
-    n_legs: int = eqx.field(static=True, converter=_convert_n_legs, default=8)
+    n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
 
     def __new__(cls, *_: Any, **named_values: Any) -> "WheelParams":
         """Raise `TypeError` for names that no parameter has, before the wheel is made."""
@@ -245,18 +245,18 @@ class WheelParams(AbstractPrintable):
 
     def summary_rows(self) -> list[TextRow]:
         """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
-        values = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
+        parameter_numbers = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
         if not np.all(self.is_in_domain()):
             denominator_text = lambda domain: (
                 f"{domain.symbol}, {domain.unit}" if domain.unit else domain.symbol
             )
             return [
                 (f"by {n} {denominator_text(PARAMETER_DOMAINS[n])}", format_quantity(value, ""))
-                for n, value in values.items()
+                for n, value in parameter_numbers.items()
             ]
         parameter_rows = [
             (f"{n} {PARAMETER_DOMAINS[n].symbol}", format_quantity(x, PARAMETER_DOMAINS[n].unit))
-            for n, x in values.items()
+            for n, x in parameter_numbers.items()
         ]
         return [*parameter_rows, ("n_legs", str(self.n_legs))]
 
@@ -309,8 +309,8 @@ class WheelParams(AbstractPrintable):
             >>> print(f"{small.locked_length:.2f} m, {small.gravity:.2f} m/s^2")
             0.20 m, 9.81 m/s^2
         """
-        factors = {"length": length, "time": time, "mass": mass}
-        for name, value in factors.items():
+        factor_by_dimension = {"length": length, "time": time, "mass": mass}
+        for name, value in factor_by_dimension.items():
             checked_factor = check_reals(name, value)
             if not isinstance(checked_factor, jax.core.Tracer) and not np.all(checked_factor > 0.0):
                 raise ValueError(
@@ -321,8 +321,10 @@ class WheelParams(AbstractPrintable):
         for name, domain in PARAMETER_DOMAINS.items():
             unit_powers = UNIT_POWERS[domain.unit]
             scale_factor = math.prod(
-                checked_factor**power
-                for checked_factor, power in zip(factors.values(), unit_powers, strict=True)
+                checked_factor**unit_power
+                for checked_factor, unit_power in zip(
+                    factor_by_dimension.values(), unit_powers, strict=True
+                )
             )
             scaled_values[name] = getattr(self, name) * scale_factor
         return WheelParams(**scaled_values, n_legs=self.n_legs)
@@ -417,7 +419,7 @@ def refuse_symbol(name: Any, allowed_names: Iterable[str]) -> None:
 def check_parameter_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
     """Raise `ValueError` for a name that is no allowed parameter.
 
-    For a symbol of the paper, the message gives the parameter's name.
+    If the name is a symbol of the paper, the message gives the parameter's name.
     """
     refuse_symbol(name, allowed_names)
     check_known_name(name, allowed_names, description)
@@ -428,14 +430,16 @@ def convert_friction(value: object) -> Array:
 
     Raises `ValueError` for a negative number or NaN.
     """
-    friction = check_reals(FRICTION_NAME, value)
-    is_concrete = not isinstance(friction, jax.core.Tracer) and friction.ndim == 0
-    if is_concrete and not float(friction) >= 0.0:
+    friction_coefficient = check_reals(FRICTION_NAME, value)
+    is_concrete = (
+        not isinstance(friction_coefficient, jax.core.Tracer) and friction_coefficient.ndim == 0
+    )
+    if is_concrete and not float(friction_coefficient) >= 0.0:
         raise ValueError(
-            f"friction is {float(friction):g}, but a coefficient of friction is at least 0: give "
-            "0.7, say, or math.inf for feet that never slide."
+            f"friction is {float(friction_coefficient):g}, but a coefficient of friction is at "
+            "least 0: give 0.7, say, or math.inf for feet that never slide."
         )
-    return friction
+    return friction_coefficient
 
 
 def require_known_friction(value: Any) -> float:

@@ -77,14 +77,13 @@ class AbstractPhase(abc.ABC):
     """Outcomes of `end_guard` (STEPPED) and of `specific_guards`."""
     counts_contraction_at_start: ClassVar[bool] = False
     counts_specific_margins_at_start: ClassVar[tuple[bool, ...]] = ()
-    """Whether Leg 1's contraction and the margins of this phase alone count at its start.
-
-    A margin that is zero there by construction does not count."""
+    """Whether Leg 1's contraction and the specific margins of this phase count at its start. A
+    margin that is zero at the start by construction does not count."""
     can_come_to_rest: ClassVar[bool] = False
     """Whether the phase contains a stable equilibrium of the wheel."""
     has_stiff_start: ClassVar[bool] = False
-    """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays at
-    once."""
+    """Whether the phase starts with the fast mode of the airborne leg, near c/m, which decays
+    quickly."""
 
     @abc.abstractmethod
     def complete_motion(self, sin: Elementwise, cos: Elementwise, q: Vector, v: Vector) -> Motion:
@@ -100,13 +99,13 @@ class AbstractPhase(abc.ABC):
     def dynamics_residual(self, motion: Motion, phase_acceleration: Vector) -> Vector:
         """Return the residual of the equations of motion at `phase_acceleration`.
 
-        The residual is linear in the accelerations. Its derivative is far cheaper than that of the
-        solution.
+        The residual is linear in the accelerations. The derivative of the residual is far cheaper
+        than that of the solution.
         """
 
     @abc.abstractmethod
     def solve_dynamics(self, motion: Motion, right_hand_side: Vector) -> Vector:
-        """Return the phase's accelerations for which the linear part of the residual equals
+        """Return the accelerations for which the linear part of the residual equals
         `right_hand_side`.
         """
 
@@ -116,17 +115,18 @@ class AbstractPhase(abc.ABC):
 
     @abc.abstractmethod
     def end_guard(self, instant: "PhaseInstant") -> Elementwise:
-        """Return the guard whose zero is the regular end of the phase: positive before it, m
-        or N.
+        """Return the guard whose zero is the regular end of the phase, m or N.
+
+        The guard is positive before the end.
         """
 
     @abc.abstractmethod
     def specific_guards(self, instant: "PhaseInstant") -> Vector:
-        """Return the guards that other phases do not have."""
+        """Return the guards of this phase that other phases do not have."""
 
     @abc.abstractmethod
     def specific_margins(self, instant: "PhaseInstant") -> Vector:
-        """Return the margins that other phases do not have."""
+        """Return the margins of this phase that other phases do not have."""
 
     @abc.abstractmethod
     def reset_map(self, motion: Motion) -> Motion:
@@ -213,9 +213,10 @@ class AbstractPhase(abc.ABC):
         )
 
     def outcome_of_guard(self, guard: Int[Array, "..."], is_timed_out: Bool[Array, "..."]) -> Array:
-        """Return the `Outcome` of a phase that ended at this guard; STEPPED for its regular end.
+        """Return the `Outcome` of a phase that ended at the guard of an index; STEPPED for its
+        regular end.
 
-        A guard of -1 means that no guard ended the phase.
+        An index of -1 means that no guard ended the phase.
         """
         outcome = jnp.full_like(guard, Outcome.SOLVER_FAILED)
         for index, guard_outcome in enumerate(self.all_guard_outcomes):

@@ -262,15 +262,15 @@ def locked_leg_impulses(
     s: Symbols,
     motion: Motion,
     hub_jump: tuple[Elementwise, Elementwise],
-    legs: range,
+    leg_numbers: range,
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the stopper impulse on the mass of each of `legs` for a jump of the hub's velocity, N
+    """Return the stopper impulse on the mass of each of `leg_numbers` for a jump of the hub's velocity, N
     s.
 
     The impulse is negative if the collision throws the leg off its stopper: a preload resists no
     impulse.
     """
-    leg_angles = s.alpha * (np.asarray(legs).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
+    leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
     radial_jump = hub_jump[0] * motion.sin + hub_jump[1] * motion.cos
     transverse_jump = hub_jump[0] * motion.cos - hub_jump[1] * motion.sin
     return s.m * (radial_jump * np.cos(leg_angles) + transverse_jump * np.sin(leg_angles))

@@ -1,8 +1,8 @@
 """Units of length, time and mass of a wheel, in which numerical options hold.
 
 The tolerances and time limits of a step are stated for a wheel of Table 1's length, mass and
-gravity. In its units every wheel has that size, so no result depends on the units of the
-parameters.
+gravity. In its units every wheel has the size of Table 1's wheel. So no result depends on the units
+of the parameters.
 """
 
 from typing import Any, NamedTuple
@@ -38,9 +38,7 @@ class WheelUnits(NamedTuple):
     mass: Any  # kg
 
     def si_value(self, unit: str) -> Elementwise:
-        """Return the wheel's unit that corresponds to an SI unit such as "N s/m", as a number in
-        SI.
-        """
+        """Return the wheel's unit for an SI unit such as "N s/m", as a number in SI."""
         length, time, mass = UNIT_POWERS[unit]
         return self.length**length * self.time**time * self.mass**mass
 
@@ -65,7 +63,7 @@ class WheelUnits(NamedTuple):
         return self.mass * self.speed * self.speed
 
     def scale_times(self, options: StepOptions) -> StepOptions:
-        """Return the options with their times in seconds, given in the wheel's unit of time."""
+        """Return the options with times in seconds, from options with times in the wheel's unit."""
         select_times = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
             select_times, options, tuple(self.time * x for x in select_times(options))
