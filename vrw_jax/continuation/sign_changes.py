@@ -106,12 +106,12 @@ def locate_zeros(
     """Return the locations of zeros of functions with opposite signs at 0 and 1, by Chandrupatla's
     method.
 
-    `function` takes locations and the indices of their brackets. `end_values` are the values of
-    the function at 0 and 1. A round uses inverse quadratic interpolation if it is reliable, and otherwise bisection.
-    A bracket in which the function jumps or stalls is divided into several sections per round, so
-    that a jump is located as reliably as a smooth zero. The search ends when each bracket is
-    narrower than `max_bracket_width`, or at an exact zero. A location where the function is NaN counts to the
-    side of 1.
+    `function` takes locations and the indices of their brackets. `end_values` are the values of the
+    function at 0 and 1. A round uses inverse quadratic interpolation if it is reliable, and
+    otherwise bisection. A bracket in which the function jumps or stalls is divided into several
+    sections per round, so that a jump is located as reliably as a smooth zero. The search ends when
+    each bracket is narrower than `max_bracket_width`, or at an exact zero. A location where the
+    function is NaN counts to the side of 1.
     """
     values_at_zero, values_at_one = end_values
     # The rows are the newest location, the end with the other sign, and the location replaced by

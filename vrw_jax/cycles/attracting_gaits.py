@@ -32,7 +32,8 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
 
     Args:
         gait_finder: finder of gaits with unilateral contact.
-        parameter_values: values of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
+        parameter_values: values of each wheel, (wheels, n_values); see
+            `AbstractWheel.parameter_values`.
 
     Returns:
         Index of the wheel of each gait, (gaits,), and a cycle with that leading axis.

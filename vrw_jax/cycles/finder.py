@@ -203,8 +203,8 @@ class AbstractGaitFinder(eqx.Module):
     ) -> "GaitMeasures":
         """Return the requested measures of the gait near `guess` with their derivatives.
 
-        `measure_names` are some of `differentiable_measures`. Derivatives of stability measures are second
-        derivatives of the motion.
+        `measure_names` are some of `differentiable_measures`. Derivatives of stability measures are
+        second derivatives of the motion.
         """
         return measure_on_cycle(self, parameter_values, guess, measure_names)
 

@@ -168,7 +168,8 @@ def walk_to_gaits(
 
     Args:
         gait_finder: finder of gaits, whose model takes the steps.
-        parameter_values: values of each wheel, (wheels, n_values); see `AbstractWheel.parameter_values`.
+        parameter_values: values of each wheel, (wheels, n_values); see
+            `AbstractWheel.parameter_values`.
         compute_starts: function that returns section states of shape (starts, wheels, 3).
         walk_options: options of the walks.
     """

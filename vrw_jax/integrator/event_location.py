@@ -172,9 +172,9 @@ def _refine_event_location(
 ) -> EventSearch:
     """Return the search with its event located by short steps of low order from a state near it.
 
-    `step_time_limits` are the largest time bridged by extrapolation, and the largest length of a short
-    step, s. One step suffices, except for guards that graze zero. The event stays unresolved if
-    Newton's method diverges.
+    `step_time_limits` are the largest time bridged by extrapolation, and the largest length of a
+    short step, s. One step suffices, except for guards that graze zero. The event stays unresolved
+    if Newton's method diverges.
     """
     max_extrapolation_time, max_short_step_time = step_time_limits
     # Over a thousandth of a step, a method of order 3 is accurate to round-off.

@@ -137,9 +137,9 @@ def integrate_batch_phase(
 
     Each active element is integrated to its earliest event. Errors are those of
     `hybrid.integrate_phase`. In a large batch, as on a GPU, the last `straggler_count` elements are
-    cut off if they take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. They are
-    marked unfinished, and the caller integrates them again together with other stragglers. The
-    result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
+    cut off if they take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch.
+    They are marked unfinished, and the caller integrates them again together with other stragglers.
+    The result is differentiable with respect to `constants`, `held_constants`, `q` and `v`, see
     `tangents`.
     """
     integrate_with_rule = jax.custom_jvp(

@@ -56,7 +56,9 @@ def evaluate_with_rates(
     evaluate_acceleration: EvaluateAcceleration,
     motion_state: StageState,
 ) -> tuple[Vector, Vector]:
-    """Return the values of `evaluate_functions` at a state, and their time derivatives along the motion."""
+    """Return the values of `evaluate_functions` at a state, and their time derivatives along the
+    motion.
+    """
     n = len(motion_state.q)
 
     def evaluate_along_motion(q: Vector, v: Vector) -> Vector:

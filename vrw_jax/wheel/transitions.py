@@ -264,8 +264,8 @@ def locked_leg_impulses(
     hub_jump: tuple[Elementwise, Elementwise],
     leg_numbers: range,
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the stopper impulse on the mass of each of `leg_numbers` for a jump of the hub's velocity, N
-    s.
+    """Return the stopper impulse on the mass of each of `leg_numbers` for a jump of the hub's
+    velocity, N s.
 
     The impulse is negative if the collision throws the leg off its stopper: a preload resists no
     impulse.
