@@ -8,6 +8,7 @@ Groups are independent, so that the spread between groups gives the error.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -62,6 +63,10 @@ class PassageSamplingOptions:
     """Smallest effective number of sampled failures for which an error is estimated. The value is
     chosen because a few likelihood ratios dominate smaller samples. Their spread is then no
     estimate of the error."""
+    min_effective_failure_fraction: float = 0.02
+    """Smallest effective number of sampled failures, divided by the number of failing walks. The
+    value is chosen because it is a tenth of the usual one. Lower values belong to fits that miss a
+    part of the failures, and failures are then counted if they are frequent enough."""
     confidence_level: float = 0.99
     """Confidence level of the error estimate."""
 
@@ -241,57 +246,38 @@ def sample_passage(
         step_transitions[-sampling_options.n_kappa_2_steps :], walker_groups.n_continuous
     )
     walker_groups.weight_by_outcome.clear()
-    n_biased_lines = n_decay_lines = min(
+    n_biased_lines = min(
         count_decay_steps(sampling_options.negligible_line_effect),
         sampling_options.max_biased_lines,
     )
-    sample_failure_weights: Callable[[], np.ndarray] | None
-    walk_density = GaussianMixture.make_isotropic_gaussian(n_decay_lines, 1.0)
-    if n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting:
-        n_biased_lines = 1
-        sample_failure_weights = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(
-            float
-        )
-    else:
+    walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_lines, 1.0)
+    estimate_probability = functools.partial(
+        _estimate_failure_probability,
+        walker_groups,
+        student_t_quantile=student_t_quantile,
+        start_effect=(max(kappa_2, spectral_radius), n_forgetting_steps - 1),
+        relative_tolerance=relative_tolerance,
+        max_steps=max_steps,
+        sampling_options=sampling_options,
+    )
+    count_failures = lambda: (~walker_groups.step_and_replace_failures()[0]).astype(float)
+    failure_probability, relative_error = 0.0, np.inf
+    is_counted = n_biased_lines * np.mean(~is_alive) > sampling_options.min_failures_for_counting
+    if not is_counted:
         failure_density = _fit_density_of_failures(walker_groups, n_biased_lines)
-        sample_failure_weights = None
         if failure_density is not None:
             walk_density = failure_density
-            sample_failure_weights = lambda: run_biased_walks(walker_groups, walk_density)[1]
-    group_weight_sums, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
-    weight_sum, squared_weight_sum = 0.0, 0.0
-    failure_probability, relative_error = 0.0, np.inf
-    remaining_start_effect = max(kappa_2, spectral_radius) ** (
-        n_forgetting_steps + n_biased_lines - 1
-    )
-    while sample_failure_weights and (
-        n_sampling_rounds < sampling_options.min_sampling_rounds
-        or (relative_error > relative_tolerance and walker_groups.n_steps < max_steps)
-    ):
-        failure_weights = sample_failure_weights()
-        group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
-        weight_sum += float(np.sum(failure_weights))
-        squared_weight_sum += float(np.sum(failure_weights**2))
-        n_sampling_rounds += 1
-        last_step_failure_probability = float(np.mean(group_weight_sums)) / n_sampling_rounds
-        if last_step_failure_probability > 0.0:
-            failure_probability, error_amplification = _solve_failure_probability(
-                last_step_failure_probability, n_biased_lines
+            failure_probability, relative_error = estimate_probability(
+                lambda: run_biased_walks(walker_groups, walk_density)[1], n_biased_lines
             )
-            standard_error = (
-                np.std(group_weight_sums, ddof=1)
-                / np.sqrt(walker_groups.n_groups)
-                / n_sampling_rounds
-            )
-            sampling_error = (
-                student_t_quantile
-                * error_amplification
-                * standard_error
-                / last_step_failure_probability
-            )
-            relative_error = float(sampling_error + remaining_start_effect)
-            if weight_sum**2 < sampling_options.min_effective_failures * squared_weight_sum:
-                relative_error = np.inf
+        n_expected_failures = failure_probability * (max_steps - walker_groups.n_steps)
+        is_counted = (
+            not np.isfinite(relative_error)
+            and n_expected_failures > sampling_options.min_effective_failures
+        )
+    if is_counted:
+        walker_groups.weight_by_outcome.clear()
+        failure_probability, relative_error = estimate_probability(count_failures, 1)
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
         mean_steps_from_gait = float(
@@ -314,6 +300,68 @@ def sample_passage(
         n_sampled_steps=walker_groups.n_steps,
         walk_density=walk_density,
     )
+
+
+def _estimate_failure_probability(
+    walker_groups: WalkerGroups,
+    sample_failure_weights: Callable[[], np.ndarray],
+    n_lines: int,
+    *,
+    student_t_quantile: float,
+    start_effect: tuple[float, int],
+    relative_tolerance: float,
+    max_steps: int,
+    sampling_options: PassageSamplingOptions,
+) -> tuple[float, float]:
+    """Return the failure probability of a step, and its relative error.
+
+    Rounds of all walkers are repeated until the relative error is within tolerance. The error is
+    infinite if a few walks dominate the probability.
+
+    - `sample_failure_weights`: function that returns the weight of each walk of a round, which is 0
+      unless the walk fails in its last step;
+    - `n_lines`: number of lines of a walk;
+    - `start_effect`: factor per step of the start's effect, and number of steps before the walks.
+    """
+    group_weight_sums, n_rounds = np.zeros(walker_groups.n_groups), 0
+    weight_sum, squared_weight_sum, n_failing_walks = 0.0, 0.0, 0
+    failure_probability, relative_error = 0.0, np.inf
+    remaining_start_effect = start_effect[0] ** (start_effect[1] + n_lines)
+    while n_rounds < sampling_options.min_sampling_rounds or (
+        relative_error > relative_tolerance and walker_groups.n_steps < max_steps
+    ):
+        failure_weights = sample_failure_weights()
+        group_weight_sums += failure_weights.reshape(walker_groups.n_groups, -1).mean(1)
+        weight_sum += float(np.sum(failure_weights))
+        squared_weight_sum += float(np.sum(failure_weights**2))
+        n_failing_walks += int(np.sum(failure_weights > 0.0))
+        n_rounds += 1
+        if weight_sum == 0.0:
+            continue
+        last_step_failure_probability = float(np.mean(group_weight_sums)) / n_rounds
+        failure_probability, error_amplification = _solve_failure_probability(
+            last_step_failure_probability, n_lines
+        )
+        standard_error = (
+            np.std(group_weight_sums, ddof=1) / np.sqrt(walker_groups.n_groups) / n_rounds
+        )
+        sampling_error = (
+            student_t_quantile
+            * error_amplification
+            * standard_error
+            / last_step_failure_probability
+        )
+        relative_error = float(sampling_error + remaining_start_effect)
+        n_effective_failures = weight_sum**2 / squared_weight_sum
+        if n_effective_failures < sampling_options.min_effective_failures:
+            relative_error = np.inf
+        min_effective_fraction = sampling_options.min_effective_failure_fraction
+        if (
+            n_rounds >= sampling_options.min_sampling_rounds
+            and n_effective_failures < min_effective_fraction * n_failing_walks
+        ):
+            return failure_probability, np.inf
+    return failure_probability, relative_error
 
 
 def _estimate_survival_from_gait(
