@@ -1,7 +1,9 @@
 """Every notebook runs from top to bottom and prints the stored text."""
 
+import ast
 import os
 import re
+import types
 from pathlib import Path
 
 import jax
@@ -36,6 +38,22 @@ def test_imports_of_a_notebook_exist(path):
     lines = [line for cell in cells for line in cell.splitlines()]
     for line in (line for line in lines if re.match(r"(from|import) .*\bvrw_jax\b", line)):
         exec(line, {})
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_names_of_modules_in_a_notebook_exist(path):
+    cells = [c.source for c in nbformat.read(path, as_version=4).cells if c.cell_type == "code"]
+    tree = ast.parse(
+        "\n".join(line for cell in cells for line in cell.splitlines() if line[:1] != "%")
+    )
+    names = {}
+    imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    exec(compile(ast.Module(imports, []), path.name, "exec"), names)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = names.get(node.value.id)
+            if isinstance(module, types.ModuleType):
+                assert hasattr(module, node.attr), f"{node.value.id}.{node.attr}"
 
 
 @pytest.mark.slow
