@@ -20,7 +20,7 @@ from vrw_jax.batches import programs
 from vrw_jax.batches.stiffness import select_solver
 from vrw_jax.integrator.integrate import BatchPhase, integrate_batch_phase
 from vrw_jax.integrator.tableaus import (
-    StageAcceleration,
+    StageAccelerations,
     StageState,
     compute_real_stability_limit,
     load_explicit_tableau,
@@ -258,7 +258,7 @@ def test_sine_and_cosine_are_accurate_to_round_off_at_every_leg_angle():
 def test_a_solver_step_has_the_order_of_its_tableau(name, order):
     """A pendulum with damping: error over one unit of time against the number of steps."""
     tableau = load_explicit_tableau(name)
-    evaluate = lambda q, v: StageAcceleration(q[0], q[0], (-jnp.sin(q[0]) - 0.3 * v[0],))
+    evaluate = lambda q, v: StageAccelerations(q[0], q[0], (-jnp.sin(q[0]) - 0.3 * v[0],))
 
     def end(n):
         q, v = (jnp.ones(1),), (jnp.full(1, 0.5),)
@@ -278,7 +278,7 @@ def integrate_free_flight(start, rate, acceleration=1.0, options=None):
     options = vrw.StepOptions() if options is None else options
     zero, one = jnp.zeros(8), jnp.ones(8)
     phase = BatchPhase(
-        lambda q, v: StageAcceleration(q[0], q[0], (acceleration * jnp.ones_like(q[0]),)),
+        lambda q, v: StageAccelerations(q[0], q[0], (acceleration * jnp.ones_like(q[0]),)),
         lambda place: (place.q[0],),
     )
     end = integrate_batch_phase(

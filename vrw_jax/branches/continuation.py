@@ -72,8 +72,13 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_name
 
-INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
-BRANCH_ENDING_QUANTITIES = (*INDICATOR_NAMES, "duration_dls", "duration_sls1", "duration_sls2")
+DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+BRANCH_ENDING_QUANTITIES = (
+    *DOUBLE_SUPPORT_INDICATOR_NAMES,
+    "duration_dls",
+    "duration_sls1",
+    "duration_sls2",
+)
 """Quantities at whose zeros the order of events changes and the branch ends."""
 
 SECOND_PEAK_RATE_NAME = "second_peak_rate"
@@ -121,7 +126,7 @@ class GaitContinuation(AbstractContinuation):
         FRICTION_SURPLUS_COLUMN_NAME,
     )
     margin_names: ClassVar[tuple[str, ...]] = (
-        *INDICATOR_NAMES,
+        *DOUBLE_SUPPORT_INDICATOR_NAMES,
         *MARGIN_MEASURES,
         SECOND_PEAK_RATE_NAME,
     )

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.branches.continuation import INDICATOR_NAMES, GaitContinuation
+from vrw_jax.branches.continuation import DOUBLE_SUPPORT_INDICATOR_NAMES, GaitContinuation
 from vrw_jax.branches.continuation_problems import (
     BranchWheel,
     CollocationProblem,
@@ -53,7 +53,7 @@ LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_su
 """Names of margins that vanish as a cube, each with the quantity that vanishes linearly at the same
 point."""
 
-DISCONTINUOUS_QUANTITIES = (*INDICATOR_NAMES, "duration_sls1", "duration_sls2")
+DISCONTINUOUS_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, "duration_sls1", "duration_sls2")
 """Quantities at whose zeros the step is discontinuous, so that measures of the step are not
 defined."""
 

@@ -121,11 +121,13 @@ def are_multipliers_off_circle(
 
 
 def find_unexplained_ranks(
-    moduli_before: np.ndarray, moduli_after: np.ndarray, bifurcation_names: list[str]
+    multiplier_moduli_before: np.ndarray,
+    multiplier_moduli_after: np.ndarray,
+    bifurcation_names: list[str],
 ) -> range:
     """Return the ranks that cross 1 between two points unless the bifurcations explain them."""
     first_rank, last_rank = sorted(
-        int(np.sum(moduli > 1.0)) for moduli in (moduli_before, moduli_after)
+        int(np.sum(moduli > 1.0)) for moduli in (multiplier_moduli_before, multiplier_moduli_after)
     )
     n_explained_crossings = sum(CROSSING_MULTIPLIER_COUNTS[name] for name in bifurcation_names)
     return (

@@ -84,9 +84,9 @@ def phase_integration_matrices(mesh: PhaseMesh) -> tuple[np.ndarray, ...]:
 
 
 def lagrange_weights(interval_location: float) -> np.ndarray:
-    """Return the weights of node values with which their polynomial is evaluated at `location`.
+    """Return the weights of node values that give the value of their polynomial at a location.
 
-    The location is the time from the interval's start in interval lengths.
+    The location is the time from the start of the mesh interval, in interval lengths.
     """
     node_differences = GAUSS_NODES[:, None] - GAUSS_NODES + np.eye(N_GAUSS_NODES)
     lagrange_factors = np.where(

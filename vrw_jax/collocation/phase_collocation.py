@@ -407,11 +407,11 @@ def _linearize_phase(
     Within the phase there is one more tangent, the last one. It belongs to the duration of the
     phase.
     """
-    append_zero_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+    append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
     tangent_state = tangent_state._replace(
-        held_tangents=append_zero_tangent(tangent_state.held_tangents),
-        q_tangents=append_zero_tangent(tangent_state.q_tangents),
-        v_tangents=append_zero_tangent(tangent_state.v_tangents),
+        held_tangents=append_duration_tangent(tangent_state.held_tangents),
+        q_tangents=append_duration_tangent(tangent_state.q_tangents),
+        v_tangents=append_duration_tangent(tangent_state.v_tangents),
     )
 
     def linearize_interval(interval_state: tuple, interval_inputs: tuple) -> tuple[tuple, Array]:
@@ -671,16 +671,14 @@ def reconstruct_step(
             weights.astype(durations.dtype)
             for weights in phase_integration_matrices(phase_meshes[i])
         )
-        accelerations_of_phase, duration = accelerations[i], durations[i]
-        accelerations_of_phase = accelerations_of_phase.reshape(
-            -1, *accelerations_of_phase.shape[2:]
-        )
+        phase_accelerations, duration = accelerations[i], durations[i]
+        phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
         q, v = jnp.stack(start_point.q), jnp.stack(start_point.v)
         node_times = node_times.reshape(-1, *(1,) * q.ndim)
         node_q = q + duration * (
-            node_times * v + duration * jnp.tensordot(position_matrix, accelerations_of_phase, 1)
+            node_times * v + duration * jnp.tensordot(position_matrix, phase_accelerations, 1)
         )
-        node_v = v + duration * jnp.tensordot(rate_matrix, accelerations_of_phase, 1)
+        node_v = v + duration * jnp.tensordot(rate_matrix, phase_accelerations, 1)
         node_points = PhasePoint(
             start_point.held_constants,
             tuple(node_q[:-1].swapaxes(0, 1)),

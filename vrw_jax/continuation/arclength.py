@@ -485,11 +485,11 @@ def _choose_next_step_length(
 
     The step grows after few Newton iterations, shrinks after many, and is halved after a failure.
     """
-    converged_quickly, converged_slowly = (
+    has_converged_quickly, has_converged_slowly = (
         continuation_state.iteration < 4,
         continuation_state.iteration >= 6,
     )
-    growth_factor = jnp.where(converged_quickly, 1.4, jnp.where(converged_slowly, 0.6, 1.0))
+    growth_factor = jnp.where(has_converged_quickly, 1.4, jnp.where(has_converged_slowly, 0.6, 1.0))
     longer_ds = jnp.minimum(continuation_state.ds * growth_factor, options.max_ds)
     shorter_ds = jnp.where(
         trial_assessment.has_failed, 0.5 * continuation_state.ds, continuation_state.ds
@@ -571,9 +571,9 @@ def _init_continuation_state(
 ) -> ContinuationState:
     """Return the initial state of one branch, whose first trial is the given point."""
     x = problem.section_state(z)
-    n_section, dtype = x.shape[0], x.dtype
-    zero_length, zero_count, constant_false = (
-        jnp.zeros((), dtype),
+    n_section, float_dtype = x.shape[0], x.dtype
+    zero_length, zero_count, false_flag = (
+        jnp.zeros((), float_dtype),
         jnp.zeros((), jnp.int32),
         jnp.asarray(False),
     )
@@ -586,19 +586,19 @@ def _init_continuation_state(
         p,
         zero_tangent,
         zero_length + direction_sign,
-        jnp.zeros((n_section, n_section), dtype),
-        constant_false,
+        jnp.zeros((n_section, n_section), float_dtype),
+        false_flag,
     )
     trial_point = _TrialPoint(
         ConstraintPlane(x, fraction, jnp.zeros_like(x), zero_length + 1.0),
         z,
         fraction,
         zero_length,
-        constant_false,
+        false_flag,
     )
     running_status = zero_count + int(ContinuationStatus.RUNNING)
     jump_suspicion, first_step = (
-        BranchJumpSuspicion(zero_length, constant_false),
+        BranchJumpSuspicion(zero_length, false_flag),
         zero_length + options.initial_ds,
     )
     return ContinuationState(

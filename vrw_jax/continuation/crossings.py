@@ -32,13 +32,13 @@ def is_multiplier_change_explained(
     `has_turned_back` states whether the parameter turns back between the points.
     """
     margins_before, margins_after = map(bifurcation_margins, (jacobian_before, jacobian_after))
-    has_sign_change = margins_before * margins_after < 0.0
-    crosses_other_branch = has_sign_change[0] != has_turned_back
+    has_margin_sign_change = margins_before * margins_after < 0.0
+    crosses_other_branch = has_margin_sign_change[0] != has_turned_back
     if jacobian_before.shape[-1] > MAX_CLOSED_FORM_SIZE and jax.default_backend() != "cpu":
         return ~crosses_other_branch  # Eigenvalues of larger matrices are computed on CPUs alone.
-    n_explained_multipliers = has_sign_change[0].astype(int) + has_sign_change[1]
+    n_explained_multipliers = has_margin_sign_change[0].astype(int) + has_margin_sign_change[1]
     n_explained_multipliers = n_explained_multipliers + (
-        2 * has_sign_change[2] if len(has_sign_change) > 2 else 0
+        2 * has_margin_sign_change[2] if len(has_margin_sign_change) > 2 else 0
     )
 
     def count_outside(jacobian: Array) -> tuple[Array, Array]:

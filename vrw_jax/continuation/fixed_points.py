@@ -122,7 +122,7 @@ def solve_fixed_point(
     """
 
     fixed_point = _check_and_solve(
-        _run_newton, function, start, period_n, tolerance, max_iterations
+        _run_newton_loop, function, start, period_n, tolerance, max_iterations
     )
     if isinstance(function, ReturnMap):
         fixed_point = fixed_point._replace(
@@ -228,7 +228,7 @@ derivatives of the point.
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _run_newton(
+def _run_newton_loop(
     converted_map: ClosureConvertedMap,
     iterations: int,
     start: Array,
@@ -240,7 +240,7 @@ def _run_newton(
     The loop compiles the map, often a large program, once.
     """
 
-    def is_searching(correction_norm: Array, n_iterations: Array) -> Array:
+    def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
         return (
             (correction_norm > tolerance)
             & (n_iterations < iterations)
@@ -249,13 +249,13 @@ def _run_newton(
 
     def needs_newton_iteration(loop_state: tuple) -> Array:
         _, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
-        return is_searching(correction_norm, n_iterations) | (
+        return is_newton_searching(correction_norm, n_iterations) | (
             (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
         )
 
     def iterate_newton(loop_state: tuple) -> tuple:
         x, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
-        n_searching = is_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
+        n_searching = is_newton_searching(correction_norm, n_iterations).astype(n_iterations.dtype)
         correction, jacobian, map_defect = _compute_newton_correction(
             converted_map, x, closed_over_values
         )
@@ -290,14 +290,14 @@ def _run_newton(
     )
 
 
-@_run_newton.defjvp
+@_run_newton_loop.defjvp
 @with_default_settings
 def _run_newton_jvp(
     converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent, by iterations with derivatives from the point."""
     start, _, *closed_over_values = primals
-    newton_result = _run_newton(converted_map, iterations, *lax.stop_gradient(primals))
+    newton_result = _run_newton_loop(converted_map, iterations, *lax.stop_gradient(primals))
 
     def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
         def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
@@ -329,7 +329,7 @@ def _run_newton_implicit(
     """Return the fixed point by Newton's method, with the implicit function theorem as derivative
     rule.
     """
-    return _run_newton(converted_map, iterations, start, tolerance, *closed_over_values)
+    return _run_newton_loop(converted_map, iterations, start, tolerance, *closed_over_values)
 
 
 @_run_newton_implicit.defjvp

@@ -159,7 +159,9 @@ def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
 
 
 def _split_into_isolated_and_pair(matrix: RealMatrix) -> tuple[list[Array], _EigenvaluePair | None]:
-    """Return the isolated real eigenvalues, and the remaining pair."""
+    """Return the isolated real eigenvalues of a small matrix, and the other two eigenvalues as a
+    pair.
+    """
     coefficients = characteristic_polynomial(matrix)
     if len(coefficients) == 1:
         return [-coefficients[0]], None
@@ -177,7 +179,7 @@ def _split_into_isolated_and_pair(matrix: RealMatrix) -> tuple[list[Array], _Eig
 def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
     """Return all eigenvalues, largest modulus first."""
     if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
-        return _sort_by_modulus(jnp.linalg.eigvals(matrix))
+        return _sort_eigenvalues_by_modulus(jnp.linalg.eigvals(matrix))
     isolated_values, remaining_pair = _split_into_isolated_and_pair(matrix)
     eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_values]
     if remaining_pair is not None:
@@ -185,10 +187,10 @@ def floquet_multipliers(matrix: RealMatrix) -> Complex[Array, "... n"]:
         eigenvalues += [
             lax.complex(mean + sign * real_offset, sign * imaginary_offset) for sign in (1.0, -1.0)
         ]
-    return _sort_by_modulus(jnp.stack(eigenvalues, -1))
+    return _sort_eigenvalues_by_modulus(jnp.stack(eigenvalues, -1))
 
 
-def _sort_by_modulus(eigenvalues: Array) -> Array:
+def _sort_eigenvalues_by_modulus(eigenvalues: Array) -> Array:
     """Return the eigenvalues sorted by modulus, the largest first."""
     eigenvalue_moduli = jnp.square(eigenvalues.real) + jnp.square(eigenvalues.imag)
     descending_order = jnp.argsort(-lax.stop_gradient(eigenvalue_moduli), axis=-1)

@@ -121,8 +121,8 @@ class TestFunctionCurve(AbstractContinuationProblem):
         )
 
     def is_admissible(self, args: Any, z: TestFunctionPoint, p: Scalar) -> Bool[Array, ""]:
-        is_inside = (z.fraction >= 0.0) & (z.fraction <= 1.0)
-        return is_inside & self.test_function.is_admissible(
+        is_inside_parameter_range = (z.fraction >= 0.0) & (z.fraction <= 1.0)
+        return is_inside_parameter_range & self.test_function.is_admissible(
             args, z.z, jnp.stack([p, self.second_parameter(z)])
         )
 

@@ -122,13 +122,15 @@ class LimitCycle(AbstractCycle):
 
         On the section before the impact there is a third multiplier, which is zero.
         """
-        attach_function = (
+        attach_derivatives = (
             attach_monodromy_derivatives if is_inside_jit() else _attach_monodromy_compiled
         )
-        attach_to_batch = self._vmap_over_batch_axes(
-            functools.partial(attach_function, self.system)
+        attach_derivatives_to_batch = self._vmap_over_batch_axes(
+            functools.partial(attach_derivatives, self.system)
         )
-        return attach_to_batch(self.monodromy_value, self.parameters, self.collocation_state)
+        return attach_derivatives_to_batch(
+            self.monodromy_value, self.parameters, self.collocation_state
+        )
 
     @property
     def jury_margins(self) -> Array:
@@ -161,9 +163,11 @@ class LimitCycle(AbstractCycle):
 
         See `margin_defaults`.
         """
-        compute_acceleration = functools.partial(_compute_takeoff_acceleration, self.system)
+        compute_least_takeoff_acceleration = functools.partial(
+            _compute_takeoff_acceleration, self.system
+        )
         return self._zero_without_gait(
-            self._vmap_over_batch_axes(compute_acceleration)(
+            self._vmap_over_batch_axes(compute_least_takeoff_acceleration)(
                 self.parameters, self.collocation_state
             )
         )
@@ -220,11 +224,11 @@ class LimitCycle(AbstractCycle):
     def margins(self) -> Margins:
         """Return the margins over the first step, computed by one event-driven step."""
 
-        def compute_margins(parameters: Array, section_state: Array) -> Margins:
+        def compute_step_margins(parameters: Array, section_state: Array) -> Margins:
             wheel = wheel_from_parameters(parameters, self.system.n_legs)
             return step(wheel, section_state, model=self.model).margins
 
-        return self._vmap_over_batch_axes(compute_margins)(self.parameters, self.section_state)
+        return self._vmap_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
 
     @property
     def ending(self) -> Any:

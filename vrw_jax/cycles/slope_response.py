@@ -125,9 +125,9 @@ def invert_by_elimination(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         pivot_candidates = jnp.where(
             jnp.arange(n) >= column_index, jnp.abs(augmented_matrix[:, column_index]), -1.0
         )
-        pivot_index = jnp.argmax(pivot_candidates)
-        pivot_row, replaced_row = augmented_matrix[pivot_index], augmented_matrix[column_index]
-        augmented_matrix = augmented_matrix.at[pivot_index].set(replaced_row)
+        pivot_row_index = jnp.argmax(pivot_candidates)
+        pivot_row, replaced_row = augmented_matrix[pivot_row_index], augmented_matrix[column_index]
+        augmented_matrix = augmented_matrix.at[pivot_row_index].set(replaced_row)
         pivot_row = pivot_row / pivot_row[column_index]
         eliminated_matrix = augmented_matrix - augmented_matrix[:, column_index, None] * pivot_row
         return eliminated_matrix.at[column_index].set(pivot_row)

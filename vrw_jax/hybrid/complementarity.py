@@ -78,12 +78,14 @@ def enumerate_lcp_solutions(
             is_closed, jnp.linalg.solve(linear_system, jnp.where(is_closed, -free_gap, 0.0)), 0.0
         )
         contact_gaps = jnp.where(is_closed, 0.0, matrix @ contact_forces + free_gap)
-        has_valid_forces = jnp.all(contact_forces >= -tolerance * jnp.max(jnp.abs(contact_forces)))
-        has_valid_gaps = jnp.all(
+        are_forces_nonnegative = jnp.all(
+            contact_forces >= -tolerance * jnp.max(jnp.abs(contact_forces))
+        )
+        are_gaps_nonnegative = jnp.all(
             contact_gaps
             >= -tolerance * (jnp.max(jnp.abs(contact_gaps)) + jnp.max(jnp.abs(free_gap)))
         )
-        return contact_forces, has_valid_forces & has_valid_gaps & ~is_singular
+        return contact_forces, are_forces_nonnegative & are_gaps_nonnegative & ~is_singular
 
     candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
     same_solution_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))

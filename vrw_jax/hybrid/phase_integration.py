@@ -322,37 +322,37 @@ def _init_phase_state(
         )
         + zero_time
     )
-    constant_false = is_active & False
-    constant_zero = lax.stop_gradient(zero_time)
+    false_flag = is_active & False
+    zero_number = lax.stop_gradient(zero_time)
     solver_state, controller_state = solver_stepper.init_states(start_state, options)
-    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | constant_false
+    is_crossing = jnp.zeros((monitored_functions.n_guards,), bool) | false_flag
     return _PhaseState(
         purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
         accepted_step=AcceptedPhaseStep(
             zero_time, start_state, solver_state, zero_values, zero_values
         ),
         next_length=zero_time,  # The first step has length zero and evaluates the start.
-        controller_state=jax.tree.map(lambda x: x + constant_zero, controller_state),
+        controller_state=jax.tree.map(lambda x: x + zero_number, controller_state),
         search=_EventSearch(
             is_crossing,
-            constant_zero,
-            constant_zero,
-            constant_zero,
+            zero_number,
+            zero_number,
+            zero_number,
             zero_count,
             zero_count,
-            constant_zero,
+            zero_number,
         ),
         minimum=make_empty_minimum(monitored_functions, start_state),
         refinement=MinimumRefinement(
             zero_count,
             zero_count,
-            constant_zero,
-            constant_zero,
+            zero_number,
+            zero_number,
             zero_values[monitored_functions.n_guards :] + jnp.inf,
         ),
         guard=zero_count - 1,
-        timed_out=constant_false,
-        gave_up=constant_false,
+        timed_out=false_flag,
+        gave_up=false_flag,
         n_tried_steps=zero_count,
     )
 
@@ -568,9 +568,9 @@ def _assess_solver_step(
     following_length = jnp.where(is_starting, options.dt0, next_length)
     following_length = jnp.where(must_retry, length_to_minimum, following_length)
     is_accepted = is_starting | (is_within_tolerance & ~has_crossed & ~must_retry)
-    reached_time = jnp.where(is_accepted, tried_step.time, previous_step.time)
+    end_time = jnp.where(is_accepted, tried_step.time, previous_step.time)
     # The last step ends at the time limit.
-    time_left = lax.stop_gradient(options.max_phase_time - reached_time)
+    time_left = lax.stop_gradient(options.max_phase_time - end_time)
     following_length = jnp.minimum(following_length, time_left)
     event_length_guess = _guess_event_length(
         previous_step, tried_step.values, tried_step.rates, length, n_guards, is_crossing
@@ -710,7 +710,7 @@ def _propose_event_time(
     upper_bound = jnp.where(is_before_event, event_search.upper_bound, lax.stop_gradient(length))
     earliest_proposal = proposed_lengths[guard]
     # A proposal within round-off of a collapsed bracket counts as inside.
-    is_inside = (earliest_proposal >= lower_bound - event_search.time_tolerance) & (
+    is_proposal_inside = (earliest_proposal >= lower_bound - event_search.time_tolerance) & (
         earliest_proposal <= upper_bound + event_search.time_tolerance
     )
     # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
@@ -718,7 +718,7 @@ def _propose_event_time(
     bisected_length = 0.5 * (lower_bound + upper_bound) + (
         finite_proposal - lax.stop_gradient(finite_proposal)
     )
-    next_length = jnp.where(is_inside, finite_proposal, bisected_length)
+    next_length = jnp.where(is_proposal_inside, finite_proposal, bisected_length)
     return _EventProposal(next_length, guard, lower_bound, upper_bound)
 
 

@@ -179,7 +179,7 @@ def _make_class_key(value_type: type, enclosing_ids: frozenset) -> Hashable:
 
 
 def _make_function_key(function: types.FunctionType, enclosing_ids: frozenset) -> Hashable:
-    """Return the function's code, and the keys of all values to which it refers."""
+    """Return the key of a function: its code, and the keys of all values to which it refers."""
     if _is_in_unchanging_package(function.__module__) and not function.__closure__:
         return _IdentityKey(function)
     global_names = {

@@ -12,7 +12,7 @@ from vrw_jax.integrator.integrate import (
 from vrw_jax.integrator.minima import MarginFunctions
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
-    StageAcceleration,
+    StageAccelerations,
     StageState,
     compute_real_stability_limit,
     compute_step_size_factor,

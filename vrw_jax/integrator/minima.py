@@ -199,8 +199,8 @@ def refine_minima(
     """
 
     def refine_margin(_: None, margin_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
-        margin_index, margin_state = margin_inputs
-        q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
+        margin_index, minima_state_of_margin = margin_inputs
+        q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
         minimum_start = StageState(q, v, evaluate_acceleration(q, v))
 
         def selected_margin(state: StageState) -> Array:
@@ -225,11 +225,11 @@ def refine_minima(
                 0.0,
             )
             length = jnp.clip(
-                minimum_search.length + length_correction, 0.0, margin_state.step_length
+                minimum_search.length + length_correction, 0.0, minima_state_of_margin.step_length
             )
             has_converged = (
                 jnp.abs(length - minimum_search.length)
-                <= MINIMUM_LOCATION_TOLERANCE * margin_state.step_length
+                <= MINIMUM_LOCATION_TOLERANCE * minima_state_of_margin.step_length
             )
             has_smaller_rate = jnp.abs(margin_rate) < jnp.abs(minimum_search.best_rate)
             improved_search = _MinimumSearch(
@@ -246,13 +246,13 @@ def refine_minima(
                 minimum_search.is_unresolved, improved_search, minimum_search
             )._replace(n_iterations=minimum_search.n_iterations + 1)
 
-        has_minimum = jnp.isfinite(margin_state.lowest_values)
-        zero_length = jnp.zeros_like(margin_state.step_length)
+        has_minimum = jnp.isfinite(minima_state_of_margin.lowest_values)
+        zero_length = jnp.zeros_like(minima_state_of_margin.step_length)
         n_iterations = jnp.zeros((), jnp.int32)
         minimum_search = _MinimumSearch(
-            margin_state.minimum_offset,
+            minima_state_of_margin.minimum_offset,
             zero_length,
-            margin_state.start_rates,
+            minima_state_of_margin.start_rates,
             zero_length + jnp.inf,
             has_minimum,
             n_iterations,
@@ -300,12 +300,12 @@ def compute_minima_jvp(
     compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
     def compute_margin_tangent(_: None, margin_inputs: tuple) -> tuple[None, Array]:
-        margin_index, margin_state, length = margin_inputs
-        q, v = tuple(margin_state.start_q), tuple(margin_state.start_v)
+        margin_index, minima_state_of_margin, length = margin_inputs
+        q, v = tuple(minima_state_of_margin.start_q), tuple(minima_state_of_margin.start_v)
         minimum_start = StageState(q, v, evaluate_acceleration(q, v))
         rk_step = step_function(minimum_start, length)
         state_tangents = phase_tangents.propagate(
-            tableau, rk_step.stage_states, margin_state.start_tangents, length
+            tableau, rk_step.stage_states, minima_state_of_margin.start_tangents, length
         )
         is_selected = jnp.arange(len(margins.includes_start)) == margin_index
         return None, jnp.sum(

@@ -261,7 +261,7 @@ def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
     return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
 
 
-class StageAcceleration(NamedTuple):
+class StageAccelerations(NamedTuple):
     """Accelerations at one state, with the sine and cosine of theta."""
 
     sin: Array  # sine of theta
@@ -294,7 +294,7 @@ class StageState(NamedTuple):
 
     q: Vector
     v: Vector
-    acceleration: StageAcceleration
+    acceleration: StageAccelerations
 
 
 class RKStep(NamedTuple):
@@ -305,7 +305,7 @@ class RKStep(NamedTuple):
     stage_states: list[StageState]  # the start first, the end last
 
 
-EvaluateAcceleration = Callable[[Vector, Vector], StageAcceleration]
+EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
 TakeStep = Callable[[StageState, Array], RKStep]
 
 
@@ -362,19 +362,23 @@ def evaluate_stage(
         coordinate_accelerations = [
             stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
         ]
-        double_sum = _weighted_sum(tableau.matrix_squared[stage_index], coordinate_accelerations)
-        single_sum = _weighted_sum(tableau.matrix[stage_index], coordinate_accelerations)
+        twice_integrated_acceleration = _weighted_sum(
+            tableau.matrix_squared[stage_index], coordinate_accelerations
+        )
+        integrated_acceleration = _weighted_sum(
+            tableau.matrix[stage_index], coordinate_accelerations
+        )
         displacement_at_constant_rate = float(tableau.nodes[stage_index]) * v0[coordinate]
         stage_positions.append(
             q0[coordinate]
             + h
             * (
                 displacement_at_constant_rate
-                if double_sum is None
-                else displacement_at_constant_rate + h * double_sum
+                if twice_integrated_acceleration is None
+                else displacement_at_constant_rate + h * twice_integrated_acceleration
             )
         )
-        stage_rates.append(v0[coordinate] + h * single_sum)
+        stage_rates.append(v0[coordinate] + h * integrated_acceleration)
     return tuple(stage_positions), tuple(stage_rates)
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Array
 
 from vrw_jax.integrator.tableaus import (
     ButcherTableau,
-    StageAcceleration,
+    StageAccelerations,
     StageState,
     evaluate_stage,
 )
@@ -34,7 +34,7 @@ from vrw_jax.runtime import with_default_settings
 
 
 class ImplicitDynamics(NamedTuple):
-    """Equations of motion near a state whose accelerations are known."""
+    """Equations of motion near a state with known accelerations, in implicit form."""
 
     residual: Callable[[StageState], Vector]
     """Function that returns the left side minus the right side of the equations at the state's
@@ -241,7 +241,7 @@ def _unpack_state(packed_state: Array) -> StageState:
     """Return the state from its array, the inverse of `_pack_state`."""
     n = (len(packed_state) - 2) // 3
     components = tuple(packed_state)
-    acceleration = StageAcceleration(
+    acceleration = StageAccelerations(
         components[2 * n], components[2 * n + 1], components[2 * n + 2 :]
     )
     return StageState(components[:n], components[n : 2 * n], acceleration)
@@ -260,7 +260,7 @@ def _compute_acceleration_tangent(
     sin, cos, acceleration = state.acceleration
     zero_accelerations = tuple(jnp.zeros_like(x) for x in acceleration)
     state_tangent = StageState(
-        dq, dv, StageAcceleration(cos * dq[0], -sin * dq[0], zero_accelerations)
+        dq, dv, StageAccelerations(cos * dq[0], -sin * dq[0], zero_accelerations)
     )
     _, residual_tangent = jax.jvp(dynamics.residual, (state,), (state_tangent,))
     return tuple(_solve_acceleration(dynamics, state, residual_tangent))

@@ -21,7 +21,7 @@ from vrw_jax.integrator import (
     ButcherTableau,
     ImplicitDynamics,
     MarginFunctions,
-    StageAcceleration,
+    StageAccelerations,
     StageState,
     integrate_batch_phase,
     load_explicit_tableau,
@@ -114,9 +114,9 @@ def make_batch_phase(
     - `records_margins`: whether margins are evaluated in addition to guards.
     """
 
-    def evaluate_acceleration(q: Vector, v: Vector) -> StageAcceleration:
+    def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
         sin, cos = sine_cosine(q[0])
-        return StageAcceleration(
+        return StageAccelerations(
             sin, cos, phase.acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
         )
 

@@ -30,7 +30,7 @@ def unbatch(function: BatchFunction) -> BatchFunction:
 
     @batched_function.def_vmap
     @with_default_settings
-    def merge_axis(axis_size: int, is_batched_tree: PyTree, *arrays: PyTree) -> tuple:
+    def merge_axis(axis_size: int, is_batched_by_argument: PyTree, *arrays: PyTree) -> tuple:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
 
         def merge_into_lanes(x: Array, is_batched: bool) -> Array:
@@ -44,7 +44,7 @@ def unbatch(function: BatchFunction) -> BatchFunction:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
         batched_outputs = batched_function(
-            *jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_tree))
+            *jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_by_argument))
         )
         return jax.tree.map(split_lanes, batched_outputs), jax.tree.map(
             lambda _: True, batched_outputs

@@ -258,8 +258,8 @@ def required_friction(force: FootForce) -> Elementwise:
     force.
     """
     is_loaded = force.normal > 0.0
-    force_ratio = jnp.abs(force.tangential) / jnp.where(is_loaded, force.normal, 1.0)
-    return jnp.where(is_loaded, force_ratio, 0.0)
+    friction_ratio = jnp.abs(force.tangential) / jnp.where(is_loaded, force.normal, 1.0)
+    return jnp.where(is_loaded, friction_ratio, 0.0)
 
 
 def foot_force_from_residual(
