@@ -126,7 +126,13 @@ def count_failure_share(params, slope_sd, n_walkers, n_steps):
 
 
 @pytest.mark.parametrize(
-    ("slope_sd", "damping"), [(0.007, 200.0), (0.01, 200.0), (0.0125, 200.0), (0.015, 150.0)]
+    ("slope_sd", "damping"),
+    [
+        pytest.param(0.007, 200.0, marks=pytest.mark.slow),
+        pytest.param(0.01, 200.0, marks=pytest.mark.slow),
+        (0.0125, 200.0),
+        pytest.param(0.015, 150.0, marks=pytest.mark.slow),
+    ],
 )
 def test_samples_agree_with_a_million_counted_steps(slope_sd, damping):
     params = vrw.WheelParams(damping=damping)
