@@ -133,10 +133,16 @@ SLOW_FUNCTIONS = (
 steps, or a branch of gaits."""
 
 
-def count_over_calls(name: str, n_calls: int, seed: int) -> list[ProcessResources]:
-    """Return the counts after each tenth of the calls of a function."""
+def count_over_calls(
+    name: str, n_calls: int, seed: int, max_batch_size: int
+) -> list[ProcessResources]:
+    """Return the counts after each tenth of the calls of a function.
+
+    - `max_batch_size`: largest batch, also of fast functions.
+    """
     rng, function = np.random.default_rng(seed), BATCH_FUNCTIONS[name]
-    max_batch_size = MAX_SLOW_BATCH_SIZE if name in SLOW_FUNCTIONS else MAX_BATCH_SIZE
+    if name in SLOW_FUNCTIONS:
+        max_batch_size = min(max_batch_size, MAX_SLOW_BATCH_SIZE)
     counts = []
     for i in range(n_calls):
         function(draw_wheels(rng, max_batch_size))
@@ -181,11 +187,14 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=2000, help="calls of each function")
     parser.add_argument("--functions", nargs="+", default=list(BATCH_FUNCTIONS))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--max-batch-size", type=int, default=MAX_BATCH_SIZE)
     chosen = parser.parse_args()
+    if chosen.calls < N_COUNTS:
+        parser.error(f"--calls is {chosen.calls}, but {N_COUNTS} counts need as many calls.")
     vrw.start_jax()
     counts = {}
     for name in chosen.functions:
-        counts[name] = count_over_calls(name, chosen.calls, chosen.seed)
+        counts[name] = count_over_calls(name, chosen.calls, chosen.seed, chosen.max_batch_size)
         growth = "; ".join(find_growth(counts[name])) or "plateau"
         print(f"{name}: {growth} ({counts[name][-1].memory_maps} maps)", flush=True)
     chosen.folder.mkdir(parents=True, exist_ok=True)
