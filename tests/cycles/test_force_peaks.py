@@ -140,6 +140,7 @@ def test_the_table_of_two_peaks_has_the_published_digits(peaks_by_wheel):
         assert abs(measures["force_trough_depth"] - depth) < 0.02, name
 
 
+@pytest.mark.slow  # its program compiles for a minute on a busy machine
 def test_derivatives_are_central_differences(cycles):
     names = tuple(name for name in FORCE_PEAK_MEASURES if not name.startswith("n_"))
     cycle = cycles["two peaks"]
