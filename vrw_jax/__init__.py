@@ -79,7 +79,7 @@ from vrw_jax.tolerance import (
     multifidelity_mean,
 )
 from vrw_jax.tuning import TuneResult, tune
-from vrw_jax.validation import RENAMED_IN_PACKAGE, describe_renamed, suggest_name
+from vrw_jax.validation import RENAMED_PACKAGE_NAMES, describe_renamed_attribute, suggest_name
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, ParameterSet, WheelParams, parameter_sets
 
@@ -172,7 +172,7 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
-    if sentence := describe_renamed("vrw_jax", name, RENAMED_IN_PACKAGE):
+    if sentence := describe_renamed_attribute("vrw_jax", name, RENAMED_PACKAGE_NAMES):
         raise AttributeError(sentence)
     raise AttributeError(
         f"vrw_jax has no {name!r}{suggest_name(name, __all__)}: dir(vrw_jax) lists what it has."

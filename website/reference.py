@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from vrw_jax.cli.config import (
-    RANDOM_DESIGNS,
+    RANDOM_DESIGN_FUNCTIONS,
     BranchConfig,
     GaitConfig,
     ScanConfig,
@@ -30,7 +30,7 @@ from vrw_jax.measures.table import (
 from vrw_jax.numerics import StepOptions
 from vrw_jax.printing import format_markdown_table
 from vrw_jax.scans import design as designs
-from vrw_jax.selection import find_model_class, list_config_names
+from vrw_jax.selection import find_model_class, list_model_config_names
 from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
 
 FIELD = re.compile(r"^ *- ((?:`\w+`(?:, )?)+): (.*(?:\n +[^ -].*)*)", re.MULTILINE)
@@ -59,7 +59,7 @@ def toml_page() -> str:
     wheel.append(("`n_legs`", "8", "", "5 and more", "number of legs, a whole number"))
     lines += format_markdown_table(("key", "default", "unit", "allowed", "meaning"), wheel)
     lines += _section("model", "This table contains the model and its settings.")
-    model_names = list_config_names()
+    model_names = list_model_config_names()
     choices = ", ".join(f'`"{name}"`' for name in model_names)
     rows = [("`name`", "", '`"viscoelastic"`', f"one of {choices}")]
     for model_name in model_names:
@@ -75,7 +75,7 @@ def toml_page() -> str:
         )
     lines += _section("grid", _first_line(designs.grid), *_GRID)
     lines += _section("samples", _first_line(designs.samples), *_SAMPLES)
-    for name, design in RANDOM_DESIGNS.items():
+    for name, design in RANDOM_DESIGN_FUNCTIONS.items():
         lines += _section(name, _first_line(design), *_DRAWN_KEYS)
     return "\n".join(lines) + "\n"
 

@@ -20,8 +20,8 @@ from experiments.shared.tables import (
     read_table,
     replace_block,
 )
-from vrw_jax.figures import PAGE_WIDTH_INCHES, figure_style, save
-from vrw_jax.figures.style import OUTCOME_STYLES
+from vrw_jax.figures import PAGE_FIGURE_WIDTH_INCHES, figure_style, save
+from vrw_jax.figures.style import OUTCOME_LABELS_AND_COLORS
 from vrw_jax.wheel import Outcome
 
 STYLES = {  # of Okabe and Ito, a marker each
@@ -44,7 +44,7 @@ FAST_MODE_RATIO = 1.03  # rate of SLS-I's fast mode over c/m, docs/explanation/p
 
 def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
     """Time, work and error over stiffness; crosses where a method gave up or stepped otherwise."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 7.4))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 7.4))
     grid = figure.subplots(3, 2, sharex="col", sharey="row")
     for column, axis in enumerate(AXES):
         for method, (colour, marker) in STYLES.items():
@@ -80,7 +80,7 @@ def stiffness(rows: list[Row], limit: Callable[[str], float]) -> Figure:
 def borders(rows: list[Row]) -> Figure:
     """Error of derivatives and values over the distance to a border."""
     names = list(dict.fromkeys(row["border"] for row in rows))
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, len(names), sharey=True)
     for axes, name in zip(grid, names, strict=True):
         selection = [row for row in rows if row["border"] == name]
@@ -117,7 +117,7 @@ def draw_over_steps(
     rows: list[Row], key: str, label: str, shown_values: dict[str, str], height: float
 ) -> tuple[Figure, Axes]:
     """Draw a panel over the number of steps for each column, and return the last panel."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, height))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, height))
     for axes, (y, name) in zip(
         figure.subplots(1, len(shown_values)), shown_values.items(), strict=True
     ):
@@ -151,7 +151,7 @@ def long_walk(rows: list[Row]) -> Figure:
 
 def between(rows: list[Row]) -> Figure:
     """Share of other outcomes, and the times' largest difference, next to borders of outcomes."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 3.4))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.4))
     left_part, right = figure.subplots(1, 2)
     result = summarize_by_border(rows)
     for row in result:
@@ -169,7 +169,7 @@ def between(rows: list[Row]) -> Figure:
 
 def describe_outcome(outcome: str) -> str:
     """Return a short description of the outcome of a step."""
-    return "stepped" if outcome == "STEPPED" else OUTCOME_STYLES[Outcome[outcome]][0]
+    return "stepped" if outcome == "STEPPED" else OUTCOME_LABELS_AND_COLORS[Outcome[outcome]][0]
 
 
 def summarize_by_border(rows: list[Row]) -> list[Row]:
@@ -234,7 +234,7 @@ def limits(rows: list[Row]) -> str:
 
 def first_order(rows: list[Row]) -> Figure:
     """Error and cost of a leg of first order over c/m."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     left_part, right = figure.subplots(1, 2)
     curves(left_part, rows, "leg", "c_over_m", "error", "leg: {}")
     curves(right, rows, "leg", "c_over_m", "us_per_gait")
@@ -246,7 +246,7 @@ def first_order(rows: list[Row]) -> Figure:
 
 def slowing(rows: list[Row]) -> Figure:
     """Period, and error of the period by each method, over the distance to the stop."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     left_part, right = figure.subplots(1, 2)
     x, period, rate = (read_column(rows, name) for name in ("distance", "period_s", "upright_rate"))
     left_part.semilogx(x, period, "o", ms=3.5, color=COLOURS[0], label="gait, by isolated roots")
@@ -275,7 +275,7 @@ def slowing(rows: list[Row]) -> Figure:
 
 def scuffing(rows: list[Row]) -> Figure:
     """Clearance and its derivative, and their errors, where scuffing begins."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     for axes, (value, error, name) in zip(
         figure.subplots(1, 2),
         (
@@ -311,7 +311,7 @@ def growth(rows: list[Row]) -> Figure:
 
 def meeting(rows: list[Row]) -> Figure:
     """Draw errors of derivatives of stability measures over the distance between multipliers."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     grid = figure.subplots(1, 2, sharey=True)
     for axes, (kind, selection) in zip(grid, group_rows(rows, "multipliers").items(), strict=True):
         x = np.abs(read_column(selection, "distance"))
@@ -337,7 +337,7 @@ def meeting(rows: list[Row]) -> Figure:
 
 def modes(rows: list[Row]) -> Figure:
     """Error and cost of a gait's derivative, implicit and through n steps."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     left_part, right = figure.subplots(1, 2)
     walk_rows = [row for row in rows if row["steps"] != "0"]
     curves(left_part, walk_rows, "way", "steps", "median_error")
@@ -355,7 +355,7 @@ def modes(rows: list[Row]) -> Figure:
 
 def formulations(drift: list[Row], penalty: list[Row]) -> Figure:
     """Constraint drift over steps, and a penalty ground's error over its work."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.9))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
     left_part, right = figure.subplots(1, 2)
     for marker, name in zip("os^", dict.fromkeys(row["stabilised"] for row in drift), strict=True):
         selection = [row for row in drift if row["stabilised"] == name]

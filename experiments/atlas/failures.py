@@ -31,7 +31,7 @@ from experiments.shared.tables import (
     write_named_rows,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
-from vrw_jax.figures import PAGE_WIDTH_INCHES as WIDE
+from vrw_jax.figures import PAGE_FIGURE_WIDTH_INCHES as WIDE
 from vrw_jax.figures import figure_style, save
 
 TABLE = FIGURES / "atlas_failures.csv"

@@ -11,7 +11,7 @@ import numpy as np
 import vrw_jax as vrw
 from vrw_jax import Outcome
 from vrw_jax.hybrid import MonitoredFunctions, PhaseEnd, integrate_phase
-from vrw_jax.models.viscoelastic import DiffraxPhase, make_diffrax_phase
+from vrw_jax.models.viscoelastic import DiffraxPhaseFunctions, make_diffrax_phase
 from vrw_jax.wheel import Motion, dynamics, make_phases, transitions
 
 REFERENCE = Path(__file__).parents[2] / "tests" / "reference_code"
@@ -22,7 +22,10 @@ WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
 
 
 def with_damping(
-    phase: DiffraxPhase, start: jax.Array, params: vrw.WheelParams, options: vrw.StepOptions
+    phase: DiffraxPhaseFunctions,
+    start: jax.Array,
+    params: vrw.WheelParams,
+    options: vrw.StepOptions,
 ) -> tuple[PhaseEnd, jax.Array, Motion]:
     """Integrate a phase; return the energy lost in dampers (J, eq. 29) and the last motion too.
 

@@ -13,7 +13,7 @@ import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.figures.style import format_value_label
-from vrw_jax.simulation.basins import compute_end_fractions
+from vrw_jax.simulation.basins import compute_walk_end_fractions
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 ANGULAR_RATES = np.linspace(0.4, 3.2, 57)  # rad/s
@@ -39,7 +39,7 @@ def main() -> None:
         titles.append(", ".join(title_parts))
         print(
             damping,
-            compute_end_fractions(basin_result),
+            compute_walk_end_fractions(basin_result),
             "periods",
             basin_result.orbit_period.values,
         )

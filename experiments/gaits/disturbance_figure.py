@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import figures as plots
-from vrw_jax.figures.style import format_axis_label, label_panel
+from vrw_jax.figures.style import draw_panel_letter, format_axis_label
 
 DAMPING_BOUNDS = (100.0, 219.0)
 N_POINTS = 25
@@ -33,7 +33,7 @@ def main() -> None:
 @plots.figure_style()
 def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure:
     """Return the figure: sizes over the step, and smallest sizes over damping."""
-    figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.7))
+    figure = Figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 2.7))
     profile, branch = figure.subplots(1, 2)
     curves = (
         ("slower", result.backward_sizes, plots.LEG_2_COLOR),
@@ -43,10 +43,12 @@ def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure
         is_in_phase = result.profile_phase_indices == phase
         times = result.profile_times[is_in_phase]
         if phase == 1:
-            profile.axvspan(times[0], times[-1], color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
+            profile.axvspan(
+                times[0], times[-1], color=plots.LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0
+            )
         profile.text(
             float(np.mean(times[[0, -1]])), 1.02, label, ha="center", va="bottom",
-            transform=profile.get_xaxis_transform(), color=plots.DARK_GRAY, fontsize=7.5,
+            transform=profile.get_xaxis_transform(), color=plots.DARK_GRAY_COLOR, fontsize=7.5,
         )  # fmt: skip
         for name, sizes, color in curves:
             text = name if phase == 0 else None
@@ -61,8 +63,8 @@ def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure
     branch.set_xlabel(format_axis_label("damping"))
     branch.set_ylabel("smallest change over the step [rad/s]")
     branch.set_ylim(bottom=0.0)
-    label_panel(profile, "a")
-    label_panel(branch, "b")
+    draw_panel_letter(profile, "a")
+    draw_panel_letter(branch, "b")
     return figure
 
 

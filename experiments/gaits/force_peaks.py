@@ -168,7 +168,7 @@ def draw() -> None:
     rows = read_table(MAP_TABLE)
     panels = list(dict.fromkeys(map(get_panel, rows)))
     figure, axes = plt.subplots(
-        2, 2, figsize=(plots.PAGE_WIDTH_INCHES, 5.6), sharex=True, sharey=True
+        2, 2, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 5.6), sharex=True, sharey=True
     )
     for axis, panel in zip(axes.T.ravel(), panels, strict=True):
         draw_map(axis, select_gaits(rows, panel))
@@ -186,7 +186,7 @@ def draw() -> None:
     labels = {0: "no smooth peak", 1: "one peak", 2: "two peaks", 3: "three peaks"}
     figure.legend(
         handles=[
-            Patch(color=plots.LIGHT_GRAY, label="no gait found"),
+            Patch(color=plots.LIGHT_GRAY_COLOR, label="no gait found"),
             *(Patch(color=PEAK_COLORS[n], label=labels[n]) for n in shown_peaks),
             Line2D([], [], linestyle="none", marker=".", color="black",
                    label="at least one bounce in single support"),
@@ -213,7 +213,7 @@ def draw_map(axis: Axes, gaits: list[Row]) -> None:
         has_bounce[i, j] = has_whole_bounce(row)
     i, j = np.nonzero(has_bounce)
     axis.plot(SLOPES[j], STIFFNESS_NUMBERS[i], ".", color="black", markersize=3)
-    axis.set_facecolor(plots.LIGHT_GRAY)
+    axis.set_facecolor(plots.LIGHT_GRAY_COLOR)
     axis.pcolormesh(SLOPES, STIFFNESS_NUMBERS, n_peaks, shading="nearest",
                     cmap=ListedColormap(list(PEAK_COLORS.values())),
                     vmin=-0.5, vmax=len(PEAK_COLORS) - 0.5, rasterized=True)  # fmt: skip

@@ -18,11 +18,11 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import figures as plots
 from vrw_jax.figures.branch_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
-from vrw_jax.figures.style import draw_marks, format_axis_label
+from vrw_jax.figures.style import draw_markers, format_axis_label
 from vrw_jax.simulation.attractors import (
-    WalkEnds,
+    PeriodicWalkEnds,
     find_distinct_orbits,
-    measure_orbits,
+    measure_orbit_steps,
     walk_until_periodic,
 )
 
@@ -66,7 +66,7 @@ def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figur
     """
     value = orbits.damping.values
     lifts, scuffs = orbits.duration_dls.values == 0.0, orbits.clearance.values < 0.0
-    figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 3.9))
+    figure = Figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.9))
     rates, periods = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
     groups = (
         (~lifts & ~scuffs, "o", plots.LEG_1_COLOR, plots.LEG_1_COLOR, "with DLS"),
@@ -84,7 +84,7 @@ def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figur
         if is_in_group.any():
             size = 2.4 if marker == "o" else 3.4
             x, y = value[is_in_group], orbits.dtheta_post_impact.values[is_in_group]
-            draw_marks(rates, x, y, marker, colour, fill, markersize=size, label=text)
+            draw_markers(rates, x, y, marker, colour, fill, markersize=size, label=text)
     periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
     for axes in (rates, periods):
         axes.axvline(
@@ -95,10 +95,10 @@ def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figur
             zorder=0,
         )
         for left, right in _find_empty_intervals(orbits):
-            axes.axvspan(left, right, color=plots.LIGHT_GRAY, linewidth=0.0, zorder=0)
+            axes.axvspan(left, right, color=plots.LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
     for left, right in _find_empty_intervals(orbits)[-1:]:
         rates.text(0.5 * (left + right), 0.5, "falls", rotation=90, ha="center", va="center",
-                   transform=rates.get_xaxis_transform(), color=plots.DARK_GRAY)  # fmt: skip
+                   transform=rates.get_xaxis_transform(), color=plots.DARK_GRAY_COLOR)  # fmt: skip
     rates.text(special_point_damping, 0.4, " $\\lambda_4^+ = 0$", color=BRANCH_END_COLOR,
                transform=rates.get_xaxis_transform())  # fmt: skip
     rates.set_ylabel("rate after landing, $\\dot\\theta^+$ [rad/s]")
@@ -141,11 +141,13 @@ def compute() -> pd.DataFrame:
     )
     rows = []
     for damping in DAMPINGS:
-        walk_ends = WalkEnds(*(part[dampings == damping] for part in walk_result))
+        walk_ends = PeriodicWalkEnds(*(part[dampings == damping] for part in walk_result))
         failures = [vrw.Outcome(int(c)).name for c in walk_ends.outcome if c != vrw.Outcome.STEPPED]
         orbits = find_distinct_orbits(walk_ends)
-        for index, orbit in enumerate(orbits.orbits):
-            measured_orbit = measure_orbits(vrw.WheelParams(damping=damping), orbit, model, options)
+        for index, orbit in enumerate(orbits.orbit_states):
+            measured_orbit = measure_orbit_steps(
+                vrw.WheelParams(damping=damping), orbit, model, options
+            )
             for k in range(len(orbit)):
                 negative_margins = [
                     name for name in MARGIN_NAMES if measured_orbit[name][k].min() < 0.0
@@ -162,12 +164,12 @@ def compute() -> pd.DataFrame:
                         "lambda_4_plus": measured_orbit["lambda_4_plus"][k],
                         "clearance": min(measured_orbit[name][k] for name in MARGIN_NAMES[:2]),
                         "broken": " ".join(negative_margins),
-                        "share_of_starts": np.mean(orbits.orbit_index == index),
+                        "share_of_starts": np.mean(orbits.orbit_indices == index),
                     }
                 )
         print(
             damping,
-            sorted({len(o) for o in orbits.orbits}),
+            sorted({len(o) for o in orbits.orbit_states}),
             {n: failures.count(n) for n in failures},
         )
     return pd.DataFrame(rows)

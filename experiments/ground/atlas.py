@@ -138,7 +138,7 @@ def draw() -> None:
         "slip": ("slip per step [m]", LogNorm(0.01, 1.0)),
     }
     figure, axes = plt.subplots(
-        2, 3, figsize=(plots.PAGE_WIDTH_INCHES, 4.8), sharex=True, sharey=True
+        2, 3, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 4.8), sharex=True, sharey=True
     )
     corners = [compute_cell_edges(np.array(values)) for values in (DAMPING, FRICTION)]
     for column, (name, (label, norm)) in enumerate(shown_by_name.items()):
@@ -172,7 +172,7 @@ def draw_branches() -> None:
         "slip": "slip per step [m]",
     }
     rows, (c_fold, mu_fold) = read_table(BRANCH_TABLE), read_folds()
-    figure, axes = plt.subplots(1, 3, figsize=(plots.PAGE_WIDTH_INCHES, 2.8), sharex=True)
+    figure, axes = plt.subplots(1, 3, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 2.8), sharex=True)
     colors = plt.get_cmap("viridis")(np.linspace(0.0, 0.85, len(c_fold)))
     for damping, friction_of_fold, color in zip(c_fold, mu_fold, colors, strict=True):
         gaits = [row for row in rows if row["kind"] == "gait" and float(row["damping"]) == damping]

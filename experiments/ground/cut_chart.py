@@ -77,7 +77,7 @@ def compute(wheels: int) -> None:
 
 def draw() -> None:
     """Draw median, 90th percentile and largest error over the tolerance."""
-    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE_WIDTH_INCHES, 2.8))
+    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE_FIGURE_WIDTH_INCHES, 2.8))
     for color, (stoppers, rows) in zip(
         ("#0072B2", "#D55E00"), group_rows(read_table(TABLE), "stoppers").items(), strict=True
     ):

@@ -98,7 +98,7 @@ def draw() -> None:
     figure, axes = plt.subplots(
         len(STARTS),
         len(shown_by_name),
-        figsize=(1.5 * plots.PAGE_WIDTH_INCHES, 4.6),
+        figsize=(1.5 * plots.PAGE_FIGURE_WIDTH_INCHES, 4.6),
         sharex=True,
         sharey=True,
     )

@@ -16,7 +16,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_table, write_table
 from vrw_jax import figures as plots
 from vrw_jax.scans import plan_scan
-from vrw_jax.selection import SELECTION_MARGINS
+from vrw_jax.selection import MODEL_SELECTION_MARGINS
 
 DAMPING = np.linspace(20.0, 400.0, 77)
 FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)
@@ -29,12 +29,14 @@ def compute() -> None:
     """Write the reason of the choice for each wheel and friction."""
     options = vrw.StepOptions(rtol=TOLERANCE, atol=TOLERANCE)
     paper = vrw.scan(vrw.grid(damping=DAMPING), MEASURES[:3], options=options)
-    engine = plan_scan(vrw.grid(damping=DAMPING), MEASURES[:3], options=options).build_engine()
+    engine = plan_scan(vrw.grid(damping=DAMPING), MEASURES[:3], options=options).build_scan_engine()
     paper_gaits = engine({"damping": DAMPING})
     ladder = plan_scan(
         vrw.grid(damping=DAMPING), MEASURES, model="auto", options=options
-    ).build_engine()
-    reasons = [ladder.find_reasons(paper_gaits, np.full(len(DAMPING), mu)) for mu in FRICTION]
+    ).build_scan_engine()
+    reasons = [
+        ladder.find_selection_reasons(paper_gaits, np.full(len(DAMPING), mu)) for mu in FRICTION
+    ]
     rows = [
         [f"{c:g}", mu, int(reason), f"{float(paper.dls_fraction[i]):.6g}"]
         for mu, reasons_of_friction in zip(FRICTION, reasons, strict=True)
@@ -48,13 +50,13 @@ def draw() -> None:
     reason = np.array([int(r["reason"]) for r in read_table(REASON_TABLE)]).reshape(
         len(FRICTION), len(DAMPING)
     )
-    kinds = np.where(reason < 0, 1 + len(SELECTION_MARGINS), reason)
-    margin_labels = SELECTION_MARGINS.values()
+    kinds = np.where(reason < 0, 1 + len(MODEL_SELECTION_MARGINS), reason)
+    margin_labels = MODEL_SELECTION_MARGINS.values()
     labels = ["none: the paper's wheel is accurate", *margin_labels, "no gait of the paper's wheel"]
     shown_kinds = sorted({int(k) for k in kinds.ravel()})
     kind_index = np.vectorize({k: i for i, k in enumerate(shown_kinds)}.get)(kinds)
     figure, axes = plt.subplots(
-        1, 3, figsize=(plots.PAGE_WIDTH_INCHES, 3.1), width_ratios=(1.7, 1.0, 1.0)
+        1, 3, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.1), width_ratios=(1.7, 1.0, 1.0)
     )
     colors = ListedColormap(["#0072B2", "#E69F00", "#009E73", "#D55E00", "#BBBBBB"])
     assert len(shown_kinds) <= colors.N
@@ -70,8 +72,8 @@ def draw() -> None:
     share = np.mean(reason == 0, axis=1)
     ground = {
         "label": "unilateral contact",
-        "color": plots.LIGHT_GRAY,
-        "edgecolor": plots.DARK_GRAY,
+        "color": plots.LIGHT_GRAY_COLOR,
+        "edgecolor": plots.DARK_GRAY_COLOR,
         "lw": 0.4,
     }
     axes[1].bar(positions, 100.0 * share, color=colors(0), label="the paper's wheel")

@@ -194,7 +194,7 @@ def draw_modes() -> None:
     """Draw the time in each pair of contact modes; colors are the front foot, and hatches the rear
     foot."""
     rows = read_table(SCENE_TABLE)
-    figure, axis = plt.subplots(figsize=(plots.PAGE_WIDTH_INCHES, 4.4))
+    figure, axis = plt.subplots(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 4.4))
     bar_start = np.zeros(len(rows))
     for first, color in MODE_COLORS.items():
         for second, hatch in MODE_HATCHES.items():

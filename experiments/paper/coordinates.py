@@ -13,10 +13,10 @@ from matplotlib.patches import Arc
 
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax.figures import (
-    DARK_GRAY,
+    DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    PAGE_WIDTH_INCHES,
+    PAGE_FIGURE_WIDTH_INCHES,
     figure_style,
     save,
 )
@@ -105,12 +105,12 @@ def draw_labels(axes: Axes, instant: Instant) -> None:
                   **{"ha": "center", "va": "center", "fontsize": 10.0} | style)  # fmt: skip
 
     normal, downhill = instant.rotate(0.0, 1.0), instant.rotate(1.0, 0.0)
-    axes.plot(*np.transpose([foot_1, foot_1 + 1.3 * normal]), color=DARK_GRAY, linewidth=0.7,
+    axes.plot(*np.transpose([foot_1, foot_1 + 1.3 * normal]), color=DARK_GRAY_COLOR, linewidth=0.7,
               linestyle=(0, (4, 2)), zorder=2)  # fmt: skip
     write(
         "normal to the slope, $\\theta = 0$",
         foot_1 + 1.38 * normal + 0.1 * downhill,
-        DARK_GRAY,
+        DARK_GRAY_COLOR,
         fontsize=7.5,
     )
     degrees = lambda vector: float(np.degrees(np.arctan2(vector[1], vector[0])))
@@ -120,7 +120,7 @@ def draw_labels(axes: Axes, instant: Instant) -> None:
     middle = np.radians(0.5 * (first + last))
     write(r"$\theta$", foot_1 + 0.72 * np.array([np.cos(middle), np.sin(middle)]))
     write("$\\theta$ is negative here and\ngrows as the wheel rolls downhill",
-          foot_1 + 0.66 * normal + 0.84 * downhill, DARK_GRAY, fontsize=7.5)  # fmt: skip
+          foot_1 + 0.66 * normal + 0.84 * downhill, DARK_GRAY_COLOR, fontsize=7.5)  # fmt: skip
     first, last = sorted((degrees(-leg_1_up), degrees(-leg_2_up)))
     axes.add_patch(Arc(hub, 0.56, 0.56, theta1=first % 360, theta2=last % 360, linewidth=0.9))
     middle = np.radians(0.5 * (first + last))
@@ -141,25 +141,26 @@ def draw_labels(axes: Axes, instant: Instant) -> None:
             offset = 0.11 * vector / np.linalg.norm(vector)
             write(rf"$\lambda_{index}$", foot + vector + offset, fontsize=9.5)
     locked = hub + 0.99 * instant.leg_direction(5)
-    write("Legs 3 to 8:\nlocked on their stoppers", locked + np.array([0.33, 0.13]), DARK_GRAY,
+    write("Legs 3 to 8:\nlocked on their stoppers", locked + np.array([0.33, 0.13]),
+        DARK_GRAY_COLOR,
           fontsize=7.5)  # fmt: skip
     write("$m_H$", hub + np.array([-0.16, 0.19]), fontsize=9.0)
     locked_foot = hub + instant.leg_length(3) * instant.leg_direction(3)
     locked_mass = locked_foot - instant.parameters["leg_com"] * instant.leg_direction(3)
-    write("$m$", locked_mass + 0.13 * normal, DARK_GRAY, fontsize=9.0)
-    write("$a$", 0.5 * (locked_foot + locked_mass) - 0.1 * normal, DARK_GRAY, fontsize=9.0)
+    write("$m$", locked_mass + 0.13 * normal, DARK_GRAY_COLOR, fontsize=9.0)
+    write("$a$", 0.5 * (locked_foot + locked_mass) - 0.1 * normal, DARK_GRAY_COLOR, fontsize=9.0)
 
     corner = foot_1 + instant.rotate(1.2, 0.0)
-    axes.plot([corner[0] - 0.75, corner[0]], [corner[1]] * 2, color=DARK_GRAY, linewidth=0.6)
+    axes.plot([corner[0] - 0.75, corner[0]], [corner[1]] * 2, color=DARK_GRAY_COLOR, linewidth=0.6)
     axes.add_patch(Arc(corner, 1.1, 1.1, theta1=180 - np.degrees(instant.slope), theta2=180,
                        linewidth=0.7))  # fmt: skip
     write(r"$\varphi$", corner + np.array([-0.66, 0.085]), fontsize=9.5)
-    draw_arrow(axes, foot_1 + instant.rotate(0.72, 0.2), 0.4 * downhill, DARK_GRAY)
-    write("downhill", foot_1 + instant.rotate(0.92, 0.31), DARK_GRAY, fontsize=7.5,
+    draw_arrow(axes, foot_1 + instant.rotate(0.72, 0.2), 0.4 * downhill, DARK_GRAY_COLOR)
+    write("downhill", foot_1 + instant.rotate(0.92, 0.31), DARK_GRAY_COLOR, fontsize=7.5,
           rotation=-np.degrees(instant.slope))  # fmt: skip
     gravity = hub + np.array([-1.25, 0.75])
-    draw_arrow(axes, gravity, np.array([0.0, -0.3]), DARK_GRAY)
-    write("$g$", gravity + np.array([0.1, -0.15]), DARK_GRAY)
+    draw_arrow(axes, gravity, np.array([0.0, -0.3]), DARK_GRAY_COLOR)
+    write("$g$", gravity + np.array([0.1, -0.15]), DARK_GRAY_COLOR)
 
 
 def draw_phase(axes: Axes, instant: Instant, caption: tuple[str, str]) -> None:
@@ -173,7 +174,7 @@ def draw_phase(axes: Axes, instant: Instant, caption: tuple[str, str]) -> None:
     frame_axes(axes, instant, 1.28)
     axes.set_title(caption[0], fontsize=9.0, pad=2.0)
     axes.text(0.5, -0.02, caption[1], transform=axes.transAxes, ha="center", va="top",
-              fontsize=6.6, color=DARK_GRAY)  # fmt: skip
+              fontsize=6.6, color=DARK_GRAY_COLOR)  # fmt: skip
 
 
 def frame_axes(axes: Axes, instant: Instant, half_width: float) -> None:
@@ -192,7 +193,7 @@ def draw_coordinates(gait: xr.Dataset) -> Figure:
     middles = [(start + end) // 2 for start, end in zip(starts, ends, strict=True)]
     indices = (starts[0], middles[0], middles[1], starts[2], ends[2])
     with figure_style():
-        figure = Figure(figsize=(PAGE_WIDTH_INCHES, 5.9))
+        figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 5.9))
         grid = figure.add_gridspec(2, 5, height_ratios=[3.0, 1.0])
         main_axes = figure.add_subplot(grid[0, :])
         instant = Instant(gait, middles[0] // 3)

@@ -16,7 +16,7 @@ from matplotlib.patches import FancyBboxPatch, Polygon
 
 from experiments.shared.command import make_parser
 from tests.support.package_graph import PACKAGE_LAYERS, ImportGraph
-from vrw_jax.figures import DARK_GRAY, PAGE_WIDTH_INCHES, figure_style, save
+from vrw_jax.figures import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 ROOT = Path(__file__).parents[2]
 STEP, WIDTH, HEIGHT = 1.0, 4.3, 0.74
@@ -38,7 +38,10 @@ def draw_architecture(import_graph: ImportGraph) -> Figure:
     size = len(packages)
     with figure_style():
         figure = Figure(
-            figsize=(PAGE_WIDTH_INCHES, PAGE_WIDTH_INCHES * (size + 0.5) / (size + WIDTH))
+            figsize=(
+                PAGE_FIGURE_WIDTH_INCHES,
+                PAGE_FIGURE_WIDTH_INCHES * (size + 0.5) / (size + WIDTH),
+            )
         )
         axes = figure.add_subplot(xlim=(-0.2, size + WIDTH - 0.9), ylim=(size - 0.5, -0.8))
         axes.set_aspect("equal")
@@ -90,16 +93,16 @@ def _box(axes: Axes, row: int, import_graph: ImportGraph, package: str) -> None:
     corner = (float(row), row - HEIGHT / 2)
     axes.add_patch(
         FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle="round,pad=0,rounding_size=0.12",
-                       facecolor="white", edgecolor=DARK_GRAY, linewidth=0.7, zorder=3)
+                       facecolor="white", edgecolor=DARK_GRAY_COLOR, linewidth=0.7, zorder=3)
     )  # fmt: skip
     axes.text(row + 0.15, row, package, va="center", weight="bold", fontsize=8.0, zorder=4)
     size = f"{len(modules)} files\n{lines:,} lines"
     axes.text(row + WIDTH - 0.12, row, size, va="center", ha="right", fontsize=6.0,
-              color=DARK_GRAY, linespacing=1.05, zorder=4)  # fmt: skip
+              color=DARK_GRAY_COLOR, linespacing=1.05, zorder=4)  # fmt: skip
 
 
 def _count(axes: Axes, x: float, y: float, count: int) -> None:
-    axes.scatter([x], [y], s=62, color="white", edgecolor=DARK_GRAY, linewidth=0.4, zorder=3)
+    axes.scatter([x], [y], s=62, color="white", edgecolor=DARK_GRAY_COLOR, linewidth=0.4, zorder=3)
     axes.text(x, y + 0.02, str(count), ha="center", va="center", fontsize=5.2, zorder=4)
 
 
@@ -121,10 +124,10 @@ def _legend(axes: Axes, import_graph: ImportGraph) -> None:
         ]
         x = rows[-1] + WIDTH + 0.2
         top, bottom = rows[0] - HEIGHT / 2, rows[-1] + HEIGHT / 2
-        axes.plot([x - 0.1, x, x, x - 0.1], [top, top, bottom, bottom], color=DARK_GRAY,
+        axes.plot([x - 0.1, x, x, x - 0.1], [top, top, bottom, bottom], color=DARK_GRAY_COLOR,
                   linewidth=0.7)  # fmt: skip
         axes.text(x + 0.15, (top + bottom) / 2, "do not import\neach other", va="center",
-                  fontsize=7.0, color=DARK_GRAY)  # fmt: skip
+                  fontsize=7.0, color=DARK_GRAY_COLOR)  # fmt: skip
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from experiments.shared.tables import (
     write_named_rows,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
-from vrw_jax.runtime.start import fusion_emitter_options
+from vrw_jax.runtime.start import make_fusion_emitter_options
 
 LANES, REPEATS = 256, 10
 Program = tuple[Callable, tuple]
@@ -64,7 +64,7 @@ def measure_program(function: Callable, arguments: tuple) -> dict[str, float]:
     row, compiled = {"trace_s": time.process_time() - began}, {}
     for method_name, is_active in (("with", True), ("without", False)):
         began = time.process_time()
-        compiled[method_name] = lowered.compile(fusion_emitter_options(is_active))
+        compiled[method_name] = lowered.compile(make_fusion_emitter_options(is_active))
         row[f"compile_{method_name}_s"] = time.process_time() - began
         jax.block_until_ready(compiled[method_name](*arguments))
         row[f"run_{method_name}_ms"] = float("inf")

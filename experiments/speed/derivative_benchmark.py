@@ -171,7 +171,7 @@ def compare_with_others(n: int, repeats: int) -> list[dict]:
 def draw_chart(table: list[dict]) -> None:
     """Draw speed over error."""
     with plots.figure_style():
-        figure, axes = plt.subplots(figsize=(plots.PAGE_WIDTH_INCHES, 3.6))
+        figure, axes = plt.subplots(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.6))
         known_as = ("lane engine", "heyoka", "numba", "diffrax engine")
         for label, known_values, marker in zip(LABELS, known_as, "osD^", strict=True):
             sorted_items = sorted(

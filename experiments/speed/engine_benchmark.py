@@ -36,7 +36,7 @@ from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
 from vrw_jax import figures as plots
-from vrw_jax.batches.batch_steps import sort_by_work
+from vrw_jax.batches.batch_steps import sort_wheels_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {
@@ -101,7 +101,7 @@ def by_peer(function, side_by_side=False):
         back = slice(None)
         if side_by_side:
             columns = [np.asarray(getattr(params, name)) for name in PARAMETER_NAMES]
-            order = sort_by_work(columns, states)
+            order = sort_wheels_by_work(columns, states)
             params, states, back = make_wheels(rows[order]), states[order], np.argsort(order)
         landing = transitions.land(params.symbols(), *np.asarray(states).T)
         starts = np.asarray(np.stack([landing.theta, landing.motion.dtheta], 1))
@@ -265,7 +265,7 @@ def redraw(figures):
 
 def draw_charts(table, shares, cost):
     """Draw speed over error of every engine, and cost over the share of lanes that fall back."""
-    figure, (left_part, right) = plt.subplots(1, 2, figsize=(plots.PAGE_WIDTH_INCHES, 3.9))
+    figure, (left_part, right) = plt.subplots(1, 2, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.9))
     markers = dict(zip(("Tsit5", "Dopri5", "Dopri8"), "os^", strict=True))
     colours = {
         name: COLOURS[known_values] for name, known_values in zip(LABELS, KNOWN_AS, strict=True)

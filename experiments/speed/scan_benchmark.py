@@ -143,7 +143,7 @@ def draw(rows: list[Any]) -> None:
         rows[1:],
     )  # The first process compiles, and its time is not part of the trend.
     with plots.figure_style():
-        figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.6))
+        figure = Figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 2.6))
         left_part, right = figure.subplots(1, 2)
         left_part.set(xscale="log", yscale="log", xlabel="samples", ylabel="time [s]")
         right.set(xscale="log", xlabel="samples", ylabel="peak memory [MiB]", ylim=(0, 2300))
@@ -158,7 +158,7 @@ def draw(rows: list[Any]) -> None:
             first = [(float(r["samples"]), float(r[key])) for r in cold]
             text = f"{label}, with compiling"
             axes.plot(*zip(*first, strict=True), mark, color=colour, mfc="white", ms=4, label=text)
-        right.axhline(2048, color=plots.DARK_GRAY, linestyle=":", label="aimed at, at most")
+        right.axhline(2048, color=plots.DARK_GRAY_COLOR, linestyle=":", label="aimed at, at most")
         for axes in (left_part, right):
             axes.legend(fontsize=7)
     plots.save(figure, FIGURES, "scan_benchmark")
@@ -167,11 +167,11 @@ def draw(rows: list[Any]) -> None:
 def compare(size: int) -> None:
     """Compute some chunks again, and require the stored bits."""
     of_values = make_plan(size)
-    stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of_values.build_engine()
+    stored, engine = vrw.open_scan(STORES / f"{size}.zarr"), of_values.build_scan_engine()
     assert np.all(stored.outcome.values >= 0), "samples are missing"
-    for index in np.linspace(0, of_values.layout.n_chunks - 1, N_CHECKED_CHUNKS).astype(int):
-        region = of_values.layout.chunk_region(int(index))
-        for name, values in engine(of_values.design.sample_block(region)).items():
+    for index in np.linspace(0, of_values.result_layout.n_chunks - 1, N_CHECKED_CHUNKS).astype(int):
+        region = of_values.result_layout.get_chunk_region(int(index))
+        for name, values in engine(of_values.design.select_samples(region)).items():
             values_there = stored[name][region].values
             np.testing.assert_array_equal(values.reshape(values_there.shape), values_there, name)
     print(f"{N_CHECKED_CHUNKS} chunks of {size:,} samples computed again: bitwise the stored ones")

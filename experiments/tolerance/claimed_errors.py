@@ -247,7 +247,7 @@ def count_results() -> None:
 def draw() -> None:
     cloud = dict(np.load(CLOUD))
     with plots.figure_style():
-        page = plt.figure(figsize=(plots.PAGE_WIDTH_INCHES, 5.6))
+        page = plt.figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 5.6))
         top, below = page.subfigures(2, 1)
         axis, cost = top.subplots(1, 2)
         ends = np.array([1e-13, 1e0])
@@ -277,7 +277,7 @@ def draw() -> None:
             cost.plot(TOLERANCES, [np.nanmean(cloud["n_steps"][i]) for i in values_here], "o-",
             ms=3,
                       color=colour, label=name)  # fmt: skip
-        cost.axhline(1.0, color=plots.DARK_GRAY, lw=0.6)
+        cost.axhline(1.0, color=plots.DARK_GRAY_COLOR, lw=0.6)
         cost.set(
             xscale="log", yscale="log", xlabel="tolerance", ylabel="steps with unilateral contact"
         )

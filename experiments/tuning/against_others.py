@@ -39,7 +39,7 @@ from vrw_jax import figures as plots
 from vrw_jax.cli.config import load_config
 from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.tuning import tune
-from vrw_jax.tuning.objective import scale_slacks
+from vrw_jax.tuning.objective import compute_slack_scales
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem
 from vrw_jax.wheel import wheel_from_parameters
 
@@ -88,7 +88,7 @@ class Counter:
         if len(self.objective) >= self.allowed:
             raise SpentError
         u = np.clip(u, 0.0, 1.0)
-        solution, values = self._values(jnp.asarray(self._problem.denormalize(u)))
+        solution, values = self._values(jnp.asarray(self._problem.denormalize_parameters(u)))
         values = np.asarray(values)
         slack = (values[1:] - self._problem.min_constraint_values) / self._scales
         if not bool(solution):
@@ -109,7 +109,7 @@ class Counter:
 
 def values_of(problem: TuneProblem) -> Callable:
     """Return a compiled function: whether there is a gait, the objective and the constraints."""
-    target_values, finder = problem.objective_and_constraints, problem.finder
+    target_values, finder = problem.objective_and_constraints, problem.gait_finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
         wheel = wheel_from_parameters(parameters, problem.params.n_legs)
@@ -174,8 +174,14 @@ def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> MethodHi
     tuned = tune(
         problem.make_wheel(u),
         problem.objective_and_constraints.objective,
-        problem.free,
-        dict(zip(problem.free, zip(problem.lower, problem.upper, strict=True), strict=True)),
+        problem.free_parameters,
+        dict(
+            zip(
+                problem.free_parameters,
+                zip(problem.lower_bounds, problem.upper_bounds, strict=True),
+                strict=True,
+            )
+        ),
         problem.margins,
         max_evaluations=MAX_EVALUATIONS,
     )
@@ -206,8 +212,8 @@ def starts_of(problem: TuneProblem, values: Callable, n: int) -> list[np.ndarray
     generator = np.random.default_rng(SEED)
     starts: list[np.ndarray] = []
     while len(starts) < n:
-        u = generator.uniform(size=len(problem.free))
-        if bool(values(jnp.asarray(problem.denormalize(u)))[0]):
+        u = generator.uniform(size=len(problem.free_parameters))
+        if bool(values(jnp.asarray(problem.denormalize_parameters(u)))[0]):
             starts.append(u)
     return starts
 
@@ -221,7 +227,7 @@ def grid_around(problem: TuneProblem, values: Callable, u: np.ndarray, best: flo
             place = u + np.array(offset)
             if place.min() < 0.0 or place.max() > 1.0:
                 continue
-            solution, result = values(jnp.asarray(problem.denormalize(place)))
+            solution, result = values(jnp.asarray(problem.denormalize_parameters(place)))
             checked += 1
             if bool(solution) and np.all(np.asarray(result)[1:] >= problem.min_constraint_values):
                 retained += 1
@@ -234,7 +240,7 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
     starts = starts_of(problem, values, n_starts)
     # Violations are scaled by the change of each constraint over the box, at the config's wheel.
     first = problem.evaluate_start()
-    scales = scale_slacks(first.slack, first.slack_jacobian)
+    scales = compute_slack_scales(first.constraint_slacks, first.slack_jacobian)
     observed_values: dict[str, list[MethodHistory]] = {
         "tune": [by_tune(problem, u, scales) for u in starts]
     }
@@ -269,7 +275,7 @@ def compare_methods(problem: TuneProblem, n_starts: int, rows: list[dict], name:
 def draw_chart(results: dict[str, dict]) -> Figure:
     """Draw the gap to the best known objective over the number of gaits: median and quartiles."""
     with plots.figure_style():
-        figure = Figure(figsize=(plots.PAGE_WIDTH_INCHES, 2.9))
+        figure = Figure(figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 2.9))
         panels = figure.subplots(1, len(results), sharey=True)
         for axes, (name, result) in zip(panels, results.items(), strict=True):
             for (method, curves), dash in zip(result["curves"].items(), DASHES, strict=True):
@@ -332,12 +338,15 @@ def main() -> None:
         tuned = tune(
             problem.params,
             target_values.objective,
-            problem.free,
+            problem.free_parameters,
             target_values.bounds,
             target_values.constraints,
         )
-        u = np.array([float(getattr(tuned.params, n)) for n in problem.free]) - problem.lower
-        u = u / problem.widths
+        u = (
+            np.array([float(getattr(tuned.params, n)) for n in problem.free_parameters])
+            - problem.lower_bounds
+        )
+        u = u / problem.bound_widths
         print(f"\n{name}: best known {result['best']:.9g}\n{tuned}")
         print("grid around it:", grid_around(problem, result["values"], u, tuned.value))
     write_named_rows(folder / "tuning_against_others.csv", rows)

@@ -38,7 +38,7 @@ from vrw_jax.measures import (
     STOPPER_MARGIN_MEASURES,
     UNILATERAL_STEP_MEASURES,
 )
-from vrw_jax.models import PAPER_START, DoubleSupportIndicators, EnergyLoss
+from vrw_jax.models import PAPER_START_STATE, DoubleSupportIndicators, EnergyLoss
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parents[2]
@@ -168,7 +168,7 @@ def facts() -> dict[str, Any]:
             }
             for name, span in SLIDERS.items()
         },
-        "start": list(PAPER_START),
+        "start": list(PAPER_START_STATE),
         "legs": list(LEGS),
         "rungs": RUNGS,
         "samples": SAMPLES,

@@ -30,7 +30,7 @@ from vrw_jax.models import (
     take_gait_step,
 )
 from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
-from vrw_jax.models.phase_sequence import evaluate_states, make_step_result
+from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
 from vrw_jax.numerics import StepOptions, sine_cosine
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_from_parameters
@@ -40,7 +40,7 @@ LEGS = (6, 8, 10)
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-UNSPLIT_LIMITS = simd.RegisterLimits(max_unrolled=64)
+UNSPLIT_LIMITS = simd.RegisterLimits(max_unrolled_entries=64)
 """Limits with which small arrays stay whole in a walk with unilateral contact: for ten legs the
 code is five times as long otherwise."""
 
@@ -52,7 +52,7 @@ class Program(NamedTuple):
 
     function: Callable[..., tuple]
     numbers: int
-    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS
+    limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS
     section: int = 3
 
     def object(self, name: str) -> bytes:
@@ -128,7 +128,9 @@ def programs(n_legs: int) -> dict[str, Program]:
             known_values = sample_batch_phase(
                 flow, load_explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
             )
-            motion.append(jnp.concatenate(evaluate_states(phase, jnp.moveaxis(known_values, 1, 0))))
+            motion.append(
+                jnp.concatenate(evaluate_phase_states(phase, jnp.moveaxis(known_values, 1, 0)))
+            )
         codes = jnp.stack([step.outcome, step.solver_steps]).astype(jnp.int32)
         return _numbers_of(step), codes, *motion
 
@@ -288,7 +290,9 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         share = jnp.arange(SAMPLES)[:, None] * (1.0 / (SAMPLES - 1))
         roll = RollingMotion(params.symbols(), params.slope, step.post_impact[1])
         theta = half * (2.0 * share - 1.0) + 0.0 * x[0]
-        rows = jnp.concatenate([*roll.evaluate_states(theta), roll.time_at_angle(theta)[None]])
+        rows = jnp.concatenate(
+            [*roll.evaluate_states_at_angles(theta), roll.compute_time_to_angle(theta)[None]]
+        )
         codes = jnp.stack([step.outcome, step.solver_steps])
         return _numbers_of(step), codes, rows
 

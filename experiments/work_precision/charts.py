@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.shared.tables import DOCS, FIGURES, Row, format_markdown, replace_block
-from vrw_jax.figures import PAGE_WIDTH_INCHES, figure_style, save
+from vrw_jax.figures import PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 QUANTITIES = {  # group and title of each panel
     "post_impact": ("step", "state after the next landing"),
@@ -156,7 +156,7 @@ def draw_panel(axes: Axes, rows: list[Row], quantity: str, x_of) -> None:
 
 def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure:
     """Draw one panel for each quantity, with one legend for all."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.2))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.2))
     grid = figure.subplots(1, len(quantities), sharey=True)
     for quantity, axes in zip(quantities, grid, strict=True):
         draw_panel(axes, rows, quantity, x_of)
@@ -174,7 +174,7 @@ def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure
 
 def batch_chart(rows: list[Row], every: list[Row]) -> Figure:
     """Time per gait over the batch, and the first call beside a warm one."""
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.4))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.4))
     left_part, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     unit = unit_of(every)
     result: dict[str, list[Row]] = {}

@@ -17,7 +17,7 @@ import vrw_jax as vrw
 from vrw_jax import Outcome, simd
 from vrw_jax.batches import batch_steps as lane_batch
 from vrw_jax.batches import programs
-from vrw_jax.batches.stiffness import select_solver
+from vrw_jax.batches.stiffness import select_cheapest_solver
 from vrw_jax.integrator.integrate import BatchPhase, integrate_batch_phase
 from vrw_jax.integrator.tableaus import (
     StageAccelerations,
@@ -153,7 +153,7 @@ def test_lanes_of_similar_cost_are_grouped():
     states = TABLE_1_SECTION_STATE * draw(0.95, 1.05, (n, 3))
     tried = np.asarray(vrw.step_batch(reference_values.make_wheels(vectors), states).solver_steps)
     waits = lambda order: tried[order].reshape(-1, 8).max(1).mean() / tried.mean() - 1.0
-    ours = waits(lane_batch.sort_by_work(list(vectors.T), states))
+    ours = waits(lane_batch.sort_wheels_by_work(list(vectors.T), states))
     assert ours < 0.5 * waits(np.arange(n))
     assert ours < 0.8 * waits(np.argsort(vectors[:, NAMES.index("damping")]))
 
@@ -164,7 +164,7 @@ def test_invalid_wheels_have_a_position_in_that_order():
         np.tile(TABLE_1_SECTION_STATE, (5, 1)),
     )
     states[:, 1] = [1.6, 1e300, np.inf, -1.0, 0.0]
-    order = lane_batch.sort_by_work(list(vectors.T), states)
+    order = lane_batch.sort_wheels_by_work(list(vectors.T), states)
     np.testing.assert_array_equal(np.sort(order), np.arange(5))
 
 
@@ -176,14 +176,14 @@ COARSE_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60, rtol=1e-4,
 def test_xla_blocks_agree_with_machine_code(monkeypatch):
     vectors, states = draw_hard_starts(300)
     solution, codes = compute_values(vectors, states, COARSE_OPTIONS)
-    monkeypatch.setattr(simd, "is_available", lambda: False)
+    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
     monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
-    monkeypatch.setattr(programs, "STRAGGLER_DIVISOR", 10**9)  # no block stops early
+    monkeypatch.setattr(programs, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
     patient, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, solution, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(programs, "STRAGGLER_DIVISOR", 2)  # stragglers run again
+    monkeypatch.setattr(programs, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
     second_result, code = compute_values(vectors, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(second_result, patient)
     np.testing.assert_array_equal(code, codes)
@@ -434,10 +434,10 @@ def make_stiff_wheels(rates):
 def test_each_wheel_uses_the_cheapest_solver():
     wheels = make_stiff_wheels([200.0, 1e3, 1e4, 1e5, 3e5, 1e6, np.nan]).T
     named, stable, implicit = range(3)
-    choice = lambda **options: list(select_solver(wheels, vrw.StepOptions(**options)))
+    choice = lambda **options: list(select_cheapest_solver(wheels, vrw.StepOptions(**options)))
     loose = {"rtol": 1e-6, "atol": 1e-6}
     assert choice(**loose) == [named, stable, stable, stable, implicit, implicit, named]
-    # Tighter, IMPLICIT costs more; where STABLE would give up Dopri8 does not yet.
+    # Tighter, IMPLICIT_SOLVER costs more; where STABLE would give up Dopri8 does not yet.
     assert choice() == [named, named, stable, stable, named, implicit, named]
     assert choice(solver="Tsit5", **loose) == [named] * 4 + [implicit] * 2 + [named]
     # Of order 3, and farther still for an evaluation: who names it keeps it.

@@ -24,8 +24,8 @@ from vrw_jax.cli import commands as cli
 from vrw_jax.cli import scanning
 from vrw_jax.cli.commands import app
 from vrw_jax.cli.config import parse_config
-from vrw_jax.cli.console import make_scan_reporter
-from vrw_jax.cli.encoding import format_for_encoding
+from vrw_jax.cli.console import make_scan_progress_reporter
+from vrw_jax.cli.encoding import replace_unencodable_characters
 from vrw_jax.scans import SpecialPointMap, forecast
 from vrw_jax.scans.execution import ScanProgress
 from vrw_jax.scans.planning import ScanPlan
@@ -45,7 +45,7 @@ chunk = 6
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate_arithmetically)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # leave the suite's own as it is
@@ -104,7 +104,7 @@ def test_progress_shows_rate_failures_and_time_left(monkeypatch: pytest.MonkeyPa
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     result: list[dict] = []
-    report = make_scan_reporter(lambda _, **shown_values: result.append(shown_values), 0)
+    report = make_scan_progress_reporter(lambda _, **shown_values: result.append(shown_values), 0)
     for done, failed in ((0, 0), (1000, 100), (3000, 300)):
         report(ScanProgress(n_samples=6_000, n_done=done, n_failed=failed, n_reused=0))
     assert [shown_values["description"] for shown_values in result] == [
@@ -125,7 +125,7 @@ def test_the_bar_of_a_resumed_scan_includes_the_earlier_run(
     clock = iter([0.0, 100.0, 110.0])
     monkeypatch.setattr("time.monotonic", lambda: next(clock))
     result: list[dict] = []
-    report = make_scan_reporter(lambda _, **shown_values: result.append(shown_values), 0)
+    report = make_scan_progress_reporter(lambda _, **shown_values: result.append(shown_values), 0)
     for done in (0, 1000, 3000):
         report(ScanProgress(n_samples=6_000, n_done=done, n_failed=0, n_reused=4_000))
     assert [(shown["completed"], shown["total"]) for shown in result] == [
@@ -148,10 +148,10 @@ def test_characters_that_a_terminal_lacks_are_spelled(
 ) -> None:
     code = (
         "from vrw_jax.cli import console, encoding\n"
-        "encoding.spell_unencodable_characters()\n"
+        "encoding.replace_unencodable_output()\n"
         'headings = ("quantity", "symbol", "unit")\n'
-        'console.print_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
-        'console.print_error("φ ≥ 0 … Ω")'
+        'console.print_text_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
+        'console.print_error_sentence("φ ≥ 0 … Ω")'
     )
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "80"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
@@ -167,7 +167,7 @@ def test_characters_that_a_terminal_lacks_are_spelled(
 def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
     for measure in vrw.MEASURES.values():
         for text in (measure.symbol, measure.long_name, measure.display_unit):
-            spelled = format_for_encoding(text, "ascii")
+            spelled = replace_unencodable_characters(text, "ascii")
             assert "?" not in spelled, (text, spelled)
 
 
@@ -190,7 +190,7 @@ def test_a_map_prints_its_stages_after_the_scan(
         **evaluate_arithmetically(columns),
         "lambda_4_plus": columns["slope"],
     }
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate)
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate)
 
     def follow(
         scan: xr.Dataset, base: object, model: object, on_stage: Callable
@@ -224,12 +224,12 @@ def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> No
 def test_a_stopped_scan_names_the_command_that_continues_it(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: CountingEngine(failing_call=3))
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: CountingEngine(failing_call=3))
     stopped = run_command("scan", config)
     assert stopped.exit_code == 130
     assert "run the same to go on" in " ".join(stopped.stderr.split())
     rest = CountingEngine()
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: rest)
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: rest)
     assert run_command("scan", config).exit_code == 0
     assert rest.n_calls == 2
     second_result = run_command("scan", config)
@@ -308,18 +308,18 @@ def test_an_installed_wheel_brings_the_example_configs() -> None:
     built = parsed["tool"]["hatch"]["build"]["targets"]["wheel"]
     package = Path(cli.__file__).parents[1].name
     assert built["force-include"]["configs"] == f"{package}/configs"
-    assert cli.find_example_configs().name == "configs"
+    assert cli.find_example_config_folder().name == "configs"
 
 
 def test_verify_reports_whether_a_store_is_complete_and_intact(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: CountingEngine(failing_call=3))
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: CountingEngine(failing_call=3))
     assert run_command("scan", config, "--no-picture").exit_code == 130
     result = run_command("scan", config, "--verify")
     assert result.exit_code == 0
     assert "lacks 2 of 4 chunks" in result.stdout
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate_arithmetically)
     assert run_command("scan", config, "--no-picture").exit_code == 0
     assert "is complete and sound" in run_command("scan", config, "--verify").stdout
     file = config.parent / "results" / "small" / "scan.zarr" / "speed" / "c" / "1" / "0" / "0"
@@ -329,7 +329,7 @@ def test_verify_reports_whether_a_store_is_complete_and_intact(
     assert "1 damaged chunk (number 1): run the same without --verify" in result.stderr
     assert not file.exists()
     rest = CountingEngine()
-    monkeypatch.setattr(ScanPlan, "build_engine", lambda _: rest)
+    monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: rest)
     second_result = run_command("scan", config, "--no-picture")
     assert second_result.exit_code == 0
     assert "1 damaged chunk (number 1): computed again" in second_result.stderr
@@ -372,9 +372,11 @@ def test_friction_is_swept_for_the_unilateral_and_the_automatic_model(model_name
         '[scan]\nmeasures = ["slip", "d speed / d damping"]'
     )
     planned = scanning.plan_config_scan(result, None)
-    assert planned.design.names == ("friction", "slope")
+    assert planned.design.swept_parameters == ("friction", "slope")
     assert planned.requested_measures == ("slip", "d speed / d damping")
-    assert planned.request.model.model_name == {"auto": "ladder"}.get(model_name, model_name)
+    assert planned.evaluation_request.model.model_name == {"auto": "ladder"}.get(
+        model_name, model_name
+    )
 
 
 def test_a_gait_of_rigid_legs_is_printed(config: Path) -> None:
@@ -413,7 +415,7 @@ def slow(columns):
         except KeyboardInterrupt:
             print("stopping", flush=True)
             time.sleep(60)
-ScanPlan.build_engine = lambda _: slow
+ScanPlan.build_scan_engine = lambda _: slow
 sys.argv = ["vrw", "scan", {config!r}]
 from vrw_jax.cli.commands import main
 main()

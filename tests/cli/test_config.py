@@ -36,8 +36,8 @@ def test_the_quickstart_covers_table_1_with_at_least_4096_samples() -> None:
     design = load_config(CONFIG_FOLDER / "quickstart.toml").design
     assert design is not None
     assert design.size >= 4096
-    assert set(design.names) == {"damping", "stiffness", "natural_length", "slope"}
-    for name, (_, values) in design.result_coordinates().items():
+    assert set(design.swept_parameters) == {"damping", "stiffness", "natural_length", "slope"}
+    for name, (_, values) in design.make_result_coordinates().items():
         assert values.min() <= float(getattr(WheelParams(), name)) <= values.max()
 
 
@@ -56,8 +56,8 @@ def test_an_axis_is_a_list_or_from_to_count() -> None:
         "[grid]\ndamping = [1.0, 5.0, 2.0]\nslope = { from = 0.1, to = 0.3, count = 3 }"
     ).design
     assert design is not None
-    np.testing.assert_array_equal(design.values["damping"], [1.0, 5.0, 2.0])
-    np.testing.assert_allclose(design.values["slope"], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(design.values_by_parameter["damping"], [1.0, 5.0, 2.0])
+    np.testing.assert_allclose(design.values_by_parameter["slope"], [0.1, 0.2, 0.3])
 
 
 @pytest.mark.parametrize("kind", ["sobol", "uniform"])
@@ -66,7 +66,7 @@ def test_random_samples_are_reproduced_by_their_seed_and_stay_in_their_box(kind:
         text = f"[{kind}]\nn = 100\nseed = {seed}\ndamping = [100.0, 200.0]\nslope = [0.2, 0.3]"
         design = parse_config(text).design
         assert design is not None
-        return np.stack(list(design.values.values()))
+        return np.stack(list(design.values_by_parameter.values()))
 
     assert draw(1).shape == (2, 100)
     np.testing.assert_array_equal(draw(1), draw(1))

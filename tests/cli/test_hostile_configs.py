@@ -7,10 +7,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from vrw_jax.cli import config
-from vrw_jax.selection import list_config_names
+from vrw_jax.selection import list_model_config_names
 
 SWEPT = (*config.PARAMETER_NAMES, config.FRICTION_NAME)
-RANGES = dict.fromkeys(config.RANDOM_DESIGNS, ("n", "seed", *SWEPT))
+RANGES = dict.fromkeys(config.RANDOM_DESIGN_FUNCTIONS, ("n", "seed", *SWEPT))
 KEYS = {
     "wheel": (*config.PARAMETER_NAMES, "n_legs"),
     "model": ("name", "friction", "max_events", "stoppers", "restitution",
@@ -48,7 +48,7 @@ LITERALS = (
 PLACES = [(table, key) for table, keys in KEYS.items() for key in keys]
 
 
-@pytest.mark.parametrize("model_name", list_config_names())
+@pytest.mark.parametrize("model_name", list_model_config_names())
 @settings(
     max_examples=150, derandomize=True, database=None, deadline=None,
     suppress_health_check=list(HealthCheck),

@@ -385,7 +385,7 @@ def test_derivatives_of_a_batch_element_do_not_depend_on_the_others(unilateral_b
 def test_integration_by_xla_agrees_with_machine_code(unilateral_batch, monkeypatch):
     *_, walk_result = unilateral_batch
     solution = walk_result(slice(None))
-    monkeypatch.setattr(simd, "is_available", lambda: False)
+    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
     ground_lanes._compile_walk.cache_clear()
     by_xla = walk_result(slice(None))
     ground_lanes._compile_walk.cache_clear()

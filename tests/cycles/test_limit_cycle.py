@@ -121,7 +121,7 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
         assert compute_relative_error(own_values, expected) < allowed, name
 
 
-@pytest.mark.skipif(not simd.is_available(), reason="machine code is for CPUs")
+@pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
 def test_gradients_of_multipliers_use_machine_code_throughout():
     radius = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector)).spectral_radius
     program = (
@@ -613,7 +613,7 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
         )
 
     *solution, outcome, passes = jax.jit(evaluate)(rows)
-    monkeypatch.setattr(simd, "is_available", lambda: False)
+    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
     *by_xla, code, n = jax.jit(lambda vectors: evaluate(vectors))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)

@@ -45,7 +45,8 @@ def test_figures_and_animations_are_written_to_paths_given_as_strings(tmp_path):
 def test_colors_of_okabe_and_ito_stay_distinct_without_green_cones():
     np.testing.assert_allclose(perceive_color("0.5"), 0.5, atol=1e-3)
     colours = [
-        getattr(style, n) for n in ["BLUE", "ORANGE", "GREEN", "PINK", "SKY", "AMBER", "YELLOW"]
+        getattr(style, f"OKABE_ITO_{name}")
+        for name in ["BLUE", "ORANGE", "GREEN", "PINK", "SKY_BLUE", "AMBER", "YELLOW"]
     ]
     for i, one in enumerate(colours):
         for other in colours[:i]:
@@ -55,8 +56,11 @@ def test_colors_of_okabe_and_ito_stay_distinct_without_green_cones():
 
 
 def test_outcome_colors_stay_distinct_with_and_without_green_cones():
-    rows = [colour for _, colour in style.OUTCOME_STYLES.values()]
-    rows += [style.YELLOW, style.NOT_COMPUTED_STYLE[1]]  # of unstable gaits, and of what is missing
+    rows = [colour for _, colour in style.OUTCOME_LABELS_AND_COLORS.values()]
+    rows += [
+        style.OKABE_ITO_YELLOW,
+        style.NOT_COMPUTED_SAMPLE_STYLE[1],
+    ]  # of unstable gaits, and of what is missing
     for i, one in enumerate(rows):
         for other in rows[:i]:
             plain = np.array(mpl.colors.to_rgb(one)) - mpl.colors.to_rgb(other)
@@ -97,13 +101,13 @@ def test_shades_of_a_basin_differ_from_the_colors_of_falls():
         shade = simulate_color_vision(np.array(mesh.cmap(mesh.norm(steps))[:3]))
         for code in falls:
             assert (
-                np.linalg.norm(shade - perceive_color(style.OUTCOME_STYLES[code][1]))
+                np.linalg.norm(shade - perceive_color(style.OUTCOME_LABELS_AND_COLORS[code][1]))
                 > MIN_COLOR_DISTANCE
             ), (steps, code)
 
 
 def test_special_points_of_a_branch_have_their_own_colors_and_dashes():
-    curves = {colour for _, series in branch.PAPER_PANELS for colour in series.values()}
+    curves = {colour for _, series in branch.PAPER_BRANCH_PANELS for colour in series.values()}
     assert not curves & {branch.BRANCH_END_COLOR, *branch.SPECIAL_POINT_COLORS.values()}
     assert branch.SPECIAL_POINT_LINE_STYLE not in ("-", "--")
 

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from vrw_jax.figures import scan_figures
-from vrw_jax.figures.style import OUTCOME_STYLES, format_axis_label
+from vrw_jax.figures.style import OUTCOME_LABELS_AND_COLORS, format_axis_label
 from vrw_jax.wheel import Outcome
 
 
@@ -54,4 +54,4 @@ def test_colors_show_why_there_is_no_gait(code):
     outcome[0, 0] = code
     (figure,) = scan_figures(make_scan(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert OUTCOME_STYLES[code][0] in names
+    assert OUTCOME_LABELS_AND_COLORS[code][0] in names

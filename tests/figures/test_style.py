@@ -42,7 +42,8 @@ def test_a_label_has_name_symbol_and_unit(label, text):
 
 def test_every_outcome_has_its_own_color():
     colours = [
-        style.select_outcome_style(int(code))[1] for code in (*Outcome, style.UNSTABLE_CODE, -1)
+        style.select_outcome_style(int(code))[1]
+        for code in (*Outcome, style.UNSTABLE_CYCLE_CODE, -1)
     ]
     assert len(set(colours)) == len(Outcome) + 2
 
@@ -55,7 +56,11 @@ def test_cells_have_the_colors_of_their_outcomes_and_others_stay_empty(known):
     (mesh,) = axes.collections
     mesh.update_scalarmappable()
     for code, drawn_values in zip(codes.ravel(), mesh.get_facecolor().reshape(-1, 4), strict=True):
-        expected = style.OUTCOME_STYLES[Outcome(code)][1] if code in known else (0.0, 0.0, 0.0, 0.0)
+        expected = (
+            style.OUTCOME_LABELS_AND_COLORS[Outcome(code)][1]
+            if code in known
+            else (0.0, 0.0, 0.0, 0.0)
+        )
         assert np.allclose(drawn_values, mpl.colors.to_rgba(expected))
 
 
@@ -72,7 +77,7 @@ def test_special_points_in_confusable_colors_share_no_dash():
         for color in style.SPECIAL_POINT_NAMES_BY_COLOR
     }
     dashes = lambda color: {style.select_special_point_style(name)[1] for name in names[color]}
-    assert not dashes(style.GREEN) & dashes(style.PINK)
+    assert not dashes(style.OKABE_ITO_GREEN) & dashes(style.OKABE_ITO_PINK)
     looks = [
         style.select_special_point_style(name)
         for own_values in names.values()

@@ -39,13 +39,13 @@ def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, re
     for leg in (1, 2):
         for axis, letter in enumerate("xz"):
             known = walk[f"foot_{leg}_{letter}"].values  # round-off of metres
-            np.testing.assert_allclose(motion.feet[:, leg - 1, axis], known, atol=1e-12)
+            np.testing.assert_allclose(motion.foot_positions[:, leg - 1, axis], known, atol=1e-12)
             np.testing.assert_array_equal(
                 motion.forces[:, leg - 1, axis], walk[f"lambda_{2 * leg - 1 + axis}"]
             )
-    lengths = np.linalg.norm(motion.feet - motion.hub[:, None], axis=-1)
+    lengths = np.linalg.norm(motion.foot_positions - motion.hub_positions[:, None], axis=-1)
     np.testing.assert_allclose(lengths[:, 2:], 1.0, atol=1e-12)
-    is_at_rest = motion.contact == ContactMode.STICK
+    is_at_rest = motion.contact_modes == ContactMode.STICK
     np.testing.assert_array_equal(is_at_rest[:, 0], True)
     np.testing.assert_array_equal(is_at_rest[:, 1], walk.phase.values == 0)
     assert not is_at_rest[:, 2:].any()
@@ -53,9 +53,9 @@ def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, re
 
 def test_feet_with_unilateral_contact_are_those_of_the_walk(sliding_walk):
     motion = contact_figures.compute_foot_motion(sliding_walk)
-    np.testing.assert_array_equal(motion.feet[..., 0], sliding_walk.foot_x)
-    np.testing.assert_array_equal(motion.feet[..., 1], sliding_walk.foot_z)
-    np.testing.assert_array_equal(motion.contact, sliding_walk.contact)
+    np.testing.assert_array_equal(motion.foot_positions[..., 0], sliding_walk.foot_x)
+    np.testing.assert_array_equal(motion.foot_positions[..., 1], sliding_walk.foot_z)
+    np.testing.assert_array_equal(motion.contact_modes, sliding_walk.contact)
     # A foot that slides downhill moves downhill between two samples of the same mode.
     slides = sliding_walk.contact.values[:, 1] == ContactMode.SLIP_DOWN
     is_inside = slides[:-1] & slides[1:] & (np.diff(sliding_walk.time.values) > 0.0)
@@ -66,7 +66,7 @@ def test_feet_with_unilateral_contact_are_those_of_the_walk(sliding_walk):
 
 def test_bars_of_contact_modes_cover_the_time_of_each_mode(sliding_walk):
     bars = vrw.plot.gait_panels(sliding_walk).axes[2].collections
-    duration_by_color = dict.fromkeys(contact_figures.CONTACT_COLORS[1:], 0.0)
+    duration_by_color = dict.fromkeys(contact_figures.CONTACT_MODE_COLORS[1:], 0.0)
     for bar in bars:
         color = mpl.colors.to_hex(bar.get_facecolor()[0]).upper()
         duration_by_color[color] += np.ptp(bar.get_paths()[0].vertices[:, 0])
@@ -80,7 +80,7 @@ def test_sticks_have_feet_in_the_colors_of_their_modes(sliding_walk):
     axes = vrw.plot.sticks(sliding_walk, interval=0.1).axes[0]
     colors = {line.get_color() for line in axes.lines if line.get_marker() in ("o", ">", "<")}
     modes = (ContactMode.OFF, ContactMode.STICK, ContactMode.SLIP_DOWN)
-    assert {contact_figures.CONTACT_COLORS[mode] for mode in modes} <= colors
+    assert {contact_figures.CONTACT_MODE_COLORS[mode] for mode in modes} <= colors
     names = [text.get_text() for text in axes.get_legend().get_texts()]
     assert {"at rest", "sliding downhill", "in the air"} <= set(names)
 
@@ -93,7 +93,7 @@ def test_a_walk_of_every_model_is_drawn(name, request):
     frames, milliseconds = vrw.plot.walk_frames(walk, n_frames=3, slow=1.0)
     assert len(frames) == 3
     assert milliseconds == round(1e3 * float(walk.time[-1]) / 3)
-    color = contact_figures.CONTACT_COLORS[ContactMode.STICK]
+    color = contact_figures.CONTACT_MODE_COLORS[ContactMode.STICK]
     wanted_pixel = np.round(255 * np.array(mpl.colors.to_rgb(color)))
     pixels = np.asarray(frames[0]).reshape(-1, 3)
     assert np.sum(np.all(pixels == wanted_pixel, axis=1)) > 5  # of the foot at rest
@@ -102,9 +102,9 @@ def test_a_walk_of_every_model_is_drawn(name, request):
 def test_feet_between_two_samples_are_interpolated(sliding_walk):
     motion = contact_figures.compute_foot_motion(sliding_walk)
     middle = 0.5 * (motion.time[7] + motion.time[8])
-    hub, feet, sample = motion.interpolate(middle)
-    np.testing.assert_allclose(hub, motion.hub[7:9].mean(0), atol=1e-14)  # round-off
-    np.testing.assert_allclose(feet, motion.feet[7:9].mean(0), atol=1e-14)
+    hub, feet, sample = motion.interpolate_at_time(middle)
+    np.testing.assert_allclose(hub, motion.hub_positions[7:9].mean(0), atol=1e-14)  # round-off
+    np.testing.assert_allclose(feet, motion.foot_positions[7:9].mean(0), atol=1e-14)
     assert sample == 8
 
 

@@ -9,9 +9,9 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.selection.ladder import (
-    SELECTION_MARGINS,
+    MODEL_SELECTION_MARGINS,
     ModelCode,
-    describe_reason,
+    describe_selection_reason,
 )
 
 START = (0.1, 1.6, -0.1)
@@ -56,7 +56,7 @@ def ladder_steps():
 
 def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
     *_, step = ladder_steps
-    reasons = [describe_reason(code) for code in step.choice.reason_code.tolist()]
+    reasons = [describe_selection_reason(code) for code in step.choice.reason_code.tolist()]
     assert step.choice.why.tolist() == reasons
     assert step.choice.model_code.tolist() == [
         ModelCode.VISCOELASTIC,
@@ -64,10 +64,10 @@ def test_each_batch_element_has_its_own_model_and_reason(ladder_steps):
         ModelCode.UNILATERAL,
         ModelCode.VISCOELASTIC,
     ]
-    rows = [describe_reason(int(reason)) for reason in step.choice.reason_code]
+    rows = [describe_selection_reason(int(reason)) for reason in step.choice.reason_code]
     assert ["all its margins are positive" in text for text in rows] == [True, False, False, True]
     assert "scuffs" in rows[1]
-    assert list(SELECTION_MARGINS)[int(step.choice.reason_code[1]) - 1] == "clearance_sls1"
+    assert list(MODEL_SELECTION_MARGINS)[int(step.choice.reason_code[1]) - 1] == "clearance_sls1"
     assert "slide" in rows[2]
 
 

@@ -7,7 +7,7 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax.cli.config import parse_config
 from vrw_jax.models import GaitMethod, ModelCapabilities
-from vrw_jax.selection import MODEL_CLASSES, describe_models
+from vrw_jax.selection import REGISTERED_MODEL_CLASSES, describe_accepted_models
 from vrw_jax.wheel import PARAMETER_NAMES
 
 
@@ -53,12 +53,13 @@ def test_a_new_model_in_the_registry_is_known_to_configurations_and_messages(mon
     with pytest.raises(ValueError, match="viscoelastic"):
         parse_config(text)
     monkeypatch.setattr(
-        "vrw_jax.selection.registry.MODEL_CLASSES", [*MODEL_CLASSES, PointFeetWheel]
+        "vrw_jax.selection.registry.REGISTERED_MODEL_CLASSES",
+        [*REGISTERED_MODEL_CLASSES, PointFeetWheel],
     )
     assert isinstance(parse_config(text).make_model(), PointFeetWheel)
-    assert describe_models("branch").endswith(" or vrw.PointFeetWheel()")
+    assert describe_accepted_models("branch").endswith(" or vrw.PointFeetWheel()")
 
 
-@pytest.mark.parametrize("model_class", MODEL_CLASSES, ids=lambda entry: entry.__name__)
+@pytest.mark.parametrize("model_class", REGISTERED_MODEL_CLASSES, ids=lambda entry: entry.__name__)
 def test_each_model_declares_known_commands(model_class):
     assert model_class.capabilities.commands <= {"scan", "map", "tune", "branch", "explore"}

@@ -8,7 +8,7 @@ from scipy import integrate, special
 from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
-from vrw_jax.models.rigid import carlson_rf
+from vrw_jax.models.rigid import evaluate_carlson_rf
 
 HALF_ANGLE = np.pi / 8
 # Point mass at the hub, l = 1, g = 9.8, slope 0.15: Tedrake, Underactuated Robotics.
@@ -66,7 +66,9 @@ def test_the_period_agrees_with_quadrature(slope, rate):
 def test_carlsons_integral_agrees_with_scipy():
     rng = np.random.default_rng(3)
     x, y, z = rng.uniform(0.0, 5.0, (3, 50))
-    np.testing.assert_allclose(jax.vmap(carlson_rf)(x, y, z), special.elliprf(x, y, z), rtol=1e-14)
+    np.testing.assert_allclose(
+        jax.vmap(evaluate_carlson_rf)(x, y, z), special.elliprf(x, y, z), rtol=1e-14
+    )
 
 
 def test_too_slow_a_start_falls_back():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.models.unit_scaling import SCALING_BY_PARAMETER
+from vrw_jax.models.unit_scaling import UNIT_SCALING_BY_PARAMETER_INDEX
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 N = 64
@@ -54,7 +54,9 @@ def test_a_step_is_the_same_in_other_units():
     )
 
 
-@pytest.mark.parametrize("name", [PARAMETER_NAMES[last] for last in SCALING_BY_PARAMETER])
+@pytest.mark.parametrize(
+    "name", [PARAMETER_NAMES[last] for last in UNIT_SCALING_BY_PARAMETER_INDEX]
+)
 def test_tangents_derived_from_units_equal_those_of_the_step(name):
     """A single column is propagated through the step; with all columns, units give two of them."""
     table, start, length, time = random_batch()

@@ -17,7 +17,7 @@ from vrw_jax import figures as plots
 from vrw_jax.cli import commands as cli
 from vrw_jax.paper import facts
 from vrw_jax.paper import reproduction as reproduce
-from vrw_jax.paper.facts.base import Evidence
+from vrw_jax.paper.facts.base import PaperEvidence
 from vrw_jax.wheel.outcomes import Outcome
 
 FIGURE_NAMES = (
@@ -30,38 +30,38 @@ FIGURE_NAMES = (
 
 
 @pytest.fixture(scope="session")
-def evidence() -> Evidence:
-    return reproduce.collect_evidence()
+def evidence() -> PaperEvidence:
+    return reproduce.collect_paper_evidence()
 
 
 @pytest.fixture(scope="session")
 def reproduction_result(
-    evidence: Evidence, tmp_path_factory: pytest.TempPathFactory
+    evidence: PaperEvidence, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, bool, list[float]]:
     folder, result = tmp_path_factory.mktemp("reproduced"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reproduce, "collect_evidence", lambda on_progress: evidence)
-        table = reproduce.reproduce(folder, lambda share, what: result.append(share))
+        patch.setattr(reproduce, "collect_paper_evidence", lambda on_progress: evidence)
+        table = reproduce.reproduce_paper(folder, lambda share, what: result.append(share))
     return folder, all(fact.holds for fact in table), result
 
 
-def test_every_published_fact_holds(evidence: Evidence) -> None:
+def test_every_published_fact_holds(evidence: PaperEvidence) -> None:
     failing = [
-        f"{f.claim}: found {f.computed}" for f in facts.compute_facts(evidence) if not f.holds
+        f"{f.claim}: found {f.computed}" for f in facts.compute_paper_facts(evidence) if not f.holds
     ]
     assert not failing
 
 
-def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: Evidence) -> None:
-    for fact in facts.compute_facts(evidence):
+def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: PaperEvidence) -> None:
+    for fact in facts.compute_paper_facts(evidence):
         assert fact.source
         assert fact.published_value
         assert fact.computed
         assert fact.tolerance_reason
 
 
-def test_the_table_covers_every_figure_and_the_misprints(evidence: Evidence) -> None:
-    text = facts.format_facts_page(facts.compute_facts(evidence))
+def test_the_table_covers_every_figure_and_the_misprints(evidence: PaperEvidence) -> None:
+    text = facts.format_facts_page(facts.compute_paper_facts(evidence))
     for word in ("Fig. 6", "Fig. 8", "Fig. 9", "Fig. 10(a)", "Fig. 10(b)", "J43", "eq. (35)",
                  "eqs (16), (17)", "φ = 0.10", "friction", "stopper"):  # fmt: skip
         assert word in text
@@ -80,17 +80,17 @@ def test_a_successful_reproduction_writes_every_file(
 
 
 def test_a_failed_fact_is_printed_and_sets_the_exit_code(
-    evidence: Evidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    evidence: PaperEvidence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     branch = evidence.damping_branch.copy(deep=True)
     branch.lambda_4_plus.loc[{"damping": 219.0}] = -0.01
     broken = dataclasses.replace(evidence, damping_branch=branch)
-    monkeypatch.setattr(reproduce, "collect_evidence", lambda on_progress: broken)
-    monkeypatch.setattr(reproduce, "draw_figures", lambda evidence, folder: [])
+    monkeypatch.setattr(reproduce, "collect_paper_evidence", lambda on_progress: broken)
+    monkeypatch.setattr(reproduce, "write_paper_figures", lambda evidence, folder: [])
     monkeypatch.setattr("vrw_jax.runtime.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.ExitCode.CHECK_FAILED
-    table = facts.compute_facts(broken)
+    table = facts.compute_paper_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} facts hold" in result.output
     assert "26 with published numbers, 28 with independent code" in " ".join(result.output.split())
     assert "does not" in result.output
@@ -114,7 +114,7 @@ def _scale_states(branch: xr.Dataset, factors: tuple[float, float, float]) -> xr
     return branch.assign(section_state=branch.section_state * np.array(factors))
 
 
-def _corrupt_gait(e: Evidence) -> Evidence:
+def _corrupt_gait(e: PaperEvidence) -> PaperEvidence:
     return dataclasses.replace(
         e,
         table_1_trajectory=_scale_results(e.table_1_trajectory, -1.3).assign_coords(
@@ -124,12 +124,12 @@ def _corrupt_gait(e: Evidence) -> Evidence:
     )
 
 
-def _corrupt_branch(e: Evidence) -> Evidence:
+def _corrupt_branch(e: PaperEvidence) -> PaperEvidence:
     flipped = _scale_results(e.damping_branch, -1.1)
     return dataclasses.replace(e, damping_branch=flipped.assign(settled=~flipped.settled))
 
 
-def _corrupt_walks(e: Evidence) -> Evidence:
+def _corrupt_walks(e: PaperEvidence) -> PaperEvidence:
     step_by_name = {"outcome": Outcome.STEPPED.name}
     return dataclasses.replace(
         e,
@@ -143,11 +143,11 @@ def _corrupt_walks(e: Evidence) -> Evidence:
     )
 
 
-def _corrupt_states(e: Evidence) -> Evidence:
+def _corrupt_states(e: PaperEvidence) -> PaperEvidence:
     return dataclasses.replace(e, damping_branch=_scale_states(e.damping_branch, (1.0, -1.0, 0.0)))
 
 
-def _sink_foot(e: Evidence) -> Evidence:
+def _sink_foot(e: PaperEvidence) -> PaperEvidence:
     sinking = e.table_1_trajectory.assign(
         foot_2_z=-e.table_1_trajectory.foot_2_z,
         total_energy=-e.table_1_trajectory.total_energy,
@@ -162,17 +162,17 @@ def _sink_foot(e: Evidence) -> Evidence:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that were spoiled on purpose
-def test_every_fact_can_fail(evidence: Evidence) -> None:
-    spoils: tuple[Callable[[Evidence], Evidence], ...] = (
+def test_every_fact_can_fail(evidence: PaperEvidence) -> None:
+    spoils: tuple[Callable[[PaperEvidence], PaperEvidence], ...] = (
         _corrupt_gait,
         _corrupt_branch,
         _corrupt_walks,
         _corrupt_states,
         _sink_foot,
     )
-    unmoved = {fact.claim for fact in facts.compute_facts(evidence)}
+    unmoved = {fact.claim for fact in facts.compute_paper_facts(evidence)}
     for spoil in spoils:
-        unmoved &= {fact.claim for fact in facts.compute_facts(spoil(evidence)) if fact.holds}
+        unmoved &= {fact.claim for fact in facts.compute_paper_facts(spoil(evidence)) if fact.holds}
     assert not unmoved
 
 
@@ -193,7 +193,7 @@ def test_figures_are_valid_image_files(
     assert sum(sizes.values()) < 2_000_000
 
 
-def test_the_same_results_give_the_same_figure(evidence: Evidence, tmp_path: Path) -> None:
+def test_the_same_results_give_the_same_figure(evidence: PaperEvidence, tmp_path: Path) -> None:
     first, second = (
         plots.save(plots.indicators(evidence.damping_branch), tmp_path / name, "figure")[
             0
@@ -203,13 +203,13 @@ def test_the_same_results_give_the_same_figure(evidence: Evidence, tmp_path: Pat
     assert first == second
 
 
-def test_drawing_leaves_matplotlib_as_it_was(evidence: Evidence, tmp_path: Path) -> None:
+def test_drawing_leaves_matplotlib_as_it_was(evidence: PaperEvidence, tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
     plots.save(plots.rear_force(evidence.gaits_by_damping), tmp_path, "figure")
     assert dict(mpl.rcParams) == before
 
 
-def test_figure_10_shows_only_gaits_that_the_paper_shows(evidence: Evidence) -> None:
+def test_figure_10_shows_only_gaits_that_the_paper_shows(evidence: PaperEvidence) -> None:
     figure = plots.indicators(evidence.damping_branch, every=1)
     for axes in figure.axes:
         for line in axes.lines:

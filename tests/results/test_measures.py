@@ -4,7 +4,7 @@ import pytest
 
 from vrw_jax.measures import MARGIN_MEASURES, STEP_MEASURES, describe_violation
 from vrw_jax.printing import format_html_table, format_markdown_table, format_mathtext, format_text
-from vrw_jax.selection.ladder import SELECTION_MARGINS, describe_reason
+from vrw_jax.selection.ladder import MODEL_SELECTION_MARGINS, describe_selection_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 
@@ -29,8 +29,8 @@ def test_other_measures_describe_no_violation():
 
 
 def test_reasons_of_the_ladder_come_from_the_table():
-    for reason, name in enumerate(SELECTION_MARGINS, start=1):
-        assert MARGIN_MEASURES[name].violation in describe_reason(reason)
+    for reason, name in enumerate(MODEL_SELECTION_MARGINS, start=1):
+        assert MARGIN_MEASURES[name].violation in describe_selection_reason(reason)
 
 
 @pytest.mark.parametrize(

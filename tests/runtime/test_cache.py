@@ -15,9 +15,9 @@ from support.machine_code import CodeRegistrySpy
 
 import vrw_jax as vrw
 from vrw_jax.runtime import (
-    cached_lane_function,
-    cached_lane_program,
-    compile_exported,
+    compile_cached_lane_function,
+    compile_cached_lane_program,
+    compile_exported_trace,
 )
 from vrw_jax.runtime import (
     disk_cache as store,
@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def process(monkeypatch):
-    monkeypatch.setattr(store, "_warned_kinds", set())
+    monkeypatch.setattr(store, "_issued_warning_kinds", set())
     return CodeRegistrySpy(monkeypatch)
 
 
@@ -49,11 +49,15 @@ def multiples():
     results = []
     for factor in FACTORS:
         lanes = lambda _, x, factor=factor: (factor * x[0],)
-        results.append(cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0])
-        within = cached_lane_function(lambda x, f=factor: f * x, lambda x: x, ("within", factor))
+        results.append(
+            compile_cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0]
+        )
+        within = compile_cached_lane_function(
+            lambda x, f=factor: f * x, lambda x: x, ("within", factor)
+        )
         call = lambda x, g=within: g(x) + 0.0
         results.append(
-            compile_exported(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(X)
+            compile_exported_trace(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(X)
         )
     return results
 
@@ -67,7 +71,7 @@ def check_recompiles(process, warns=True):
     warning."""
     for again in range(2):
         process.reset_registry()
-        store._warned_kinds.clear()
+        store._issued_warning_kinds.clear()
         with warnings.catch_warnings(record=True) as seen:
             warnings.simplefilter("always")
             np.testing.assert_array_equal(multiples(), expected())
@@ -157,9 +161,9 @@ def test_another_users_records_are_not_used(folder, process, monkeypatch):
     owner = os.geteuid() + 1
     monkeypatch.setattr(os, "geteuid", lambda: owner)
     with pytest.warns(UserWarning, match="belongs to another user, but"):
-        assert store.cache_folder() is None
+        assert store.find_cache_folder() is None
     assert store.load_bytes(next(folder.glob("lanes_code_*")).stem) is None
-    monkeypatch.setenv(store.TRUST_SHARED_VARIABLE, "1")
+    monkeypatch.setenv(store.TRUST_SHARED_CACHE_VARIABLE, "1")
     assert store.load_bytes(next(folder.glob("lanes_code_*")).stem)
 
 
@@ -170,10 +174,10 @@ def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
         traces.append(1)
         return 2.0 * x
 
-    run = lambda: compile_exported(double, (X,), "versions", jax.devices()[0])(X)
+    run = lambda: compile_exported_trace(double, (X,), "versions", jax.devices()[0])(X)
     run(), run()
     assert len(traces) == 1
-    monkeypatch.setattr(store, "_library_versions", lambda: ("diffrax 0.0",))
+    monkeypatch.setattr(store, "_list_library_versions", lambda: ("diffrax 0.0",))
     run()
     assert len(traces) == 2
 
@@ -201,8 +205,9 @@ def started(code="", **environment):
 
 def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     code = (
-        "vrw.start_jax(); import numpy as np; from vrw_jax.runtime import cached_lane_program; "
-        "cached_lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], "
+        "vrw.start_jax(); import numpy as np; "
+        "from vrw_jax.runtime import compile_cached_lane_program; "
+        "compile_cached_lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], "
         "[np.ones(4)])"
     )
     made = started(code, XDG_CACHE_HOME=str(tmp_path / "a" / "b"))

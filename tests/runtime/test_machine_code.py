@@ -9,9 +9,9 @@ from support.machine_code import CodeRegistrySpy
 
 from vrw_jax import simd
 from vrw_jax.runtime import (
-    cached_lane_function,
-    cached_lane_program,
-    compile_exported,
+    compile_cached_lane_function,
+    compile_cached_lane_program,
+    compile_exported_trace,
 )
 from vrw_jax.runtime import (
     disk_cache as store,
@@ -39,13 +39,13 @@ def fresh_process(monkeypatch):
 
 def make_function(traced):
     """Return a JAX program that calls machine code, and appends to a list when it is traced."""
-    double = cached_lane_function(lambda x: 2.0 * x, lambda x: x, "double")
+    double = compile_cached_lane_function(lambda x: 2.0 * x, lambda x: x, "double")
 
     def run(x):
         traced.append(1)
         return double(x) + 1.0
 
-    return compile_exported(run, (X,), "kept", jax.devices()[0])(X)
+    return compile_exported_trace(run, (X,), "kept", jax.devices()[0])(X)
 
 
 def test_a_cached_program_finds_the_machine_code_that_it_calls(cache_folder, fresh_process):
@@ -70,8 +70,10 @@ def test_an_edit_that_changes_no_trace_compiles_nothing(cache_folder, fresh_proc
         first = make_function(traced)
         by_jax = set(cache_folder.glob("*-cache"))
         fresh_process.reset_registry()
-        monkeypatch.setattr(store, "source_digest", lambda: "of the library with another docstring")
-        monkeypatch.setattr(code, "compile_native", None)  # would fail
+        monkeypatch.setattr(
+            store, "compute_source_digest", lambda: "of the library with another docstring"
+        )
+        monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
         np.testing.assert_array_equal(make_function(traced), first)
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
@@ -88,7 +90,9 @@ def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, mon
         traced.append(1)
         return 2.0 * x
 
-    run = lambda: compile_exported(double, (jnp.ones(2),), "kept", jax.devices()[0])(jnp.ones(2))
+    run = lambda: compile_exported_trace(double, (jnp.ones(2),), "kept", jax.devices()[0])(
+        jnp.ones(2)
+    )
     run(), run()
     assert len(traced) == 1
     monkeypatch.setattr(simd, "describe_processor", lambda: ("x86_64", "another", ""))
@@ -104,7 +108,7 @@ def test_damaged_files_are_compiled_again(cache_folder, fresh_process):
             traced.append(1)
             return (2.0 * x[0],)
 
-        return cached_lane_program(double, [], 1, lanes[0].dtype, "double")([], lanes)[0]
+        return compile_cached_lane_program(double, [], 1, lanes[0].dtype, "double")([], lanes)[0]
 
     assert run()[3] == 6.0
     for place in cache_folder.glob("lanes_*"):

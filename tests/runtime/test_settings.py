@@ -9,7 +9,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 STRICT_SETTINGS = (
     ("jax_disable_jit", True),
@@ -104,10 +104,10 @@ def test_default_settings_hold_inside_a_function_and_in_each_thread():
 
     jax.config.update("jax_numpy_rank_promotion", "raise")
     try:
-        thread = threading.Thread(target=with_default_settings(record_settings))
+        thread = threading.Thread(target=with_default_jax_settings(record_settings))
         thread.start()
         thread.join()
-        with_default_settings(record_settings)()
+        with_default_jax_settings(record_settings)()
         record_settings()
     finally:
         jax.config.update("jax_numpy_rank_promotion", "allow")

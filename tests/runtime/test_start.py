@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.runtime.cached_programs import cached_trace
-from vrw_jax.runtime.start import fusion_emitter_options
+from vrw_jax.runtime.cached_programs import wrap_with_saved_trace
+from vrw_jax.runtime.start import make_fusion_emitter_options
 
 
 def read_output_lines(code, **environment):
@@ -52,7 +52,7 @@ def test_started_processes_compute_in_64_bits_with_the_fast_compiler(tmp_path):
     )
     assert result[:2] == ["float64", str(tmp_path)]
     quick = [
-        f"--{name}=false" for name in fusion_emitter_options(True)
+        f"--{name}=false" for name in make_fusion_emitter_options(True)
     ]  # none where XLA lacks the flag
     assert result[2:] == ["--xla_cpu_enable_fast_math=false", *quick]
 
@@ -77,17 +77,17 @@ def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder):
     expected = function(x, y)["sum"]
     traces.clear()
     for _ in range(2):  # each as another process would: nothing is remembered but on disk
-        result = jax.jit(lambda x, y: cached_trace(function, "ours")(x, y)["sum"])(x, y)
+        result = jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x, y)
         np.testing.assert_array_equal(result, expected)
     assert len(traces) == 1
-    jax.jit(lambda x, y: cached_trace(function, "other settings")(x, y)["sum"])(x, y)
-    jax.jit(lambda x, y: cached_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
+    jax.jit(lambda x, y: wrap_with_saved_trace(function, "other settings")(x, y)["sum"])(x, y)
+    jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
     assert len(traces) == 3
 
 
 def test_a_damaged_trace_is_traced_again(cache_folder):
     function, traces = make_counted_function()
-    call = lambda x: cached_trace(function, "ours")(x, x)["sum"]
+    call = lambda x: wrap_with_saved_trace(function, "ours")(x, x)["sum"]
     expected = jax.jit(call)(jnp.ones(2))
     (place,) = cache_folder.glob("vrw_trace_*")
     place.write_bytes(place.read_bytes()[:-1] + b"?")
@@ -95,7 +95,9 @@ def test_a_damaged_trace_is_traced_again(cache_folder):
     assert len(traces) == 2
 
 
-@pytest.mark.skipif(not fusion_emitter_options(True), reason="this XLA has one way of compiling")
+@pytest.mark.skipif(
+    not make_fusion_emitter_options(True), reason="this XLA has one way of compiling"
+)
 def test_both_compilers_give_the_same_gait():
     params = vrw.WheelParams()
     measured = lambda p: (lambda c: (c.section_state, c.multipliers.real))(vrw.limit_cycle(p))

@@ -23,7 +23,7 @@ results = {
     "section_state": vrw.return_map(params, start).tolist(),
     "period": float(vrw.limit_cycle(params).period),
     "section_states": vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state.tolist(),
-    "is_available": simd.is_available(),
+    "is_available": simd.is_machine_code_available(),
 }
 for name, call in {
     "engine": lambda: vrw.step(params, start, engine="lanes"),
@@ -41,7 +41,8 @@ print(json.dumps(results))
 
 def test_the_library_is_imported_without_llvmlite():
     hide = "import sys; sys.modules.update(dict.fromkeys(('llvmlite', 'llvmlite.ir', "
-    check = hide + "'llvmlite.binding'))); import vrw_jax.simd as s; assert not s.is_available()"
+    check = hide + "'llvmlite.binding'))); import vrw_jax.simd as simd; "
+    check += "assert not simd.is_machine_code_available()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", check], env=environment, check=True)
 

@@ -33,12 +33,12 @@ from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.scans import dask, planning
 from vrw_jax.scans import design as designs
 from vrw_jax.scans import store as scan_store
-from vrw_jax.scans.collocation_engine import CollocationEngine
-from vrw_jax.scans.dask import connect_workers
+from vrw_jax.scans.collocation_engine import CollocationScanEngine
+from vrw_jax.scans.dask import connect_dask_workers
 from vrw_jax.scans.execution import ScanProgress
-from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED
+from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED_VARIABLES
 from vrw_jax.scans.planning import ChunkResult, ScanPlan, plan_scan
-from vrw_jax.scans.store import choose_chunk_shape, find_first_difference, open_scan
+from vrw_jax.scans.store import choose_chunk_shape, find_first_settings_difference, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
@@ -78,7 +78,7 @@ def test_a_stored_list_of_samples_keeps_its_coordinates(tmp_path: Path) -> None:
 def test_a_scan_interrupted_at_any_chunk_ends_bitwise_the_same(tmp_path: Path) -> None:
     full_values = tmp_path / "whole.zarr"
     run_plan(make_plan(), full_values, evaluate=evaluate_arithmetically)
-    n_chunks = make_plan().layout.n_chunks
+    n_chunks = make_plan().result_layout.n_chunks
     for stop in range(1, n_chunks + 1):
         store = tmp_path / f"stopped_{stop}.zarr"
         with pytest.raises(KeyboardInterrupt):
@@ -133,7 +133,7 @@ def test_an_incompletely_written_chunk_is_computed_again(
 
 @pytest.mark.parametrize("wheel", [vrw.UnilateralWheel(), vrw.LadderWheel(friction=0.7)])
 def test_settings_of_every_model_can_be_stored(wheel):
-    attrs = plan_scan(vrw.grid(friction=[0.5, 0.7]), model=wheel).store_attrs
+    attrs = plan_scan(vrw.grid(friction=[0.5, 0.7]), model=wheel).store_attributes
     assert json.loads(attrs[scan_store.MANIFEST_ATTRIBUTE])["model"]["kind"] == type(wheel).__name__
 
 
@@ -174,13 +174,13 @@ def test_a_store_whose_creation_was_killed_is_created_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing that a killed process can leave behind is taken for a store."""
-    fill, path = scan_store._create_arrays, tmp_path / "s.zarr"
+    fill, path = scan_store._create_zarr_arrays, tmp_path / "s.zarr"
 
     def killed(place: Path, *rest: object) -> None:
         fill(place, *rest)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(scan_store, "_create_arrays", killed)
+    monkeypatch.setattr(scan_store, "_create_zarr_arrays", killed)
     monkeypatch.setattr(scan_store.shutil, "rmtree", lambda *_, **__: None)  # nothing cleans up
     with pytest.raises(KeyboardInterrupt):
         run_plan(make_plan(), path, evaluate=evaluate_arithmetically)
@@ -262,12 +262,12 @@ def test_an_unfinished_scan_is_not_continued_by_other_code(
     store = tmp_path / "s.zarr"
     with pytest.raises(KeyboardInterrupt):
         run_plan(make_plan(), store, evaluate=CountingEngine(2))
-    monkeypatch.setattr(planning, "source_digest", lambda: "other")
+    monkeypatch.setattr(planning, "compute_source_digest", lambda: "other")
     with pytest.raises(ValueError, match="the library's code differs"):
         run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
     monkeypatch.undo()
     run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
-    monkeypatch.setattr(planning, "source_digest", lambda: "other")
+    monkeypatch.setattr(planning, "compute_source_digest", lambda: "other")
     run_plan(
         make_plan(), store, evaluate=CountingEngine(1)
     )  # finished: nothing is computed, all is there
@@ -279,11 +279,11 @@ def test_an_unfinished_scan_is_not_continued_by_other_code(
 def test_every_sample_is_in_exactly_one_chunk() -> None:
     design = designs.grid(damping=[1.0, 2.0, 3.0], slope=[0.1, 0.2], stiffness=np.arange(1.0, 8.0))
     for chunk in (1, 2, 5, 7, 8, 14, 40, 42, 100):
-        layout = plan_scan(design, SCANNED_MEASURES, chunk=chunk).layout
+        layout = plan_scan(design, SCANNED_MEASURES, chunk=chunk).result_layout
         assert np.prod(layout.chunk_shape) <= chunk
         observed_values = np.zeros(design.shape, int)
         for index in range(layout.n_chunks):
-            observed_values[layout.chunk_region(index)] += 1
+            observed_values[layout.get_chunk_region(index)] += 1
         assert np.all(observed_values == 1)
 
 
@@ -306,7 +306,7 @@ def test_values_match_their_coordinates() -> None:
 def test_every_variable_is_described() -> None:
     scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
     for name in (
-        *ALWAYS_INCLUDED,
+        *ALWAYS_INCLUDED_VARIABLES,
         "dls_fraction",
         "d dls_fraction / d damping",
         "damping",
@@ -336,9 +336,9 @@ def test_progress_counts_samples_failures_and_reused_samples(tmp_path: Path) -> 
 
 
 def test_the_first_difference_is_named_by_its_path() -> None:
-    assert find_first_difference({"a": {"b": 1}}, {"a": {"b": 2}}) == ("a.b", 1, 2)
-    assert find_first_difference({"a": 1}, {"a": 1, "c": 3}) == ("c", None, 3)
-    assert find_first_difference({"a": 1}, {"a": 1})[0] == ""
+    assert find_first_settings_difference({"a": {"b": 1}}, {"a": {"b": 2}}) == ("a.b", 1, 2)
+    assert find_first_settings_difference({"a": 1}, {"a": 1, "c": 3}) == ("c", None, 3)
+    assert find_first_settings_difference({"a": 1}, {"a": 1})[0] == ""
 
 
 @pytest.mark.parametrize(
@@ -363,16 +363,16 @@ def test_a_wrong_design_gets_one_sentence(make, expected: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def engine() -> CollocationEngine:
-    return CollocationEngine(make_plan().request, threads=2)
+def engine() -> CollocationScanEngine:
+    return CollocationScanEngine(make_plan().evaluation_request, n_threads=2)
 
 
 @pytest.fixture(scope="module")
-def engine_results(engine: CollocationEngine) -> Mapping[str, np.ndarray]:
-    return engine(SMALL_GRID.sample_block((slice(None), slice(None))))
+def engine_results(engine: CollocationScanEngine) -> Mapping[str, np.ndarray]:
+    return engine(SMALL_GRID.select_samples((slice(None), slice(None))))
 
 
-def test_table_1_gives_the_paper_s_gait(engine: CollocationEngine) -> None:
+def test_table_1_gives_the_paper_s_gait(engine: CollocationScanEngine) -> None:
     values_by_name = engine({"damping": np.array([200.0])})
     assert values_by_name["outcome"] == Outcome.STEPPED
     assert values_by_name["dls_fraction"] == pytest.approx(0.5315, abs=1e-4)
@@ -381,10 +381,10 @@ def test_table_1_gives_the_paper_s_gait(engine: CollocationEngine) -> None:
 
 
 def test_the_result_of_a_sample_does_not_depend_on_the_others(
-    engine: CollocationEngine, engine_results: Mapping[str, np.ndarray]
+    engine: CollocationScanEngine, engine_results: Mapping[str, np.ndarray]
 ) -> None:
     """Alone, in another order, in another company, at another place of a batch."""
-    columns = SMALL_GRID.sample_block((slice(None), slice(None)))
+    columns = SMALL_GRID.select_samples((slice(None), slice(None)))
     order = np.random.default_rng(0).permutation(SMALL_GRID.size)
     shuffled = engine({name: column[order] for name, column in columns.items()})
     single_result = engine({name: column[7:8] for name, column in columns.items()})
@@ -396,7 +396,7 @@ def test_the_result_of_a_sample_does_not_depend_on_the_others(
         np.testing.assert_array_equal(mixed[name][40:], value, name)
 
 
-def test_a_scan_does_not_depend_on_its_chunks(engine: CollocationEngine) -> None:
+def test_a_scan_does_not_depend_on_its_chunks(engine: CollocationScanEngine) -> None:
     by_chunk = [
         run_plan(make_plan(chunk), evaluate=engine).drop_attrs() for chunk in (12, SMALL_GRID.size)
     ]
@@ -405,7 +405,7 @@ def test_a_scan_does_not_depend_on_its_chunks(engine: CollocationEngine) -> None
 
 
 def test_invalid_samples_get_outcomes_and_leave_the_others_unchanged(
-    engine: CollocationEngine,
+    engine: CollocationScanEngine,
 ) -> None:
     good = {"damping": np.array([150.0, 200.0]), "slope": np.array([0.3, 0.3])}
     bad = {
@@ -421,14 +421,14 @@ def test_invalid_samples_get_outcomes_and_leave_the_others_unchanged(
         assert np.all(np.isnan(mixed[name][:4]))
 
 
-def test_a_derivative_by_name_equals_the_difference_quotient(engine: CollocationEngine) -> None:
+def test_a_derivative_by_name_equals_the_difference_quotient(engine: CollocationScanEngine) -> None:
     h = 1e-3
     near = engine({"damping": np.array([180.0 - h, 180.0, 180.0 + h])})
     quotient = (near["dls_fraction"][2] - near["dls_fraction"][0]) / (2 * h)
     assert near["d_dls_fraction_d_damping"][1] == pytest.approx(quotient, rel=1e-5)
 
 
-def test_every_parameter_can_be_swept_at_once(engine: CollocationEngine) -> None:
+def test_every_parameter_can_be_swept_at_once(engine: CollocationScanEngine) -> None:
     base = WheelParams()
     rng = np.random.default_rng(1)
     columns = {
@@ -442,7 +442,7 @@ def test_every_parameter_can_be_swept_at_once(engine: CollocationEngine) -> None
 
 
 def test_a_cycle_is_a_fixed_point_of_the_event_driven_step(
-    engine: CollocationEngine, engine_results: Mapping[str, np.ndarray]
+    engine: CollocationScanEngine, engine_results: Mapping[str, np.ndarray]
 ) -> None:
     assert np.all(engine_results["outcome"] == Outcome.STEPPED)
     cycle = vrw.limit_cycle(WheelParams(damping=150.0, slope=0.3))
@@ -451,7 +451,7 @@ def test_a_cycle_is_a_fixed_point_of_the_event_driven_step(
 
 
 def test_a_cycle_that_the_step_does_not_confirm_has_an_outcome(
-    engine: CollocationEngine, monkeypatch: pytest.MonkeyPatch
+    engine: CollocationScanEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(finder, "STATE_AGREEMENT_TOLERANCE", 0.0)
@@ -461,10 +461,12 @@ def test_a_cycle_that_the_step_does_not_confirm_has_an_outcome(
 
 
 def test_the_engine_is_traced_once(
-    engine: CollocationEngine, monkeypatch: pytest.MonkeyPatch
+    engine: CollocationScanEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine({"damping": np.array([200.0])})
-    monkeypatch.setattr(CollocationEngine, "_compile", lambda *_: pytest.fail("compiled again"))
+    monkeypatch.setattr(
+        CollocationScanEngine, "_compile_programs", lambda *_: pytest.fail("compiled again")
+    )
     engine({"slope": np.array([0.29, 0.3]), "stiffness": np.array([480.0, 500.0])})
 
 
@@ -472,7 +474,7 @@ def test_the_engine_is_traced_once(
 
 
 def test_parallel_batches_give_the_same_results(
-    engine: CollocationEngine, engine_results: Mapping[str, np.ndarray]
+    engine: CollocationScanEngine, engine_results: Mapping[str, np.ndarray]
 ) -> None:
     """Each of two batches waits until the other has begun: with turns none would ever go on."""
     both_values = threading.Barrier(2, timeout=60.0)
@@ -483,7 +485,7 @@ def test_parallel_batches_give_the_same_results(
 
     for program in programs:
         engine._free_programs.put(program._replace(evaluate_cycle=met(program.evaluate_cycle)))
-    columns = SMALL_GRID.sample_block((slice(None), slice(None)))
+    columns = SMALL_GRID.select_samples((slice(None), slice(None)))
     size = SCAN_BATCH_SIZE + SMALL_GRID.size
     joint_result = engine({name: np.resize(column, size) for name, column in columns.items()})
     for _ in programs:
@@ -503,12 +505,12 @@ os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
 from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
-from vrw_jax.scans.collocation_engine import CollocationEngine
+from vrw_jax.scans.collocation_engine import CollocationScanEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning
-engine = CollocationEngine(scanning.make_plan().request)
-columns = scanning.SMALL_GRID.sample_block((slice(None), slice(None)))
+engine = CollocationScanEngine(scanning.make_plan().request)
+columns = scanning.SMALL_GRID.select_samples((slice(None), slice(None)))
 size = SCAN_BATCH_SIZE + scanning.SMALL_GRID.size
 results = engine({{name: np.resize(column, size) for name, column in columns.items()}})
 devices = {{engine._free_programs.get().device.id for _ in range(engine._n_workers)}}
@@ -537,7 +539,7 @@ def test_two_devices_give_bitwise_the_results_of_one(
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
-    engine: CollocationEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: CollocationScanEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two worker processes; the one at work on most chunks is killed with signal 9 in mid-scan."""
     from distributed import Client, LocalCluster
@@ -551,7 +553,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
-        connect_workers(cluster.scheduler_address) as executor,
+        connect_dask_workers(cluster.scheduler_address) as executor,
     ):
         places = client.run(os.getpid)
 
@@ -564,7 +566,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
                     killed.append(places[victim])
                     os.kill(places[victim], signal.SIGKILL)
 
-        result = run_plan(make_plan(1), shared, on_progress=report, executor=executor)
+        result = run_plan(make_plan(1), shared, on_progress=report, chunk_executor=executor)
         assert len(killed) == 1
         assert killed[0] not in client.run(os.getpid).values()
     assert reports[-1].n_done == SMALL_GRID.size
@@ -574,10 +576,10 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
 
 def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:
     """Otherwise each would trace and compile what the cache holds."""
-    values_here = make_plan().request
+    values_here = make_plan().evaluation_request
     parsed = pickle.loads(pickle.dumps(values_here))
-    assert repr(CollocationEngine(values_here)._cache_key) == repr(
-        CollocationEngine(parsed)._cache_key
+    assert repr(CollocationScanEngine(values_here)._cache_key) == repr(
+        CollocationScanEngine(parsed)._cache_key
     )
 
 
@@ -586,14 +588,14 @@ def compute_backwards(planned: ScanPlan, missing: Sequence[int]) -> Iterator[Chu
         yield (
             index,
             evaluate_arithmetically(
-                planned.design.sample_block(planned.layout.chunk_region(index))
+                planned.design.select_samples(planned.result_layout.get_chunk_region(index))
             ),
         )
 
 
 def test_chunks_may_be_computed_in_any_order(tmp_path: Path) -> None:
     run_plan(make_plan(), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)
-    run_plan(make_plan(), tmp_path / "backwards.zarr", executor=compute_backwards)
+    run_plan(make_plan(), tmp_path / "backwards.zarr", chunk_executor=compute_backwards)
     assert list_files(tmp_path / "backwards.zarr") == list_files(tmp_path / "whole.zarr")
 
 
@@ -606,24 +608,27 @@ def test_workers_with_another_environment_are_refused(
     scan_dask = dask
     environments = iter([{"code": "ours"}])
     monkeypatch.setattr(
-        scan_dask, "describe_environment", lambda: next(environments, {"code": "theirs"})
+        scan_dask, "describe_computing_environment", lambda: next(environments, {"code": "theirs"})
     )
-    monkeypatch.setattr(scan_dask, "_make_engine_once", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(scan_dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
-        connect_workers(cluster.scheduler_address) as executor,
+        connect_dask_workers(cluster.scheduler_address) as executor,
         pytest.raises(ValueError, match="the library's code differs"),
     ):
-        run_plan(make_plan(), tmp_path / "s.zarr", executor=executor)
+        run_plan(make_plan(), tmp_path / "s.zarr", chunk_executor=executor)
     assert np.all(open_scan(tmp_path / "s.zarr").outcome.values == -1)
 
 
 def test_an_address_without_a_scheduler_gets_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(dask, "SCHEDULER_TIMEOUT", "1s")
+    monkeypatch.setattr(dask, "DASK_SCHEDULER_TIMEOUT", "1s")
     for address in ("nonsense://there", "tcp://127.0.0.1:9"):
-        with pytest.raises(ValueError, match="no dask scheduler answers"), connect_workers(address):
+        with (
+            pytest.raises(ValueError, match="no dask scheduler answers"),
+            connect_dask_workers(address),
+        ):
             pass
 
 
@@ -632,8 +637,8 @@ def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
 ) -> None:
     from distributed import LocalCluster
 
-    monkeypatch.setattr(dask, "MAX_SILENT_SECONDS", 0.5)
-    monkeypatch.setattr(dask, "_make_engine_once", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(dask, "MAX_SECONDS_WITHOUT_RESULT", 0.5)
+    monkeypatch.setattr(dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
     run_plan(make_plan(), tmp_path / "alone.zarr", evaluate=evaluate_arithmetically)
     with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster:
         messages: list[str] = []
@@ -642,10 +647,10 @@ def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
             messages.append(str(message))
             cluster.scale(1)
 
-        with connect_workers(cluster.scheduler_address) as executor, warnings.catch_warnings():
+        with connect_dask_workers(cluster.scheduler_address) as executor, warnings.catch_warnings():
             warnings.simplefilter("always")
             monkeypatch.setattr("warnings.showwarning", show)
-            run_plan(make_plan(), tmp_path / "s.zarr", executor=executor)
+            run_plan(make_plan(), tmp_path / "s.zarr", chunk_executor=executor)
     assert len([text for text in messages if "has no workers" in text]) == 1
     assert list_files(tmp_path / "s.zarr") == list_files(tmp_path / "alone.zarr")
 
@@ -655,7 +660,7 @@ def test_a_lost_cluster_gets_one_sentence_and_the_scan_continues_without_it(
 ) -> None:
     from distributed import LocalCluster
 
-    monkeypatch.setattr(dask, "_make_engine_once", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(dask, "_make_worker_engine", lambda _: evaluate_arithmetically)
     cluster = LocalCluster(n_workers=1, processes=False, dashboard_address=None)
     n_done_at_loss: list[int] = []
 
@@ -666,9 +671,11 @@ def test_a_lost_cluster_gets_one_sentence_and_the_scan_continues_without_it(
 
     with (
         pytest.raises(ValueError, match=r"the dask cluster at .* is gone: start it again"),
-        connect_workers(cluster.scheduler_address) as executor,
+        connect_dask_workers(cluster.scheduler_address) as executor,
     ):
-        run_plan(make_plan(1), tmp_path / "s.zarr", on_progress=close_cluster, executor=executor)
+        run_plan(
+            make_plan(1), tmp_path / "s.zarr", on_progress=close_cluster, chunk_executor=executor
+        )
     n_kept = np.count_nonzero(open_scan(tmp_path / "s.zarr").outcome.values != -1)
     assert n_done_at_loss[0] <= n_kept < SMALL_GRID.size
     run_plan(make_plan(1), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)

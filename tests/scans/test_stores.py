@@ -60,7 +60,7 @@ CHUNK_FILE = "c/1/0"
 def test_a_damaged_chunk_is_computed_again_with_a_warning(
     complete_store: Path, what: str, variable: str
 ) -> None:
-    full_values, n = list_files(complete_store), make_plan().layout.n_chunks
+    full_values, n = list_files(complete_store), make_plan().result_layout.n_chunks
     file = complete_store / variable / (CHUNK_FILE + "/0" * (variable == "locked_stopper_force"))
     DAMAGE_CASES[what](file)
     with pytest.raises(ValueError, match=r"1 damaged chunk \(number 1\): run the scan again"):
@@ -102,7 +102,7 @@ def test_damage_in_an_unfinished_scan_is_found(tmp_path: Path) -> None:
     rest = CountingEngine()
     with pytest.warns(UserWarning, match="damaged"):
         run_plan(make_plan(), store, evaluate=rest)
-    assert rest.n_calls == make_plan().layout.n_chunks - 3 + 1
+    assert rest.n_calls == make_plan().result_layout.n_chunks - 3 + 1
     assert list_files(store) == list_files(tmp_path / "whole.zarr")
 
 
@@ -129,7 +129,7 @@ def test_a_damaged_chunk_is_not_recomputed_by_other_code(
     complete_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (complete_store / "speed" / CHUNK_FILE).unlink()
-    monkeypatch.setattr(planning, "source_digest", lambda: "other")
+    monkeypatch.setattr(planning, "compute_source_digest", lambda: "other")
     with pytest.raises(ValueError, match=r"lacks 1 of 5 chunks \(1 of them damaged\)"):
         run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
 
@@ -200,7 +200,7 @@ def test_a_misspelled_solver_is_refused_before_a_store_is_created(tmp_path: Path
 def test_a_second_scan_on_the_same_store_is_refused(complete_store: Path) -> None:
     (complete_store / "speed" / CHUNK_FILE).unlink()
     with (
-        soundness.store_lock(complete_store),
+        soundness.lock_store(complete_store),
         pytest.warns(UserWarning, match="damaged"),
         pytest.raises(ValueError, match="another scan is at work"),
     ):
@@ -213,13 +213,13 @@ def test_of_two_simultaneous_scans_one_creates_the_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both find nothing there, and both build; one is the first to put its own in place."""
-    joint_result, fill = threading.Barrier(2, timeout=60.0), scan_store._create_arrays
+    joint_result, fill = threading.Barrier(2, timeout=60.0), scan_store._create_zarr_arrays
 
     def filled(*arguments: object) -> None:
         fill(*arguments)
         joint_result.wait()
 
-    monkeypatch.setattr(scan_store, "_create_arrays", filled)
+    monkeypatch.setattr(scan_store, "_create_zarr_arrays", filled)
     ends: list[object] = []
 
     def scan() -> None:
@@ -347,7 +347,7 @@ def test_damaged_metadata_of_an_array_are_said_and_mended(
         open_scan(complete_store)
     assert (
         f"damaged metadata ({name})"
-        in running.find_store(make_plan(), complete_store).damage_description
+        in running.find_matching_store(make_plan(), complete_store).damage_description
     )
     again = CountingEngine()
     with pytest.warns(UserWarning, match="damaged metadata"):
@@ -415,8 +415,8 @@ def as_before_marks_covered_settings(complete_store: Path) -> None:
         soundness.StoredMetadata(complete_store),
     )
     books = soundness.ChunkChecksums(complete_store, group, metadata)
-    for index in range(make_plan().layout.n_chunks):
-        books.mark_chunk(index)
+    for index in range(make_plan().result_layout.n_chunks):
+        books.mark_chunk_as_written(index)
 
 
 @pytest.mark.parametrize("what", [None, *DAMAGE_CASES])

@@ -14,7 +14,7 @@ def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
     """Return a scan that computes Ishigami's function, and its unit coordinates."""
     design = vrw.saltelli(ISHIGAMI_RANGES, n)
     low, high = np.array(list(ISHIGAMI_RANGES.values())).T
-    unit = (np.stack(list(design.values.values()), 1) - low) / (high - low)
+    unit = (np.stack(list(design.values_by_parameter.values()), 1) - low) / (high - low)
     x, y, z = np.pi * (2.0 * unit.T - 1.0)
     value = np.sin(x) + 7.0 * np.sin(y) ** 2 + 0.1 * z**4 * np.sin(x)
     result_by_name = {
@@ -22,7 +22,7 @@ def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
         "period": ("sample", 2.0 * unit[:, 0] + unit[:, 1]),
     }
     outcome = np.full(design.size, int(Outcome.STEPPED))
-    attrs = {"scan": {"design": design.describe_identity()}}
+    attrs = {"scan": {"design": design.describe_design()}}
     return xr.Dataset(result_by_name | {"outcome": ("sample", outcome)}, attrs=attrs), unit
 
 
@@ -53,7 +53,7 @@ def test_a_measure_that_varies_by_round_off_has_indices_of_zero(value: float) ->
     scan["step_length"] = ("sample", value + ulps * np.spacing(value) * (value != 0.0))
     with pytest.warns(UserWarning, match=r"step_length: constant .* round-off"):
         indices = vrw.sobol_indices(scan, ["period", "step_length"])
-    assert indices.is_constant.values.tolist() == [False, True]
+    assert indices.is_constant_measure.values.tolist() == [False, True]
     for name in ("first_order", "total"):
         for part in ("", "_lower", "_upper"):
             assert np.all(indices[name + part].sel(measure="step_length") == 0.0)

@@ -31,8 +31,8 @@ def compute_waves(a, b):
 
 
 def compile_for_arm(function, *lanes):
-    return machine.compile_native(
-        kernel.write_module(code.trace_for_machine_code(function, *lanes), LANES_PER_REGISTER)
+    return machine.compile_llvm_for_processor(
+        kernel.write_llvm_kernel(code.trace_for_machine_code(function, *lanes), LANES_PER_REGISTER)
     )
 
 

@@ -55,7 +55,7 @@ def test_a_later_start_neither_traces_nor_compiles(monkeypatch, fresh_process):
     double, traces = make_counted_function()
     store = MemoryStore()
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    monkeypatch.setattr(code, "compile_native", None)  # would fail
+    monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
     fresh_process.reset_registry()
     assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
@@ -71,7 +71,7 @@ def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, fresh_pro
         fresh_process.reset_registry()
     else:
         store = None
-    monkeypatch.setattr(code, "compile_native", None)  # would fail
+    monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
     assert run_program(double, ("double", "after an edit of its docstring"), store) == [
         0.0,
         2.0,
@@ -90,7 +90,7 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
     store = MemoryStore()
     assert run_program(make_counted_function(2.0)[0], 2, store)[3] == 6.0
     assert run_program(make_counted_function(3.0)[0], 3, store)[3] == 9.0
-    monkeypatch.setattr(code, "compilation_key", lambda: "by another processor")
+    monkeypatch.setattr(code, "describe_compilation", lambda: "by another processor")
     double, traces = make_counted_function()
     assert run_program(double, 2, store)[3] == 6.0
     assert len(traces) == 1
@@ -99,8 +99,10 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
 
 
 def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatch):
-    may, compiled = threading.Event(), code.compile_native
-    monkeypatch.setattr(code, "compile_native", lambda text: may.wait(60) and compiled(text))
+    may, compiled = threading.Event(), code.compile_llvm_for_processor
+    monkeypatch.setattr(
+        code, "compile_llvm_for_processor", lambda text: may.wait(60) and compiled(text)
+    )
     evaluate_both = lambda x: run_two_programs(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
     traced = jax.jit(evaluate_both).trace(X)
     may.set()
@@ -109,7 +111,7 @@ def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatc
     def refuse(text):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(code, "compile_native", refuse)
+    monkeypatch.setattr(code, "compile_llvm_for_processor", refuse)
     traced = jax.jit(
         lambda x: run_two_programs(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)
     ).trace(X)
@@ -149,10 +151,10 @@ def test_code_is_loaded_by_its_name(fresh_process):
     double = simd.compile_lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
     jax.jit(double)(jnp.ones(3))
     (name,) = fresh_process.names
-    assert not simd.ensure_loaded([name, "lanes_code_of_none"], store)
+    assert not simd.load_saved_machine_code([name, "lanes_code_of_none"], store)
     fresh_process.reset_registry()
-    assert not simd.ensure_loaded([name], None)
-    assert simd.ensure_loaded([name], store)
+    assert not simd.load_saved_machine_code([name], None)
+    assert simd.load_saved_machine_code([name], store)
     assert fresh_process.names == [name, name]
 
 
@@ -168,7 +170,7 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
         table = jnp.arange(9.0, dtype=jnp.float32)
         shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
         closed = code_cache.trace_for_machine_code(lambda x: step(x, table), shape)
-        print(code_cache._digest(kernel.write_module(closed, 8).encode()))
+        print(code_cache._compute_sha256_digest(kernel.write_llvm_kernel(closed, 8).encode()))
     """
     lines = "\n".join(line[8:] for line in result.splitlines())
     method_names = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
@@ -190,6 +192,6 @@ def test_repeated_operations_along_an_axis_are_emitted_once():
     def length(n):
         shape = jax.ShapeDtypeStruct((1021,), jnp.float64)
         closed = code.trace_for_machine_code(lambda x: sampled(n, x), shape)
-        return len(kernel.write_module(closed, 8))
+        return len(kernel.write_llvm_kernel(closed, 8))
 
     assert length(900) < 1.1 * length(100)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from vrw_jax.simd import fallback, kernel, rules
-fallback.LATEST_TESTED_JAX = (0, 1)
+fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
 {change}
 import vrw_jax as vrw
 from vrw_jax import simd
@@ -30,7 +30,7 @@ def double_until_large(x):
     return lax.while_loop(lambda y: jnp.any(y < 9.0), lambda y: jnp.where(y < 9.0, 2.0 * y, y), x)
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
-    is_available = simd.is_available()
+    is_available = simd.is_machine_code_available()
     run = simd.compile_lane_function(double_until_large, double_until_large, "doubling", None)
     x = jnp.linspace(1.0, 10.0, 9)
     in_jit = (jax.jit(run) if is_available else jax.jit(double_until_large))(x).tolist()
@@ -39,12 +39,12 @@ with warnings.catch_warnings(record=True) as caught:
     )
     of_arrays = program([], [np.asarray(x)])[0].tolist()
 messages = [str(w.message) for w in caught if "machine code does not work" in str(w.message)]
-print(json.dumps([in_jit, of_arrays, messages, simd.is_available()]))
+print(json.dumps([in_jit, of_arrays, messages, simd.is_machine_code_available()]))
 """
 
 CHANGES = {
     "a primitive is new": 'del rules.PRIMITIVE_RULES["while"]',
-    "the call interface differs": "kernel.read_api_version = lambda: (7, 0)",
+    "the call interface differs": "kernel.read_ffi_api_version = lambda: (7, 0)",
     "nothing differs": "",
 }
 
@@ -76,8 +76,8 @@ WHEEL_PROGRAM = """
 import json, sys, warnings
 import numpy as np
 from vrw_jax.simd import fallback, kernel
-fallback.LATEST_TESTED_JAX = (0, 1)
-kernel.read_api_version = lambda: (7, 0)
+fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
+kernel.read_ffi_api_version = lambda: (7, 0)
 import vrw_jax as vrw
 vrw.start_jax(sys.argv[1])
 warnings.simplefilter("ignore")
@@ -101,15 +101,15 @@ def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
     run = simd.compile_lane_function(lambda x: x + 1.0, lambda x: x, "version test", None)
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
-    code = list(ffi_primitive.LOADED_BY_NAME.values())[-1]
+    code = list(ffi_primitive.LOADED_CODE_BY_NAME.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
-        code.find_address(ffi_handler.HANDLER_NAME)
+        code.find_function_address(ffi_handler.FFI_HANDLER_NAME)
     )
     metadata = (ctypes.c_int64 * 8)()
-    extension = (ctypes.c_int64 * 4)(32, ffi_handler.METADATA_EXTENSION_TYPE, 0)
+    extension = (ctypes.c_int64 * 4)(32, ffi_handler.FFI_METADATA_EXTENSION_TYPE, 0)
     extension[3] = ctypes.addressof(metadata)
     frame = (ctypes.c_int64 * 32)(0, ctypes.addressof(extension))
     assert not handler(ctypes.addressof(frame))
-    version = ffi_handler.read_api_version()
+    version = ffi_handler.read_ffi_api_version()
     assert tuple((ctypes.c_int32 * 2).from_buffer(metadata, 24)) == version
     assert version != (0, 0)

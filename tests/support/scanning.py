@@ -55,11 +55,15 @@ def run_plan(
         for index in missing:
             yield (
                 index,
-                evaluate(running_plan.design.sample_block(running_plan.layout.chunk_region(index))),
+                evaluate(
+                    running_plan.design.select_samples(
+                        running_plan.result_layout.get_chunk_region(index)
+                    )
+                ),
             )
 
     return running.run_scan(
-        plan_of_scan, store, **({"executor": compute_in_order} if evaluate else {}) | keywords
+        plan_of_scan, store, **({"chunk_executor": compute_in_order} if evaluate else {}) | keywords
     )
 
 

@@ -11,8 +11,13 @@ import vrw_jax as vrw
 from vrw_jax.cycles import make_finder
 from vrw_jax.cycles.margin_defaults import KEPT_MARGIN_NAMES, default_margins
 from vrw_jax.measures.table import MARGIN_MEASURES
-from vrw_jax.tuning.maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
-from vrw_jax.tuning.objective import max_breach, parse_margins, scale_slacks, signed_bound
+from vrw_jax.tuning.maximization import DEFAULT_MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
+from vrw_jax.tuning.objective import (
+    compute_max_violation,
+    compute_slack_scales,
+    parse_constraint_margins,
+    restore_bound_sign,
+)
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
 from vrw_jax.tuning.tune_result import TuneResult
 from vrw_jax.wheel import PARAMETER_NAMES
@@ -47,13 +52,13 @@ def test_gradients_of_objective_and_all_constraints_agree_with_central_differenc
     problem = make_problem({"dls_fraction": 1.0, "speed": -0.3})
     u = np.array([0.7, 0.45, 0.4, 0.55])
     values_here = problem.evaluate_trial(u, None)
-    exact = np.vstack([values_here.gradient, values_here.slack_jacobian])
+    exact = np.vstack([values_here.objective_gradient, values_here.slack_jacobian])
     for i in range(u.size):
         h = 1e-3 * np.eye(u.size)[i]
         values = []
         for k in (-2, -1, 1, 2):
             values_there = problem.evaluate_trial(u + k * h, values_here)
-            values.append(np.r_[values_there.objective, values_there.slack])
+            values.append(np.r_[values_there.objective, values_there.constraint_slacks])
         # Fourth order, and exact to the step's error over h.
         difference = (values[0] - 8.0 * values[1] + 8.0 * values[2] - values[3]) / 12e-3
         scale = np.maximum(np.abs(exact).max(axis=1), 1e-3)
@@ -65,13 +70,16 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
     assert max_dls_result.kkt_residual < 1e-6
     assert {a.name for a in max_dls_result.active} >= {"takeoff_acceleration", "slope"}
     assert all(a.price > 0.0 for a in max_dls_result.active)
-    retained = make_problem("dls_fraction").make_trial(
+    retained = make_problem("dls_fraction").make_evaluated_trial(
         np.zeros(4), find_max_dls_gait(max_dls_result), vrw.Outcome.STEPPED, True
     )
     # A constraint counts as kept within ACTIVE widths; the gait found afresh differs by 1e-9.
     assert (
-        max_breach(retained.slack, scale_slacks(retained.slack, retained.slack_jacobian))
-        <= 1.01 * MAXIMIZATION_OPTIONS.active_bound_tolerance
+        compute_max_violation(
+            retained.constraint_slacks,
+            compute_slack_scales(retained.constraint_slacks, retained.slack_jacobian),
+        )
+        <= 1.01 * DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
     )
 
 
@@ -79,24 +87,24 @@ def find_max_dls_gait(tuned: TuneResult):
     """Return the gait at a result, computed without a guess."""
     problem = make_problem("dls_fraction")
     u = (
-        np.array([float(getattr(tuned.params, n)) for n in FREE_PARAMETERS]) - problem.lower
-    ) / problem.widths
-    return problem.evaluate_trial(u, None).evaluation
+        np.array([float(getattr(tuned.params, n)) for n in FREE_PARAMETERS]) - problem.lower_bounds
+    ) / problem.bound_widths
+    return problem.evaluate_trial(u, None).gait_evaluation
 
 
 def test_no_wheel_on_a_grid_around_the_optimum_is_better(max_dls_result):
     problem = make_problem("dls_fraction")
     u = (
         np.array([float(getattr(max_dls_result.params, n)) for n in FREE_PARAMETERS])
-        - problem.lower
+        - problem.lower_bounds
     )
-    u = u / problem.widths
+    u = u / problem.bound_widths
     centre = problem.evaluate_trial(u, None)
     better = retained = 0
     for offsets in itertools.product((-0.02, 0.0, 0.02), repeat=4):
         place = np.clip(u + np.array(offsets), 0.0, 1.0)
         trial = problem.evaluate_trial(place, centre)
-        if trial.is_found and np.all(trial.slack >= 0.0):
+        if trial.has_gait_on_branch and np.all(trial.constraint_slacks >= 0.0):
             retained += 1
             better += trial.objective > centre.objective + 1e-9
     assert retained >= 5
@@ -209,7 +217,7 @@ def test_functions_of_cycle_and_step_are_objectives_like_names():
     )
     for other in (of_both, of_cycle):
         np.testing.assert_allclose(other.objective, by_name.objective, rtol=1e-8)
-        np.testing.assert_allclose(other.gradient, by_name.gradient, rtol=1e-6)
+        np.testing.assert_allclose(other.objective_gradient, by_name.objective_gradient, rtol=1e-6)
 
 
 def test_the_path_is_a_labelled_dataset_and_the_result_prints_itself(max_dls_result, tmp_path):
@@ -264,7 +272,7 @@ def test_many_starts_reach_the_same_optimum(max_dls_result):
     np.testing.assert_allclose(many.value, max_dls_result.value, rtol=1e-6)
     walkers = np.isfinite(many.exploration.objective)
     assert walkers.sum() >= 4
-    near = many.exploration.max_breach[walkers] < 0.05
+    near = many.exploration.max_violations[walkers] < 0.05
     assert np.median(many.exploration.objective[walkers][near]) > 0.7  # of 0.786 after 25 steps
 
 
@@ -280,14 +288,14 @@ def test_a_start_without_a_gait_is_refused():
 def test_constraints_of_a_unilateral_gait_are_lower_bounds_or_ranges():
     ground = make_finder(vrw.UnilateralWheel(), 8)
     given = {"slip": (0.0, 0.05), "speed": 1.0}
-    margins = parse_margins(vrw.WheelParams(), given, ground)
+    margins = parse_constraint_margins(vrw.WheelParams(), given, ground)
     assert margins == {"-slip": -0.05, "slip": 0.0, "speed": 1.0}
-    assert [signed_bound(*pair) for pair in margins.items()] == [0.05, 0.0, 1.0]
-    assert parse_margins(vrw.WheelParams(), None, ground) == {}
+    assert [restore_bound_sign(*pair) for pair in margins.items()] == [0.05, 0.0, 1.0]
+    assert parse_constraint_margins(vrw.WheelParams(), None, ground) == {}
     with pytest.raises(ValueError, match="clearance_sls1"):
-        parse_margins(vrw.WheelParams(), ["clearance_sls1"], ground)
+        parse_constraint_margins(vrw.WheelParams(), ["clearance_sls1"], ground)
     with pytest.raises(ValueError, match="holds nothing"):
-        parse_margins(vrw.WheelParams(), {"slip": (0.05, 0.0)}, ground)
+        parse_constraint_margins(vrw.WheelParams(), {"slip": (0.05, 0.0)}, ground)
 
 
 @pytest.mark.parametrize(
@@ -300,13 +308,13 @@ def test_constraints_of_a_unilateral_gait_are_lower_bounds_or_ranges():
 )
 def test_none_at_an_end_of_a_constraint_s_range_is_no_bound(pair, margins):
     finder = make_finder(vrw.ViscoelasticWheel(), 8)
-    assert parse_margins(vrw.WheelParams(), {"dls_fraction": pair}, finder) == margins
+    assert parse_constraint_margins(vrw.WheelParams(), {"dls_fraction": pair}, finder) == margins
 
 
 def test_a_range_without_any_bound_is_refused():
     finder = make_finder(vrw.ViscoelasticWheel(), 8)
     with pytest.raises(ValueError, match="bounds nothing"):
-        parse_margins(vrw.WheelParams(), {"dls_fraction": (None, None)}, finder)
+        parse_constraint_margins(vrw.WheelParams(), {"dls_fraction": (None, None)}, finder)
 
 
 def test_an_upper_bound_alone_is_kept():
@@ -330,7 +338,9 @@ def test_unilateral_tuning_keeps_the_slip_within_its_bound():
         problem.evaluate_trial(problem.normalized_start + d, values_here) for d in (1e-3, -1e-3)
     ]
     np.testing.assert_allclose(
-        values_here.slack_jacobian[:, 0], (ends[0].slack - ends[1].slack) / 2e-3, rtol=1e-4
+        values_here.slack_jacobian[:, 0],
+        (ends[0].constraint_slacks - ends[1].constraint_slacks) / 2e-3,
+        rtol=1e-4,
     )
     tuned = tune(start, "dls_fraction", ["damping"], bounds, given, model=ground)
     assert float(tuned.step.slip) == pytest.approx(0.06, abs=1e-7)

@@ -6,8 +6,12 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.figures.branch_figures import basin_figure
-from vrw_jax.simulation.attractors import WalkEnds, find_distinct_orbits
-from vrw_jax.simulation.basins import POST_LANDING_NAMES, PRE_TOUCHDOWN_NAMES, compute_end_fractions
+from vrw_jax.simulation.attractors import PeriodicWalkEnds, find_distinct_orbits
+from vrw_jax.simulation.basins import (
+    POST_LANDING_COMPONENT_NAMES,
+    PRE_TOUCHDOWN_COMPONENT_NAMES,
+    compute_walk_end_fractions,
+)
 
 OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 
@@ -35,9 +39,9 @@ def test_the_attractor_is_the_limit_cycle(basins):
 
 
 def test_the_basin_at_200_is_far_smaller_than_at_100(basins):
-    assert compute_end_fractions(basins[100.0])["attractor 0"] > 0.9
+    assert compute_walk_end_fractions(basins[100.0])["attractor 0"] > 0.9
     assert (
-        compute_end_fractions(basins[200.0])["attractor 0"] < 0.6
+        compute_walk_end_fractions(basins[200.0])["attractor 0"] < 0.6
     )  # half of the 24 starts, one at its edge
 
 
@@ -73,8 +77,8 @@ def test_starts_after_a_landing_reach_the_attractors_of_the_starts_before_it():
     result = vrw.basin(params, grid, options=OPTIONS)
     assert result.attractor.values[0, 0] == 0
     assert result.steps.values[0, 0] <= 1
-    assert set(result.coords) >= set(POST_LANDING_NAMES)
-    assert not set(result.coords) & set(PRE_TOUCHDOWN_NAMES)
+    assert set(result.coords) >= set(POST_LANDING_COMPONENT_NAMES)
+    assert not set(result.coords) & set(PRE_TOUCHDOWN_COMPONENT_NAMES)
 
 
 def test_orbits_do_not_depend_on_their_first_step():
@@ -82,10 +86,10 @@ def test_orbits_do_not_depend_on_their_first_step():
     orbit[0, :2] = [[0.1, 1.0, 0.0], [0.1, 1.5, 0.0]]
     orbit[1, :2] = orbit[0, :2] + 1e-6
     orbit[2, :1] = [[0.1, 1.2, 0.0]]
-    settled = WalkEnds(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
+    settled = PeriodicWalkEnds(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
     solution = find_distinct_orbits(settled)
-    assert solution.orbit_index.tolist() == [0, 0, 1]
-    assert [len(o) for o in solution.orbits] == [2, 1]
+    assert solution.orbit_indices.tolist() == [0, 0, 1]
+    assert [len(o) for o in solution.orbit_states] == [2, 1]
 
 
 def test_an_incomplete_grid_is_refused_with_the_missing_names():

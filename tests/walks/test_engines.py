@@ -138,7 +138,7 @@ def test_the_result_names_its_engine():
     assert would(options=vrw.StepOptions(solver="Kvaerno5")) == "diffrax"
 
 
-@pytest.mark.skipif(not simd.is_available(), reason="machine code is for CPUs")
+@pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
 def test_a_jacobian_within_jit_compiles_only_its_own_machine_code(monkeypatch):
     class AskedError(Exception):
         pass

@@ -7,7 +7,7 @@ from reference_code import complementarity
 from scipy.integrate import solve_ivp
 
 import vrw_jax as vrw
-from vrw_jax.simulation import SAMPLED_PEAK_MEASURES
+from vrw_jax.simulation import SAMPLED_FORCE_PEAK_MEASURES
 
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
 TIGHT = vrw.StepOptions.tight()
@@ -19,7 +19,7 @@ def test_peaks_of_a_sampled_step_are_those_of_its_gait():
     cycle = vrw.limit_cycle(TWO_PEAKS)
     peaks = vrw.force_peaks(vrw.simulate(TWO_PEAKS, cycle.section_state, 2, options=TIGHT))
     assert peaks.sizes["step"] == 2
-    for name, value in cycle.measures(SAMPLED_PEAK_MEASURES).items():
+    for name, value in cycle.measures(SAMPLED_FORCE_PEAK_MEASURES).items():
         np.testing.assert_allclose(peaks[name], value, rtol=1e-7, err_msg=name)
     assert peaks.n_force_peaks.attrs["units"] == "1"
     np.testing.assert_array_equal(peaks.is_maximum, [True, False, True] * 2)

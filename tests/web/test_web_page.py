@@ -265,7 +265,9 @@ def test_the_frame_of_a_widget_exchanges_values_in_both_directions(browser):
         "map": {},
         "measures": {},
     }
-    traits["values"] = explorer._page_values(vrw.WheelParams(damping=150.0), 0.9, "viscoelastic")
+    traits["values"] = explorer._make_page_values(
+        vrw.WheelParams(damping=150.0), 0.9, "viscoelastic"
+    )
     shown_values.evaluate(
         """traits => {
           const listeners = {};

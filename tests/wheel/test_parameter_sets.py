@@ -34,7 +34,7 @@ def test_a_design_may_sweep_a_parameter_of_the_set():
     text = '[wheel]\nparameter_set = "two_peaks"\n[grid]\nslope = [0.07, 0.075]\n'
     design = parse_config(text).design
     assert design is not None
-    assert design.names == ("slope",)
+    assert design.swept_parameters == ("slope",)
 
 
 def test_an_unknown_set_is_refused_with_the_names_of_all():

@@ -210,7 +210,9 @@ def end_by_lane_engine():
 def end_by_step_collocation():
     """Collocate repeatedly, because the duration is not known before."""
     phase, q, v = make_state_at(2)
-    run = jax.jit(lambda q, v, T: fixed_work.collocate_phase(phase, q, v, T, PhaseMesh(2, 1.0)))
+    run = jax.jit(
+        lambda q, v, T: fixed_work.solve_phase_by_collocation(phase, q, v, T, PhaseMesh(2, 1.0))
+    )
     duration = jnp.asarray(0.2, float)  # of no weak type, as what comes back
     for _ in range(3):
         end = run(q, v, duration)

@@ -6,31 +6,32 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.batches.walk_batch import (
-    START_NAME,
+    START_INPUT_NAME,
     StepBatchResult,
     StepwiseParameter,
     WalkBatch,
-    complete_batch_slopes,
+    complete_slopes_over_steps,
 )
 from vrw_jax.contact import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES
 
-CONTACT_PARAMETERS = (*PARAMETER_NAMES, "friction")
-UNEVEN_GROUND_PARAMETERS = ("previous_friction", "tilt")
+CONTACT_PARAMETER_NAMES = (*PARAMETER_NAMES, "friction")
+UNEVEN_GROUND_PARAMETER_NAMES = ("previous_friction", "tilt")
 """Parameters that uneven ground adds: friction of the feet that landed earlier, and the angle by
 which the next line is steeper, rad."""
-SLOPE_INDEX = CONTACT_PARAMETERS.index("slope")
-FRICTION_INDEX = CONTACT_PARAMETERS.index("friction")
-CONTACT_STEP_INPUTS = (START_NAME, *CONTACT_PARAMETERS)
-"""Inputs of a step with respect to which derivatives are available."""
+CONTACT_SLOPE_INDEX = CONTACT_PARAMETER_NAMES.index("slope")
+CONTACT_FRICTION_INDEX = CONTACT_PARAMETER_NAMES.index("friction")
+CONTACT_STEP_INPUT_NAMES = (START_INPUT_NAME, *CONTACT_PARAMETER_NAMES)
+"""Names of the inputs of a step with unilateral contact with respect to which derivatives are
+available."""
 
 
 def step_batch_with_contact(
     model: Any,
-    parameters: list[np.ndarray],
-    states: np.ndarray,
+    parameter_columns: list[np.ndarray],
+    section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
     engine: str,
@@ -41,8 +42,8 @@ def step_batch_with_contact(
 
     Without derivatives, all steps of an element on flat ground are one walk of the kernel.
     """
-    friction = np.asarray(model.friction, states.dtype)
-    is_uneven = any(np.ndim(x) == 2 for x in (*parameters, friction))
+    element_friction = np.asarray(model.friction, section_states.dtype)
+    is_uneven = any(np.ndim(x) == 2 for x in (*parameter_columns, element_friction))
     if engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {engine!r} and solver {options.solver}, but batches with contact need "
@@ -53,112 +54,159 @@ def step_batch_with_contact(
             f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
             "for all elements: call vrw.step_batch for each restitution."
         )
-    ground = _GroundBySteps.from_arrays(parameters[SLOPE_INDEX], friction, len(states), n_steps)
-    parameters = [ground.slopes[0] if i == SLOPE_INDEX else x for i, x in enumerate(parameters)]
-    input_columns = np.stack(
-        [np.broadcast_to(x, len(states)) for x in (*parameters, ground.friction[0])]
+    stepwise_ground = _StepwiseGround.repeat_over_steps(
+        parameter_columns[CONTACT_SLOPE_INDEX], element_friction, len(section_states), n_steps
     )
-    states = embed_section_states(input_columns, states, n_legs)
-    int_zeros = np.zeros(len(states), np.int32)
+    parameter_columns = [
+        stepwise_ground.slopes_by_step[0] if i == CONTACT_SLOPE_INDEX else x
+        for i, x in enumerate(parameter_columns)
+    ]
+    parameter_rows = np.stack(
+        [
+            np.broadcast_to(x, len(section_states))
+            for x in (*parameter_columns, stepwise_ground.friction_by_step[0])
+        ]
+    )
+    section_states = embed_section_states(parameter_rows, section_states, n_legs)
+    integer_zeros = np.zeros(len(section_states), np.int32)
     if not derivative_names and not is_uneven:
-        walk_result = walk_batch(input_columns, states, n_steps, model, options, n_legs)
-        x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, walk_result)
-        result_arrays = x, durations, outcome, n_stepped, n_solver_steps, int_zeros > 0, int_zeros
+        kernel_walk_result = walk_batch(
+            parameter_rows, section_states, n_steps, model, options, n_legs
+        )
+        x, durations, outcome, n_stepped, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
+        result_arrays = (
+            x,
+            durations,
+            outcome,
+            n_stepped,
+            n_solver_steps,
+            integer_zeros > 0,
+            integer_zeros,
+        )
         return StepBatchResult(*result_arrays, engine="lanes", solver_names=(options.solver,))
-    parameter_names: tuple[str, ...] = CONTACT_PARAMETERS
+    parameter_names: tuple[str, ...] = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_uneven:
-        parameter_names = (*CONTACT_PARAMETERS, *UNEVEN_GROUND_PARAMETERS)
-        stepwise_parameters = ground.stepwise_parameters()
-    walks = WalkBatch(states.T.copy(), derivative_names, parameter_names, stepwise_parameters)
+        parameter_names = (*CONTACT_PARAMETER_NAMES, *UNEVEN_GROUND_PARAMETER_NAMES)
+        stepwise_parameters = stepwise_ground.make_stepwise_parameters()
+    active_walks = WalkBatch(
+        section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
+    )
     for k in range(n_steps):
-        active_lanes = walks.active_lanes()
+        active_lanes = active_walks.find_active_lanes()
         if not len(active_lanes):
             break
-        input_columns = ground.parameters_of_step(k, input_columns) if is_uneven else input_columns
+        parameter_rows = (
+            stepwise_ground.make_step_parameters(k, parameter_rows) if is_uneven else parameter_rows
+        )
         step_arguments = (
-            input_columns[:, active_lanes],
-            walks.section_state[:, active_lanes].T,
+            parameter_rows[:, active_lanes],
+            active_walks.section_state[:, active_lanes].T,
             model,
             options,
             n_legs,
         )
         if not derivative_names:
-            walk_result = walk_batch(step_arguments[0], step_arguments[1], 1, *step_arguments[2:])
-            x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, walk_result)
-            walks.record_step(
+            kernel_walk_result = walk_batch(
+                step_arguments[0], step_arguments[1], 1, *step_arguments[2:]
+            )
+            x, durations, outcome, _, n_solver_steps, _ = map(np.asarray, kernel_walk_result)
+            active_walks.record_lane_steps(
                 active_lanes,
                 (x.T, durations.T, outcome, n_solver_steps),
-                int_zeros[active_lanes] > 0,
+                integer_zeros[active_lanes] > 0,
             )
             continue
-        step_result, step_jacobian = step_batch_with_jacobian(*step_arguments, walks.input_indices)
-        full_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)
-        input_jacobian = full_jacobian[:, :, list(walks.input_indices)]
-        step_values = (
-            step_result.section_state,
-            step_result.durations,
-            step_result.outcome,
-            step_result.solver_steps,
+        contact_step_result, step_jacobian = step_batch_with_jacobian(
+            *step_arguments, active_walks.input_indices
         )
-        walks.record_step(
+        full_jacobian = np.concatenate([step_jacobian.section_state, step_jacobian.durations], 1)
+        input_jacobian = full_jacobian[:, :, list(active_walks.input_indices)]
+        step_values = (
+            contact_step_result.section_state,
+            contact_step_result.durations,
+            contact_step_result.outcome,
+            contact_step_result.solver_steps,
+        )
+        active_walks.record_lane_steps(
             active_lanes,
             tuple(np.asarray(x).T for x in (*step_values, input_jacobian)),
-            int_zeros[active_lanes] > 0,
+            integer_zeros[active_lanes] > 0,
         )
-    return walks.to_result(np.arange(len(states)), int_zeros, "lanes", (options.solver,))
+    return active_walks.make_batch_result(
+        np.arange(len(section_states)), integer_zeros, "lanes", (options.solver,)
+    )
 
 
-class _GroundBySteps(NamedTuple):
+class _StepwiseGround(NamedTuple):
     """Slope and friction of the ground of each step."""
 
-    slopes: np.ndarray  # (n_steps + 1, elements), rad
-    friction: np.ndarray  # (n_steps, elements)
-    n_slopes: int | None  # number of given slopes of an element; None without steps
-    n_frictions: int | None
+    slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
+    friction_by_step: np.ndarray  # (n_steps, elements)
+    n_given_slopes: int | None  # number of given slopes of an element; None without steps
+    n_given_frictions: int | None
 
     @classmethod
-    def from_arrays(
-        cls, slope: np.ndarray, friction: np.ndarray, n_elements: int, n_steps: int
-    ) -> "_GroundBySteps":
+    def repeat_over_steps(
+        cls, element_slopes: np.ndarray, element_friction: np.ndarray, n_elements: int, n_steps: int
+    ) -> "_StepwiseGround":
         """Return the ground, with scalars and arrays over the batch repeated for each step."""
-        n_given_by_quantity = (x.shape[1] if x.ndim == 2 else None for x in (slope, friction))
-
-        def expand_over_steps(x: np.ndarray, n_rows: int) -> np.ndarray:
-            return x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_rows, 1)).T
-
-        slopes = complete_batch_slopes(expand_over_steps(slope, n_steps + 1), n_steps)
-        return cls(slopes, expand_over_steps(friction, n_steps).T[:n_steps], *n_given_by_quantity)
-
-    def parameters_of_step(self, k: int, input_columns: np.ndarray) -> np.ndarray:
-        """Return the parameters of step k, with those of `UNEVEN_GROUND_PARAMETERS`, (parameters,
-        elements).
-        """
-        input_columns = np.concatenate(
-            [input_columns[: len(CONTACT_PARAMETERS)], np.empty((2, input_columns.shape[1]))]
+        n_given_values = (
+            x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
-        input_columns[SLOPE_INDEX], input_columns[FRICTION_INDEX] = self.slopes[k], self.friction[k]
-        input_columns[-2:] = self.friction[max(k - 1, 0)], self.slopes[k + 1] - self.slopes[k]
-        return input_columns
 
-    def stepwise_parameters(self) -> dict[str, StepwiseParameter]:
-        """Return the roles of slopes and friction in the steps, by name."""
-        previous_friction_index = len(CONTACT_PARAMETERS)
+        def expand_over_steps(x: np.ndarray, n_repetitions: int) -> np.ndarray:
+            return (
+                x if x.ndim == 2 else np.tile(np.broadcast_to(x, n_elements), (n_repetitions, 1)).T
+            )
+
+        slopes_by_step = complete_slopes_over_steps(
+            expand_over_steps(element_slopes, n_steps + 1), n_steps
+        )
+        return cls(
+            slopes_by_step,
+            expand_over_steps(element_friction, n_steps).T[:n_steps],
+            *n_given_values,
+        )
+
+    def make_step_parameters(self, k: int, parameter_rows: np.ndarray) -> np.ndarray:
+        """Return the parameters of step k, including `UNEVEN_GROUND_PARAMETER_NAMES`, shape
+        (parameters, elements)."""
+        parameter_rows = np.concatenate(
+            [parameter_rows[: len(CONTACT_PARAMETER_NAMES)], np.empty((2, parameter_rows.shape[1]))]
+        )
+        parameter_rows[CONTACT_SLOPE_INDEX], parameter_rows[CONTACT_FRICTION_INDEX] = (
+            self.slopes_by_step[k],
+            self.friction_by_step[k],
+        )
+        parameter_rows[-2:] = (
+            self.friction_by_step[max(k - 1, 0)],
+            self.slopes_by_step[k + 1] - self.slopes_by_step[k],
+        )
+        return parameter_rows
+
+    def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
+        """Return the roles of slopes and friction in the chain rule over steps, by name."""
+        previous_friction_index = len(CONTACT_PARAMETER_NAMES)
         tilt_index = previous_friction_index + 1
-        n_slopes, n_frictions = self.n_slopes, self.n_frictions
+        n_given_slopes, n_given_frictions = self.n_given_slopes, self.n_given_frictions
 
-        def slope_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_slopes or 1) - 1), 1.0)
+        def list_slope_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+            return (0, k, 1.0), (1, k, -1.0), (1, min(k + 1, (n_given_slopes or 1) - 1), 1.0)
 
-        def friction_terms(k: int) -> tuple[tuple[int, int, float], ...]:
-            if n_frictions is None:
+        def list_friction_terms(k: int) -> tuple[tuple[int, int, float], ...]:
+            if n_given_frictions is None:
                 return (0, 0, 1.0), (1, 0, 1.0)
             return (0, k, 1.0), (1, max(k - 1, 0), 1.0)
 
-        friction = StepwiseParameter(
-            (FRICTION_INDEX, previous_friction_index), n_frictions, friction_terms
+        stepwise_friction = StepwiseParameter(
+            (CONTACT_FRICTION_INDEX, previous_friction_index),
+            n_given_frictions,
+            list_friction_terms,
         )
-        if n_slopes is None:
-            return {"friction": friction}
-        slope = StepwiseParameter((SLOPE_INDEX, tilt_index), n_slopes, slope_terms)
-        return {"slope": slope, "friction": friction}
+        if n_given_slopes is None:
+            return {"friction": stepwise_friction}
+        stepwise_slope = StepwiseParameter(
+            (CONTACT_SLOPE_INDEX, tilt_index), n_given_slopes, list_slope_terms
+        )
+        return {"slope": stepwise_slope, "friction": stepwise_friction}

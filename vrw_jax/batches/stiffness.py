@@ -14,28 +14,28 @@ from vrw_jax.wheel import PARAMETER_NAMES
 class SolverIndex(IntEnum):
     """Index of a solver in `StepBatchResult.solver_names`."""
 
-    REQUESTED = 0  # solver of the step options
-    STABLE = 1  # explicit solver if stability limits the steps
-    IMPLICIT = 2  # solver for wheels that are too stiff for explicit solvers
+    REQUESTED_SOLVER = 0  # solver of the step options
+    STABLE_SOLVER = 1  # explicit solver if stability limits the steps
+    IMPLICIT_SOLVER = 2  # solver for wheels that are too stiff for explicit solvers
 
 
 @dataclass(frozen=True)
 class SolverSelectionOptions:
-    """Solvers for stiff wheels, and their costs, which `select_solver` compares."""
+    """Solvers for stiff wheels, and the costs that `select_cheapest_solver` compares."""
 
     stable_solver: SolverName = "Tsit5"
     """Explicit solver for steps that are limited by stability.
 
     The value is chosen because of diffrax's solvers of order 5 and more it has the largest stable
     step per evaluation. That step is 0.58 over the mode's rate, against 0.40 for Dopri8."""
-    stable_tolerance_factor: float = 4.0
+    stable_solver_tightening_factor: float = 4.0
     """Factor by which the tolerance of the stable solver is tightened.
 
     The value is chosen because the tighter tolerance costs little. At tolerances of 1e-6 and below,
     the error is then no larger than that of Dopri8."""
     implicit_solver: SolverName = "Kvaerno5"
     """Solver for wheels that are too stiff for explicit solvers."""
-    implicit_cost: float = 6e4
+    implicit_solver_cost_evaluations: float = 6e4
     """Cost of the implicit solver at a tolerance of 1e-6, in evaluations of an explicit solver.
 
     The cost was measured (docs/verification/failures.md). It grows as the tolerance to the power of
@@ -46,53 +46,59 @@ class SolverSelectionOptions:
 SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
 
 
-def select_solver(
-    parameters: np.ndarray,
+def select_cheapest_solver(
+    parameter_rows: np.ndarray,
     options: StepOptions,
     selection_options: SolverSelectionOptions = SOLVER_SELECTION_OPTIONS,
 ) -> np.ndarray:
     """Return the `SolverIndex` of the cheapest solver for each lane.
 
-    If legs are light, the airborne leg's fast mode decays at 1.03 c/m for some 0.67 sqrt(L0 / g),
-    s. The step size times that rate must stay below an explicit solver's limit of stability.
-    Rejected steps add a tenth. The solver of `options` is kept if accuracy requires more steps of
-    the stable solver, about its tolerance to the power of -1/5. A solver that would need more than
-    `max_solver_steps` is excluded.
+    If legs are light, the airborne leg's fast mode decays at the rate 1.03 c/m for some 0.67
+    sqrt(L0 / g), s. The step size times that rate must stay below an explicit solver's limit of
+    stability. Rejected steps add a tenth to the number of steps. The solver of `options` is kept if
+    accuracy requires more steps of the stable solver than stability. That number is about the
+    tolerance to the power of -1/5. A solver that would need more than `max_solver_steps` is
+    excluded.
 
-    - `parameters`: in the order of `PARAMETER_NAMES`, (9, lanes).
+    - `parameter_rows`: parameters in the order of `PARAMETER_NAMES`, (9, lanes).
     """
-    damping, leg_mass, leg_length, gravity = (
-        parameters[PARAMETER_NAMES.index(name)]
+    damping, leg_mass, locked_length, gravity = (
+        parameter_rows[PARAMETER_NAMES.index(name)]
         for name in ("damping", "leg_mass", "locked_length", "gravity")
     )
-    tolerance = float(options.rtol)
+    relative_tolerance = float(options.rtol)
     with np.errstate(all="ignore"):
-        n_decay_times = 1.03 * damping / leg_mass * 0.74 * np.sqrt(leg_length / gravity)
+        n_decay_times = 1.03 * damping / leg_mass * 0.74 * np.sqrt(locked_length / gravity)
 
-        def count_evaluations(solver: str) -> tuple[np.ndarray, np.ndarray]:
-            n_stages, stability_limit = _count_stages_and_stability_limit(solver)
+        def estimate_solver_cost(solver: str) -> tuple[np.ndarray, np.ndarray]:
+            n_stages, stability_limit = _get_stages_and_stability_limit(solver)
             n_solver_steps = n_decay_times / stability_limit
             return n_solver_steps, np.where(
                 n_solver_steps > options.max_solver_steps, np.inf, n_solver_steps * n_stages
             )
 
-        _, requested_cost = count_evaluations(options.solver)
-        n_solver_steps, stable_cost = count_evaluations(selection_options.stable_solver)
-        stable_tolerance = tolerance / selection_options.stable_tolerance_factor
-        is_stability_limited = n_solver_steps > stable_tolerance**-0.2
-        implicit_cost = selection_options.implicit_cost * (1e-6 / tolerance) ** 0.17
-        costs = (
-            requested_cost,
-            np.where(is_stability_limited, stable_cost, np.inf),
-            np.full_like(n_decay_times, implicit_cost),
+        _, requested_solver_cost = estimate_solver_cost(options.solver)
+        n_solver_steps, stable_solver_cost = estimate_solver_cost(selection_options.stable_solver)
+        stable_solver_tolerance = (
+            relative_tolerance / selection_options.stable_solver_tightening_factor
         )
-        return np.argmin(costs, axis=0).astype(np.int32)  # 0 for an invalid wheel
+        is_stability_limited = n_solver_steps > stable_solver_tolerance**-0.2
+        implicit_solver_cost = (
+            selection_options.implicit_solver_cost_evaluations * (1e-6 / relative_tolerance) ** 0.17
+        )
+        solver_costs = (
+            requested_solver_cost,
+            np.where(is_stability_limited, stable_solver_cost, np.inf),
+            np.full_like(n_decay_times, implicit_solver_cost),
+        )
+        return np.argmin(solver_costs, axis=0).astype(np.int32)  # 0 for an invalid wheel
 
 
 @functools.cache
-def _count_stages_and_stability_limit(solver: str) -> tuple[int, float]:
-    """Return an explicit solver's evaluations per step, and its largest stable step size times
-    decay rate.
+def _get_stages_and_stability_limit(solver: str) -> tuple[int, float]:
+    """Return the number of evaluations per step of an explicit solver, and its limit of stability.
+
+    The limit is the largest stable step size times the decay rate.
     """
     tableau = load_explicit_tableau(solver)
     assert tableau is not None  # The caller has checked the solver.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from vrw_jax.printing import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_ending,
     format_outcome_counts,
     format_quantity,
@@ -68,12 +68,12 @@ class StepBatchResult(AbstractPrintable):
         """Return how each walk ended, as an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return the rows of the printed result as pairs of label and text."""
         n_by_solver = np.bincount(np.ravel(self.solver_index), minlength=len(self.solver_names))
         solver_texts = (
-            f"{n_elements:,} by {name}"
-            for n_elements, name in zip(n_by_solver, self.solver_names, strict=True)
+            f"{n_elements:,} by {solver_name}"
+            for n_elements, solver_name in zip(n_by_solver, self.solver_names, strict=True)
             if n_elements
         )
         return [
@@ -84,7 +84,7 @@ class StepBatchResult(AbstractPrintable):
         ]
 
 
-START_NAME = "section_state"
+START_INPUT_NAME = "section_state"
 
 
 class StepwiseParameter(NamedTuple):
@@ -94,16 +94,16 @@ class StepwiseParameter(NamedTuple):
     """
 
     input_indices: tuple[int, ...]  # indices among the inputs of a step
-    n_values: int | None  # number of values of one lane; None for a single number
-    chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
+    n_stepwise_values: int | None  # number of values of one lane; None for a single number
+    list_chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
     """Function from a step to its terms (position of the input, index of the value, derivative of
     the input by the value)."""
 
 
-def complete_batch_slopes(slopes: np.ndarray, n_steps: int) -> np.ndarray:
+def complete_slopes_over_steps(slopes: np.ndarray, n_steps: int) -> np.ndarray:
     """Return the slopes of the lines of n steps, (n_steps + 1, lanes), rad.
 
-    If `slopes` has n entries per lane, the last one is repeated.
+    If `slopes` has n entries per lane, the last slope is repeated.
     """
     return slopes.T if slopes.shape[1] > n_steps else np.concatenate([slopes.T, slopes.T[-1:]])
 
@@ -113,121 +113,160 @@ class WalkBatch:
 
     def __init__(
         self,
-        states: np.ndarray,
+        section_states: np.ndarray,
         derivative_names: Sequence[str],
-        parameters: tuple[str, ...],
+        step_parameter_names: tuple[str, ...],
         stepwise_parameters: Mapping[str, StepwiseParameter],
     ) -> None:
-        """Start the walks from `states`, (section, lanes).
+        """Start the walks from `section_states`, (section, lanes).
 
-        - `derivative_names`: requested derivatives: `START_NAME` and names of `parameters`;
-        - `parameters`: names of the first inputs of a step; the section state follows them;
+        - `derivative_names`: requested derivatives: `START_INPUT_NAME` and names of
+          `step_parameter_names`;
+        - `step_parameter_names`: names of the first inputs of a step; the section state follows
+          them;
         - `stepwise_parameters`: parameters that do not enter every step as one equal input.
         """
-        state_size, n_lanes = states.shape
-        self.section_state, self.durations = states, np.zeros((3, n_lanes), states.dtype)
+        state_size, n_lanes = section_states.shape
+        self.section_state, self.durations = (
+            section_states,
+            np.zeros((3, n_lanes), section_states.dtype),
+        )
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.is_collocated = np.zeros(n_lanes, bool)
         # The inputs of the Jacobian are the requested parameters, then the start.
         self.derivative_names = derivative_names
-        self.parameter_names = [name for name in derivative_names if name != START_NAME]
-        self.is_flat_ground = not stepwise_parameters
-        single_input = lambda name: StepwiseParameter(
-            (parameters.index(name),), None, lambda _: ((0, 0, 1.0),)
-        )
-        self.parameters = [
-            stepwise_parameters.get(name, single_input(name)) for name in self.parameter_names
+        self.differentiated_parameter_names = [
+            input_name for input_name in derivative_names if input_name != START_INPUT_NAME
         ]
-        parameter_inputs = [i for parameter in self.parameters for i in parameter.input_indices]
-        state_inputs = range(len(parameters), len(parameters) + state_size)
-        self.input_indices = (*parameter_inputs, *state_inputs) if derivative_names else ()
-        n_rows_by_parameter = [parameter.n_values or 1 for parameter in self.parameters]
+        self.has_flat_ground = not stepwise_parameters
+        make_single_input = lambda input_name: StepwiseParameter(
+            (step_parameter_names.index(input_name),), None, lambda _: ((0, 0, 1.0),)
+        )
+        self.differentiated_parameters = [
+            stepwise_parameters.get(input_name, make_single_input(input_name))
+            for input_name in self.differentiated_parameter_names
+        ]
+        parameter_input_indices = [
+            i
+            for stepwise_parameter in self.differentiated_parameters
+            for i in stepwise_parameter.input_indices
+        ]
+        state_input_indices = range(
+            len(step_parameter_names), len(step_parameter_names) + state_size
+        )
+        self.input_indices = (
+            (*parameter_input_indices, *state_input_indices) if derivative_names else ()
+        )
+        n_rows_by_parameter = [
+            stepwise_parameter.n_stepwise_values or 1
+            for stepwise_parameter in self.differentiated_parameters
+        ]
         # This is the first row of each parameter in the Jacobian, and then that of the start.
         self.first_jacobian_rows = np.cumsum([0, *n_rows_by_parameter])
-        n_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
-        self.jacobian = np.zeros((n_rows, state_size + 3, n_lanes), states.dtype)
+        n_jacobian_rows = self.first_jacobian_rows[-1] + state_size if derivative_names else 0
+        self.walk_jacobian = np.zeros(
+            (n_jacobian_rows, state_size + 3, n_lanes), section_states.dtype
+        )
 
-    def active_lanes(self) -> np.ndarray:
+    def find_active_lanes(self) -> np.ndarray:
         """Return the indices of the lanes whose walk continues."""
         return np.flatnonzero(self.outcome == Outcome.STEPPED)
 
-    def to_result(
+    def make_batch_result(
         self,
         lane_order: np.ndarray,
         solver_index: np.ndarray,
         engine: str,
         solver_names: tuple[str, ...],
     ) -> StepBatchResult:
-        """Return the result, with each lane at its index before sorting by `lane_order`."""
+        """Return the result, with the lanes in the order before they were sorted by
+        `lane_order`.
+        """
         inverse_lane_order = np.empty_like(lane_order)
         inverse_lane_order[lane_order] = np.arange(len(lane_order))
-        reorder = lambda x: x.take(inverse_lane_order, -1).T
+        restore_lane_order = lambda x: x.take(inverse_lane_order, -1).T
         return StepBatchResult(
-            reorder(self.section_state),
-            reorder(self.durations),
-            reorder(self.outcome),
-            reorder(self.n_stepped),
-            reorder(self.solver_steps),
-            reorder(self.is_collocated),
-            reorder(solver_index),
+            restore_lane_order(self.section_state),
+            restore_lane_order(self.durations),
+            restore_lane_order(self.outcome),
+            restore_lane_order(self.n_stepped),
+            restore_lane_order(self.solver_steps),
+            restore_lane_order(self.is_collocated),
+            restore_lane_order(solver_index),
             engine,
             solver_names,
-            self.derivatives_by_name(inverse_lane_order),
+            self.split_jacobian_by_input(inverse_lane_order),
         )
 
-    def derivatives_by_name(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
-        """Return the derivatives of the walk by name of the input; zero for failed walks."""
+    def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
+        """Return the derivatives of the walk by the name of the input. The derivatives of failed
+        walks are zero."""
         if not self.derivative_names:
             return {}
-        self.jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian, state_size = self.jacobian.take(inverse_lane_order, -1).T, len(self.section_state)
-        rows_by_name: dict[str, Any] = {START_NAME: slice(self.first_jacobian_rows[-1], None)}
-        for name, parameter, first_row in zip(
-            self.parameter_names, self.parameters, self.first_jacobian_rows[:-1], strict=True
+        self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
+        ordered_jacobian, state_size = (
+            self.walk_jacobian.take(inverse_lane_order, -1).T,
+            len(self.section_state),
+        )
+        jacobian_rows_by_name: dict[str, Any] = {
+            START_INPUT_NAME: slice(self.first_jacobian_rows[-1], None)
+        }
+        for input_name, stepwise_parameter, first_row in zip(
+            self.differentiated_parameter_names,
+            self.differentiated_parameters,
+            self.first_jacobian_rows[:-1],
+            strict=True,
         ):
-            n_values = parameter.n_values
-            rows_by_name[name] = (
-                first_row if n_values is None else slice(first_row, first_row + n_values)
+            n_stepwise_values = stepwise_parameter.n_stepwise_values
+            jacobian_rows_by_name[input_name] = (
+                first_row
+                if n_stepwise_values is None
+                else slice(first_row, first_row + n_stepwise_values)
             )
         jacobian_by_name = {
-            name: jacobian[:, :, rows_by_name[name]] for name in self.derivative_names
+            input_name: ordered_jacobian[:, :, jacobian_rows_by_name[input_name]]
+            for input_name in self.derivative_names
         }
         return {
-            name: StepSensitivity(x[:, :state_size], x[:, state_size:])
-            for name, x in jacobian_by_name.items()
+            input_name: StepSensitivity(x[:, :state_size], x[:, state_size:])
+            for input_name, x in jacobian_by_name.items()
         }
 
-    def record_step(
+    def record_lane_steps(
         self,
         lane_indices: np.ndarray,
         step_values: tuple[np.ndarray, ...],
         is_collocated: np.ndarray,
     ) -> None:
-        """Record a step of these lanes: state, durations, outcome, solver steps and Jacobian."""
+        """Record one step of the lanes at `lane_indices`. The step values are state, durations,
+        outcome, solver steps and Jacobian."""
         section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
-        lane_index = make_lane_index(lane_indices, self)
+        lane_selection = select_lanes(lane_indices, self)
         if step_jacobian:
-            self.jacobian = _replace_lanes(
-                self.jacobian, lane_index, self._chain_jacobian(lane_index, *step_jacobian)
+            self.walk_jacobian = _replace_lane_values(
+                self.walk_jacobian,
+                lane_selection,
+                self._chain_walk_jacobian(lane_selection, *step_jacobian),
             )
-        self.section_state = _replace_lanes(self.section_state, lane_index, section_state)
-        self.durations = _replace_lanes(self.durations, lane_index, durations)
-        self.outcome = _replace_lanes(self.outcome, lane_index, outcome)
-        self.is_collocated = _replace_lanes(self.is_collocated, lane_index, is_collocated)
-        self.n_stepped[lane_index] += outcome == Outcome.STEPPED
-        self.solver_steps[lane_index] += n_solver_steps
+        self.section_state = _replace_lane_values(self.section_state, lane_selection, section_state)
+        self.durations = _replace_lane_values(self.durations, lane_selection, durations)
+        self.outcome = _replace_lane_values(self.outcome, lane_selection, outcome)
+        self.is_collocated = _replace_lane_values(self.is_collocated, lane_selection, is_collocated)
+        self.n_stepped[lane_selection] += outcome == Outcome.STEPPED
+        self.solver_steps[lane_selection] += n_solver_steps
 
-    def _chain_jacobian(self, lane_index: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk from that of its last step, (inputs, outputs, lanes).
+    def _chain_walk_jacobian(self, lane_selection: Any, step_jacobian: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the walk from the Jacobian of its last step, (inputs, outputs,
+        lanes).
 
         Products are summed one by one, so that a lane's digits do not depend on the batch.
         """
-        if not self.is_flat_ground:
-            return self._chain_stepwise_jacobian(lane_index, step_jacobian)
-        n_parameters, state_size = len(self.parameter_names), len(self.section_state)
-        if not self.n_stepped[lane_index].any():
+        if not self.has_flat_ground:
+            return self._chain_stepwise_jacobian(lane_selection, step_jacobian)
+        n_parameters, state_size = len(self.differentiated_parameter_names), len(self.section_state)
+        if not self.n_stepped[lane_selection].any():
             return step_jacobian
-        previous_jacobian = self.jacobian[:, :state_size, lane_index]
+        previous_jacobian = self.walk_jacobian[:, :state_size, lane_selection]
         chained_jacobian = sum(
             step_jacobian[n_parameters + i] * previous_jacobian[:, i, None]
             for i in range(state_size)
@@ -235,15 +274,18 @@ class WalkBatch:
         chained_jacobian[:n_parameters] += step_jacobian[:n_parameters]
         return chained_jacobian
 
-    def _chain_stepwise_jacobian(self, lane_index: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk with one row for each value over steps.
+    def _chain_stepwise_jacobian(
+        self, lane_selection: Any, step_jacobian: np.ndarray
+    ) -> np.ndarray:
+        """Return the Jacobian of the walk, with one row for each value of a parameter that varies
+        over steps.
 
-        The values of later steps have no effect yet, and their rows are zero.
+        Values of later steps have no effect yet, and their rows are zero.
         """
         state_size, first_start_row = len(self.section_state), self.first_jacobian_rows[-1]
         n_inputs = len(step_jacobian) - state_size
-        k = int(np.max(self.n_stepped[lane_index], initial=0))
-        jacobian_shape = len(self.jacobian), *step_jacobian.shape[1:]
+        k = int(np.max(self.n_stepped[lane_selection], initial=0))
+        jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
         chained_jacobian = np.zeros(jacobian_shape, step_jacobian.dtype)
         if k == 0:
             chained_jacobian[first_start_row:] = step_jacobian[n_inputs:]
@@ -255,33 +297,39 @@ class WalkBatch:
             used_rows = np.array(
                 [*itertools.chain(*used_row_ranges), *range(first_start_row, len(chained_jacobian))]
             )
-            previous_jacobian = self.jacobian[used_rows, :state_size][..., lane_index]
+            previous_jacobian = self.walk_jacobian[used_rows, :state_size][..., lane_selection]
             chained_jacobian[used_rows] = sum(
                 step_jacobian[n_inputs + i] * previous_jacobian[:, i, None]
                 for i in range(state_size)
             )
         first_input_row = 0
-        for parameter, first_row in zip(
-            self.parameters, self.first_jacobian_rows[:-1], strict=True
+        for stepwise_parameter, first_row in zip(
+            self.differentiated_parameters, self.first_jacobian_rows[:-1], strict=True
         ):
-            for input_position, value_index, weight in parameter.chain_rule_terms(k):
+            for (
+                input_position,
+                value_index,
+                input_derivative,
+            ) in stepwise_parameter.list_chain_rule_terms(k):
                 chained_jacobian[first_row + value_index] += (
-                    weight * step_jacobian[first_input_row + input_position]
+                    input_derivative * step_jacobian[first_input_row + input_position]
                 )
-            first_input_row += len(parameter.input_indices)
+            first_input_row += len(stepwise_parameter.input_indices)
         return chained_jacobian
 
 
-def make_lane_index(lane_indices: np.ndarray, walks: WalkBatch) -> Any:
-    """Return an index of these lanes: a slice, which copies nothing, if they are all lanes."""
-    return slice(None) if len(lane_indices) == len(walks.outcome) else lane_indices
+def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
+    """Return an index of the lanes: a slice, which copies nothing, if `lane_indices` contain all
+    lanes."""
+    return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
 
 
-def _replace_lanes(lane_values: np.ndarray, lane_index: Any, new_values: np.ndarray) -> np.ndarray:
-    """Return the array with the values of the lanes at `lane_index` replaced, in place if
-    possible.
-    """
-    if isinstance(lane_index, slice):
+def _replace_lane_values(
+    lane_values: np.ndarray, lane_selection: Any, new_values: np.ndarray
+) -> np.ndarray:
+    """Return the array with new values of the selected lanes; the array is changed in place unless
+    all lanes are selected."""
+    if isinstance(lane_selection, slice):
         return new_values
-    lane_values[..., lane_index] = new_values
+    lane_values[..., lane_selection] = new_values
     return lane_values

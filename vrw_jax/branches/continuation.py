@@ -56,10 +56,10 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, take_rows
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import refuse_ladder
-from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.selection import raise_if_ladder
+from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
 from vrw_jax.validation import (
     check_bool,
     check_callable,
@@ -197,7 +197,7 @@ class GaitContinuation(AbstractContinuation):
         )
 
 
-@with_default_settings
+@with_default_jax_settings
 def continue_branch(
     params: WheelParams,
     name: str,
@@ -270,7 +270,7 @@ def continue_branch(
     return branch
 
 
-@with_default_settings
+@with_default_jax_settings
 def continue_branches(
     params: WheelParams,
     name: str,
@@ -316,8 +316,11 @@ def continue_branches(
     """
     check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    model, step_options = check_model(model), check_options(step_options or StepOptions.tight())
-    refuse_ladder(model, "followed")
+    model, step_options = (
+        check_model(model),
+        check_step_options(step_options or StepOptions.tight()),
+    )
+    raise_if_ladder(model, "followed")
     check_parameter_name(name, model.parameter_names, "parameter")
     if check_int("period_n", period_n) > 1 and cycle is None:
         raise ValueError(
@@ -558,7 +561,7 @@ class MapContinuation(AbstractContinuation):
         return np.asarray(np.isfinite(table["x"]).all(-1))
 
 
-@with_default_settings
+@with_default_jax_settings
 def continue_map(
     function: Callable[[Any, Array, Array], Array],
     x: object,

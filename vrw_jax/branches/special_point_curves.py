@@ -11,7 +11,7 @@ from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, Cur
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_names, check_range, check_type
 from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, wheel_from_parameters
 
@@ -99,7 +99,7 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
     )
 
 
-@with_default_settings
+@with_default_jax_settings
 def continue_special_points(
     names: tuple[str, ...],
     parameters: tuple[str, str],

@@ -28,7 +28,7 @@ from vrw_jax.continuation import BIFURCATION_NAMES
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -84,7 +84,7 @@ class ScanSignChange(NamedTuple):
     position_in_cells: tuple[float, float]  # position of the change in cells of the scan
 
 
-@with_default_settings
+@with_default_jax_settings
 def trace_special_points(
     scan_dataset: xr.Dataset,
     params: WheelParams,

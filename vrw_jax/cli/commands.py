@@ -20,13 +20,13 @@ from vrw_jax.cli import console as printing
 from vrw_jax.cli import scanning
 from vrw_jax.cli.console import (
     ExitCode,
-    print_error,
-    report_errors,
-    show_stages,
+    print_error_sentence,
+    report_command_errors,
+    show_computation_stages,
     show_warnings_as_sentences,
     stdout_console,
 )
-from vrw_jax.cli.encoding import spell_unencodable_characters
+from vrw_jax.cli.encoding import replace_unencodable_output
 
 if TYPE_CHECKING:
     from vrw_jax.cli.config import Config
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_OPTION_INTEGER = 10**9
 """Largest integer of an option, chosen because a scan takes no more samples."""
 
-SENSITIVITY_MEASURES = ("period", "speed")
+SENSITIVITY_NORM_MEASURES = ("period", "speed")
 """Measures whose gait sensitivity norms `vrw robustness` prints."""
 
 FolderOption = Annotated[
@@ -61,28 +61,27 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 20)
     signal.signal(signal.SIGINT, _interrupt_command)
     show_warnings_as_sentences()
-    spell_unencodable_characters()
-    with printing.report_output_errors():
+    replace_unencodable_output()
+    with printing.report_stdout_errors():
         app()
 
 
 def _interrupt_command(_signal: int, _frame: object) -> None:
     """Handle the first Ctrl-C: end the command regularly, and install the handler of a second
-    one.
-    """
-    signal.signal(signal.SIGINT, _end_process)
+    Ctrl-C."""
+    signal.signal(signal.SIGINT, _end_process_immediately)
     raise KeyboardInterrupt
 
 
-def _end_process(_signal: int, _frame: object) -> None:
+def _end_process_immediately(_signal: int, _frame: object) -> None:
     """Handle the second Ctrl-C: end the process immediately."""
     os.write(2, b"vrw: stopped at once; run the same to go on.\n")
     os._exit(ExitCode.INTERRUPTED)
 
 
-def _print_version(is_wanted: bool) -> None:
+def _print_version_and_exit(is_version_requested: bool) -> None:
     """Print the version and exit if `--version` is given."""
-    if is_wanted:
+    if is_version_requested:
         try:
             version_number = importlib.metadata.version("vrw-jax")
         except importlib.metadata.PackageNotFoundError:
@@ -95,7 +94,9 @@ def _print_version(is_wanted: bool) -> None:
 def root(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
+        typer.Option(
+            "--version", callback=_print_version_and_exit, is_eager=True, help="Show the version."
+        ),
     ] = False,
 ) -> None:
     """Simulate the passive viscoelastic-legged rimless wheel: walk, scan, tune, follow branches.
@@ -154,41 +155,49 @@ def gait(
 
       vrw gait configs/table1.toml --steps 50
     """
-    with report_errors():
-        settings = _load_config(config)
+    with report_command_errors():
+        gait_config = _start_jax_and_load_config(config)
         from vrw_jax.cli.config import parse_assignment
 
-        params = settings.make_wheel(dict(parse_assignment(text) for text in changes or []))
+        params = gait_config.make_wheel(
+            dict(parse_assignment(assignment_text) for assignment_text in changes or [])
+        )
         import jax.numpy as jnp
 
         from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
-        from vrw_jax.simulation import SAMPLED_PEAK_MEASURES, force_peaks, simulate, step
+        from vrw_jax.simulation import SAMPLED_FORCE_PEAK_MEASURES, force_peaks, simulate, step
         from vrw_jax.wheel import Outcome
 
-        model: Any = settings.make_model()
-        options = settings.make_options()
-        start = settings.gait.start
-        state = model.default_start(params) if start is None else jnp.asarray(start)
-        state = model.embed_section(params, state)
-        n_walked, n_steps = 0, steps or settings.gait.steps
-        with show_stages("walking (the first time compiles for a while)"):
+        model: Any = gait_config.make_model()
+        options = gait_config.make_options()
+        start = gait_config.gait.start
+        section_state = model.default_start(params) if start is None else jnp.asarray(start)
+        section_state = model.embed_section(params, section_state)
+        n_walked, n_steps = 0, steps or gait_config.gait.steps
+        with show_computation_stages("walking (the first time compiles for a while)"):
             while True:
-                result: Any = step(params, state, model=model, options=options)
-                has_stepped = int(result.outcome) == Outcome.STEPPED
+                step_result: Any = step(params, section_state, model=model, options=options)
+                has_stepped = int(step_result.outcome) == Outcome.STEPPED
                 n_walked += has_stepped
                 if not has_stepped or n_walked == n_steps:
                     break
-                state = result.section_state
-            model, reason = resolve_model_with_reason(params, model)
+                section_state = step_result.section_state
+            model, model_reason = resolve_model_with_reason(params, model)
             needs_no_guess = start is None or make_finder(model, params.n_legs).supports_cold_start
-            cycle: Any = limit_cycle(params, guess=None if needs_no_guess else state, model=model)
-            peaks = None
-            if model.is_compliant and bool(cycle.found):
-                gait_step = simulate(params, cycle.section_state, 1, model=model, options=options)
-                peaks = force_peaks(gait_step)[list(SAMPLED_PEAK_MEASURES)]
-        printing.print_gait(params, result, state, n_walked, cycle, peaks)
-        if reason:
-            stdout_console.print(reason)
+            limit_cycle_result: Any = limit_cycle(
+                params, guess=None if needs_no_guess else section_state, model=model
+            )
+            force_peak_dataset = None
+            if model.is_compliant and bool(limit_cycle_result.found):
+                gait_step = simulate(
+                    params, limit_cycle_result.section_state, 1, model=model, options=options
+                )
+                force_peak_dataset = force_peaks(gait_step)[list(SAMPLED_FORCE_PEAK_MEASURES)]
+        printing.print_wheel_and_gait(
+            params, step_result, section_state, n_walked, limit_cycle_result, force_peak_dataset
+        )
+        if model_reason:
+            stdout_console.print(model_reason)
 
 
 @app.command()
@@ -202,14 +211,16 @@ def explore(
     ] = "viscoelastic",
 ) -> None:
     """Open an interactive page of the wheel in your browser; the page computes by itself."""
-    with report_errors():
+    with report_command_errors():
         from vrw_jax.cli.config import parse_assignment
         from vrw_jax.web import make_page_address
 
-        params = _load_config(None).make_wheel(dict(parse_assignment(t) for t in changes or []))
-        address = make_page_address(params, model_name)
-        webbrowser.open(address)
-        print(address)
+        params = _start_jax_and_load_config(None).make_wheel(
+            dict(parse_assignment(assignment_text) for assignment_text in changes or [])
+        )
+        page_address = make_page_address(params, model_name)
+        webbrowser.open(page_address)
+        print(page_address)
 
 
 @app.command()
@@ -220,51 +231,63 @@ def init(
 
     Existing files are kept. If an existing file differs, the command names it and writes nothing.
     """
-    with report_errors():
-        example_folder = find_example_configs()
+    with report_command_errors():
+        example_folder = find_example_config_folder()
         example_texts = {
-            path.name: path.read_text(encoding="utf-8") for path in example_folder.glob("*.toml")
+            config_path.name: config_path.read_text(encoding="utf-8")
+            for config_path in example_folder.glob("*.toml")
         }
         existing_paths = [
-            folder / name for name in sorted(example_texts) if (folder / name).exists()
+            folder / config_name
+            for config_name in sorted(example_texts)
+            if (folder / config_name).exists()
         ]
-        for path in existing_paths:
-            if path.read_text(encoding="utf-8", errors="replace") != example_texts[path.name]:
-                raise ValueError(f"{path} is there already and differs: give another folder.")
-        _require_writable(folder)
+        for config_path in existing_paths:
+            if (
+                config_path.read_text(encoding="utf-8", errors="replace")
+                != example_texts[config_path.name]
+            ):
+                raise ValueError(
+                    f"{config_path} is there already and differs: give another folder."
+                )
+        _require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        missing_names = [
-            folder / name for name in sorted(example_texts) if folder / name not in existing_paths
+        missing_paths = [
+            folder / config_name
+            for config_name in sorted(example_texts)
+            if folder / config_name not in existing_paths
         ]
-        for path in missing_names:
-            path.write_text(example_texts[path.name], encoding="utf-8")
-        printing.print_written_paths(missing_names)
-        if not missing_names:
+        for config_path in missing_paths:
+            config_path.write_text(example_texts[config_path.name], encoding="utf-8")
+        printing.print_written_paths(missing_paths)
+        if not missing_paths:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
 
 
-def find_example_configs() -> Path:
-    """Return the folder of the example configs, inside an installed package or beside it."""
-    package = Path(__file__).parents[1]
+def find_example_config_folder() -> Path:
+    """Return the folder of the example configs, which is inside the installed package or beside the
+    package."""
+    package_folder = Path(__file__).parents[1]
     return next(
         candidate_folder
-        for candidate_folder in (package / "configs", package.parent / "configs")
+        for candidate_folder in (package_folder / "configs", package_folder.parent / "configs")
         if candidate_folder.is_dir()
     )
 
 
-def _require_writable(folder: Path) -> None:
-    """Raise a ValueError if the folder cannot be written to; nothing is created."""
+def _require_writable_folder(folder: Path) -> None:
+    """Raise a ValueError if the folder cannot be written to. Nothing is created."""
     existing_folder = folder
     while not existing_folder.exists():
         existing_folder = existing_folder.parent
     try:
         with tempfile.TemporaryDirectory(dir=existing_folder):
             pass
-    except OSError as error:
+    except OSError as write_error:
         raise ValueError(
-            f"nothing can be written to {folder} ({error.strerror}): give a place of your own."
-        ) from error
+            f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
+            "own."
+        ) from write_error
 
 
 @app.command()
@@ -280,27 +303,27 @@ def reproduce(
     """
     from vrw_jax.runtime import start_jax
 
-    with report_errors():
+    with report_command_errors():
         start_jax()
-        _require_compiler()
-        _require_writable(folder)
-        _require_pictures(True)
-    from vrw_jax.paper import reproduce as run
+        _require_enabled_compilation()
+        _require_writable_folder(folder)
+        _require_figure_backend(True)
+    from vrw_jax.paper import reproduce_paper
 
     with (
-        report_errors(f"stopped; what is done stays in {folder}."),
+        report_command_errors(f"stopped; what is done stays in {folder}."),
         printing.make_progress_bar("reproducing the paper") as progress_bar,
     ):
-        task = progress_bar.add_task("starting", total=1.0)
-        facts = run(
+        progress_task = progress_bar.add_task("starting", total=1.0)
+        paper_facts = reproduce_paper(
             folder,
             on_progress=lambda progress_fraction, stage_description: progress_bar.update(
-                task, completed=progress_fraction, description=stage_description
+                progress_task, completed=progress_fraction, description=stage_description
             ),
         )
-    with report_errors():
-        printing.print_facts(facts, folder)
-    if not all(fact.holds for fact in facts):
+    with report_command_errors():
+        printing.print_paper_facts(paper_facts, folder)
+    if not all(paper_fact.holds for paper_fact in paper_facts):
         raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
@@ -347,29 +370,31 @@ def scan(
 
       vrw scan configs/quickstart.toml --dask tcp://host:8786
     """
-    with report_errors():
-        settings, folder = _load_config_for(config, folder, "design", "scan")
-        plan, store = scanning.plan_config_scan(settings, chunk), folder / "scan.zarr"
+    with report_command_errors():
+        scan_config, folder = _load_config_with_table(config, folder, "design", "scan")
+        scan_plan, store_path = scanning.plan_config_scan(scan_config, chunk), folder / "scan.zarr"
         from vrw_jax.scans import forecast_scan
 
         if explain:
-            with show_stages("measuring some samples (the first time compiles for a while)"):
-                forecast = forecast_scan(plan, store) | {"store": str(store)}
-            printing.print_table("What this scan would do", forecast.items())
+            with show_computation_stages(
+                "measuring some samples (the first time compiles for a while)"
+            ):
+                forecast_texts = forecast_scan(scan_plan, store_path) | {"store": str(store_path)}
+            printing.print_text_table("What this scan would do", forecast_texts.items())
             return
         if verify:
-            scanning.verify_store(plan, store)
+            scanning.verify_scan_store(scan_plan, store_path)
             return
-        _require_writable(folder)
-        _require_pictures(picture)
-    dataset = scanning.compute_scan(plan, store, dask)
-    with report_errors(f"stopped; the data are in {store}."):
-        printing.print_outcomes(dataset)
-        stdout_console.print(f"data: {store}", highlight=False, soft_wrap=True)
+        _require_writable_folder(folder)
+        _require_figure_backend(picture)
+    scan_dataset = scanning.compute_scan_with_progress(scan_plan, store_path, dask)
+    with report_command_errors(f"stopped; the data are in {store_path}."):
+        printing.print_outcome_counts(scan_dataset)
+        stdout_console.print(f"data: {store_path}", highlight=False, soft_wrap=True)
         if picture:
-            from vrw_jax.cli.reports import write_scan
+            from vrw_jax.cli.reports import write_scan_figures
 
-            printing.print_written_paths(write_scan(dataset, folder))
+            printing.print_written_paths(write_scan_figures(scan_dataset, folder))
 
 
 @app.command()
@@ -388,23 +413,27 @@ def robustness(
 
       vrw robustness configs/robustness.toml
     """
-    with report_errors():
-        settings = _load_config(config)
-        slope_sd = settings.scan.slope_sd
+    with report_command_errors():
+        robustness_config = _start_jax_and_load_config(config)
+        slope_sd = robustness_config.scan.slope_sd
         if slope_sd is None:
             raise ValueError(
                 f"{config.name}: [scan] has no slope_sd, the standard deviation of the slopes: "
                 "write slope_sd = 0.01, in rad, say."
             )
-        if settings.design is None:
+        if robustness_config.design is None:
             from vrw_jax.robustness import first_passage, gait_sensitivity
 
-            params, model = settings.make_wheel(), settings.make_model()
-            with show_stages("walking over random slopes (the first time compiles for a while)"):
-                passage = first_passage(params, slope_sd, model=model)
-                sensitivity = gait_sensitivity(params, SENSITIVITY_MEASURES, model=model)
-            print(passage)
-            print(sensitivity)
+            params, wheel_model = robustness_config.make_wheel(), robustness_config.make_model()
+            with show_computation_stages(
+                "walking over random slopes (the first time compiles for a while)"
+            ):
+                passage_result = first_passage(params, slope_sd, model=wheel_model)
+                sensitivity_result = gait_sensitivity(
+                    params, SENSITIVITY_NORM_MEASURES, model=wheel_model
+                )
+            print(passage_result)
+            print(sensitivity_result)
             return
     scan(config, folder, picture=picture)
 
@@ -415,28 +444,30 @@ def map_special_points(
     folder: FolderOption = None,
 ) -> None:
     """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
-    with report_errors():
-        settings, folder = _load_config_for(config, folder, "design", "map")
+    with report_command_errors():
+        map_config, folder = _load_config_with_table(config, folder, "design", "map")
         from vrw_jax.branches import SPECIAL_POINT_MEASURES
-        from vrw_jax.cli.reports import write_map
+        from vrw_jax.cli.reports import write_special_point_map
         from vrw_jax.scans import follow_special_points, require_map_grid
 
-        plan = scanning.plan_config_scan(settings, None, SPECIAL_POINT_MEASURES)
-        require_map_grid(plan.design)
-        _require_writable(folder)
-        _require_pictures(True)
-    dataset = scanning.compute_scan(plan, folder / "scan.zarr", None)
+        scan_plan = scanning.plan_config_scan(map_config, None, SPECIAL_POINT_MEASURES)
+        require_map_grid(scan_plan.design)
+        _require_writable_folder(folder)
+        _require_figure_backend(True)
+    scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "scan.zarr", None)
 
     with (
-        report_errors(),
-        show_stages("following special points (the first time compiles for minutes)") as on_stage,
+        report_command_errors(),
+        show_computation_stages(
+            "following special points (the first time compiles for minutes)"
+        ) as on_stage,
     ):
-        special_points = follow_special_points(
-            dataset, settings.make_wheel(), settings.make_model(), on_stage
+        special_point_map = follow_special_points(
+            scan_dataset, map_config.make_wheel(), map_config.make_model(), on_stage
         )
         on_stage("drawing the map")
-        paths = write_map(special_points, folder)
-    printing.print_written_paths(paths)
+        written_paths = write_special_point_map(special_point_map, folder)
+    printing.print_written_paths(written_paths)
 
 
 @app.command()
@@ -460,30 +491,32 @@ def tune(
 
       vrw gait results/steady/wheel.toml
     """
-    with report_errors():
-        settings, folder = _load_config_for(config, folder, "tune", "tune")
-        tune_config = settings.tune
+    with report_command_errors():
+        command_config, folder = _load_config_with_table(config, folder, "tune", "tune")
+        tune_config = command_config.tune
         assert tune_config is not None
-        _require_writable(folder)
-        _require_pictures(picture)
-        from vrw_jax.cli.reports import write_tuning
-        from vrw_jax.tuning import tune as run
+        _require_writable_folder(folder)
+        _require_figure_backend(picture)
+        from vrw_jax.cli.reports import write_tuning_report
+        from vrw_jax.tuning import tune as tune_wheel
 
-        with show_stages("tuning (the first time compiles for a while)"):
-            result = run(
-                settings.make_wheel(),
+        with show_computation_stages("tuning (the first time compiles for a while)"):
+            tune_result = tune_wheel(
+                command_config.make_wheel(),
                 tune_config.objective,
                 tuple(tune_config.bounds),
                 tune_config.bounds,
                 tune_config.constraints,
-                model=settings.make_model(),
-                options=settings.make_options(),
+                model=command_config.make_model(),
+                options=command_config.make_options(),
                 max_evaluations=tune_config.evaluations,
             )
-        printing.print_table("Tuned gait", result.describe().items())
-        printing.print_written_paths(write_tuning(result, folder, picture))
-    if not result.converged:
-        print_error(f"this is no optimum ({result.status.name}): what was reached is written.")
+        printing.print_text_table("Tuned gait", tune_result.describe().items())
+        printing.print_written_paths(write_tuning_report(tune_result, folder, picture))
+    if not tune_result.converged:
+        print_error_sentence(
+            f"this is no optimum ({tune_result.status.name}): what was reached is written."
+        )
         raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
@@ -505,52 +538,52 @@ def continue_(
 
       vrw continue configs/branch_damping.toml --out results/along_c --no-picture
     """
-    with report_errors():
-        settings, folder = _load_config_for(config, folder, "branch", "branch")
-        branch_config = settings.branch
+    with report_command_errors():
+        command_config, folder = _load_config_with_table(config, folder, "branch", "branch")
+        branch_config = command_config.branch
         assert branch_config is not None
-        _require_writable(folder)
-        _require_pictures(picture)
+        _require_writable_folder(folder)
+        _require_figure_backend(picture)
         from vrw_jax.branches import continue_branch
-        from vrw_jax.cli.reports import write_branch
+        from vrw_jax.cli.reports import write_branch_report
         from vrw_jax.continuation import ArclengthOptions
 
-        options = ArclengthOptions()
+        arclength_options = ArclengthOptions()
         if branch_config.max_ds is not None:
-            initial_ds = min(options.initial_ds, branch_config.max_ds)
-            options = ArclengthOptions(initial_ds=initial_ds, max_ds=branch_config.max_ds)
-        with show_stages("following the branch (the first time compiles for a while)"):
+            initial_ds = min(arclength_options.initial_ds, branch_config.max_ds)
+            arclength_options = ArclengthOptions(initial_ds=initial_ds, max_ds=branch_config.max_ds)
+        with show_computation_stages("following the branch (the first time compiles for a while)"):
             branch = continue_branch(
-                settings.make_wheel(),
+                command_config.make_wheel(),
                 branch_config.parameter,
                 branch_config.bounds,
                 period_n=branch_config.period,
-                model=settings.make_model(),
-                options=options,
+                model=command_config.make_model(),
+                options=arclength_options,
             )
         if not branch.values.size:
-            print_error(
+            print_error_sentence(
                 f"there is no gait to start from ({branch.outcome.name}: "
                 f"{branch.outcome.meaning[:-1]}): give a wheel that walks, such as that of Table 1."
             )
             raise typer.Exit(ExitCode.CHECK_FAILED)
         stdout_console.print(str(branch), highlight=False, markup=False)
-        printing.print_written_paths(write_branch(branch, folder, picture))
+        printing.print_written_paths(write_branch_report(branch, folder, picture))
 
 
-def _load_config(path: Path | None) -> "Config":
-    """Start JAX, and return the config at `path` or the default config."""
+def _start_jax_and_load_config(config_path: Path | None) -> "Config":
+    """Start JAX, and return the config at `config_path` or the default config."""
     from vrw_jax.runtime import start_jax
 
     start_jax()
-    _require_compiler()
+    _require_enabled_compilation()
     from vrw_jax.cli.config import Config, load_config
 
-    return Config() if path is None else load_config(path)
+    return Config() if config_path is None else load_config(config_path)
 
 
-def _require_compiler() -> None:
-    """Raise a ValueError if compilation is disabled, because commands would take hours."""
+def _require_enabled_compilation() -> None:
+    """Raise a ValueError if compilation is disabled, because commands would then take hours."""
     import jax
 
     if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
@@ -559,20 +592,20 @@ def _require_compiler() -> None:
         )
 
 
-def _require_pictures(picture: bool) -> None:
-    """Raise a ValueError if matplotlib lacks the backend, before anything is computed."""
-    if not picture:
+def _require_figure_backend(draws_figure: bool) -> None:
+    """Raise a ValueError if matplotlib lacks the requested backend, before anything is computed."""
+    if not draws_figure:
         return
     try:
         importlib.import_module("vrw_jax.figures")
-    except ValueError as error:
+    except ValueError as backend_error:
         raise ValueError(
             f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
             "it, or set it to agg."
-        ) from error
+        ) from backend_error
 
 
-MISSING_TABLE_MESSAGES = {
+MISSING_CONFIG_TABLE_MESSAGES = {
     "design": "has no samples, but a scan needs a design: add a table [grid], [samples], [sobol], "
     "[uniform] or [saltelli], as in configs/quickstart.toml of `vrw init`.",
     "tune": "seeks nothing, but tuning needs an objective and bounds: add the tables [tune] and "
@@ -580,25 +613,27 @@ MISSING_TABLE_MESSAGES = {
     "branch": "names no branch, but continuation needs a parameter and bounds: add a table "
     "[branch], as in configs/branch_damping.toml of `vrw init`.",
 }
-"""Messages about a config that lacks the table that a command needs, by table."""
+"""Messages about a config without the table that a command needs, by name of the table."""
 
 
-def _load_config_for(
-    path: Path, folder: Path | None, table_name: str, command: str
+def _load_config_with_table(
+    config_path: Path, result_folder: Path | None, table_name: str, command_name: str
 ) -> tuple["Config", Path]:
-    """Return the config and the folder of the result; raise a ValueError if the needed table is
-    missing.
-    """
-    settings = _load_config(path)
-    if getattr(settings, table_name) is None:
-        raise ValueError(f"{settings.file_name} {MISSING_TABLE_MESSAGES[table_name]}")
-    from vrw_jax.selection import list_config_names
+    """Return the config and the folder of the result. Raise a ValueError if the config lacks the
+    needed table."""
+    command_config = _start_jax_and_load_config(config_path)
+    if getattr(command_config, table_name) is None:
+        raise ValueError(f"{command_config.file_name} {MISSING_CONFIG_TABLE_MESSAGES[table_name]}")
+    from vrw_jax.selection import list_model_config_names
 
-    supported_models = list_config_names(command)
-    if settings.model_name not in supported_models:
+    supported_models = list_model_config_names(command_name)
+    if command_config.model_name not in supported_models:
         raise ValueError(
-            f"{settings.file_name} names the model {settings.model_name}, but this command takes "
+            f"{command_config.file_name} names the model {command_config.model_name}, but this "
+            "command takes "
             f"{', '.join(supported_models)}: write "
             f"{'one of these' if len(supported_models) > 1 else 'that'} below [model]."
         )
-    return settings, Path("results") / path.stem if folder is None else folder
+    return command_config, Path(
+        "results"
+    ) / config_path.stem if result_folder is None else result_folder

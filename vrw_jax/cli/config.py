@@ -17,14 +17,14 @@ from vrw_jax.hybrid import make_solver
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import (
-    CATALOGS,
     MAX_LISTED_SAMPLES,
-    TOLERANCE_CATALOG,
+    MEASURE_CATALOGS,
+    TOLERANCE_MEASURE_CATALOG,
     add_passage_measures,
-    check_measures,
+    check_measure_names,
 )
 from vrw_jax.scans import design as designs
-from vrw_jax.selection import find_model_class, list_config_names
+from vrw_jax.selection import find_model_class, list_model_config_names
 from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
 from vrw_jax.wheel import (
     FRICTION_NAME,
@@ -36,25 +36,36 @@ from vrw_jax.wheel import (
     refuse_symbol,
 )
 
-RANDOM_DESIGNS = {"sobol": designs.sobol, "uniform": designs.uniform, "saltelli": designs.saltelli}
-DESIGN_KINDS = ("grid", "samples", *RANDOM_DESIGNS)
-TABLE_NAMES = ("wheel", "model", "options", "gait", "scan", "tune", "branch", *DESIGN_KINDS)
-_OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
+RANDOM_DESIGN_FUNCTIONS = {
+    "sobol": designs.sobol,
+    "uniform": designs.uniform,
+    "saltelli": designs.saltelli,
+}
+DESIGN_TABLE_NAMES = ("grid", "samples", *RANDOM_DESIGN_FUNCTIONS)
+CONFIG_TABLE_NAMES = (
+    "wheel",
+    "model",
+    "options",
+    "gait",
+    "scan",
+    "tune",
+    "branch",
+    *DESIGN_TABLE_NAMES,
+)
+_STEP_OPTION_KEYS = tuple(StepOptions.__dataclass_fields__)
 PARAMETER_SET_KEY = "parameter_set"
-"""Key of `[wheel]` that names a set of parameters; the other keys of the table override its
-values.
-"""
-_AXIS_KEYS = ("from", "to", "count")
+"""Key of `[wheel]` that names a set of parameters. The other keys of the table replace values of
+that set."""
+_GRID_AXIS_KEYS = ("from", "to", "count")
 
 MAX_CONFIG_INTEGER = 2**53
 """Largest integer of a config, chosen because floats represent all integers up to it."""
 
 MAX_CONFIG_LEGS = 1_000
 """Largest number of legs of a config, chosen because results have a number for each leg of each
-sample.
-"""
+sample."""
 
-RENAMED_KEYS = {
+RENAMED_CONFIG_KEYS = {
     "[model]": {"rung": "name"},
     "[options]": {
         "first_step": "dt0",
@@ -63,7 +74,7 @@ RENAMED_KEYS = {
     },
     "[branch]": {"largest_step": "max_ds"},
 }
-"""Old keys by table, with the present names that a config must use."""
+"""Present names of renamed keys by table and old key. A config with an old key raises an error."""
 
 
 @dataclass(frozen=True)
@@ -84,39 +95,42 @@ class ScanConfig:
 
     @classmethod
     def from_table(
-        cls, table: Mapping[str, object], model_class: type[AbstractWheel]
+        cls, config_table: Mapping[str, object], model_class: type[AbstractWheel]
     ) -> "ScanConfig":
-        """Return the settings of `[scan]`; raise a ValueError if the model does not have a
-        measure.
-        """
-        _require_known_keys(table, cls.__dataclass_fields__, "[scan]", "settings")
-        measures = table.get("measures")
-        slope_sd = table.get("slope_sd")
-        if measures is not None:
+        """Return the settings of `[scan]`. Raise a ValueError if the model does not have a
+        requested measure."""
+        _require_known_keys(config_table, cls.__dataclass_fields__, "[scan]", "settings")
+        measure_names = config_table.get("measures")
+        slope_sd = config_table.get("slope_sd")
+        if measure_names is not None:
             if not (
-                isinstance(measures, list)
-                and all(isinstance(measure_name, str) for measure_name in measures)
+                isinstance(measure_names, list)
+                and all(isinstance(measure_name, str) for measure_name in measure_names)
             ):
                 requirement = 'a list of names: write measures = ["dls_fraction", "speed"]'
-                raise _make_error("measures", measures, requirement)
-            catalog = (
-                CATALOGS.get(model_class.capabilities.gait_method, CATALOGS[GaitMethod.COLLOCATION])
-                if "tol" not in table
-                else TOLERANCE_CATALOG
+                raise _make_value_error("measures", measure_names, requirement)
+            measure_catalog = (
+                MEASURE_CATALOGS.get(
+                    model_class.capabilities.gait_method, MEASURE_CATALOGS[GaitMethod.COLLOCATION]
+                )
+                if "tol" not in config_table
+                else TOLERANCE_MEASURE_CATALOG
             )
-            if slope_sd is not None and "tol" not in table:
-                catalog = add_passage_measures(catalog)
-            check_measures(measures, catalog)
-            measures = tuple(measures)
-        chunk = table.get("chunk")
-        tol = table.get("tol")
+            if slope_sd is not None and "tol" not in config_table:
+                measure_catalog = add_passage_measures(measure_catalog)
+            check_measure_names(measure_names, measure_catalog)
+            measure_names = tuple(measure_names)
+        chunk_size = config_table.get("chunk")
+        error_tolerance = config_table.get("tol")
         return cls(
-            measures,
-            None if chunk is None else _parse_int(chunk, "chunk", 1),
-            None if tol is None else _parse_number(tol, "tol", must_be_positive=True),
+            measure_names,
+            None if chunk_size is None else _parse_whole_number(chunk_size, "chunk", 1),
+            None
+            if error_tolerance is None
+            else _parse_finite_number(error_tolerance, "tol", must_be_positive=True),
             None
             if slope_sd is None
-            else _parse_number(slope_sd, "slope_sd", must_be_positive=True),
+            else _parse_finite_number(slope_sd, "slope_sd", must_be_positive=True),
         )
 
 
@@ -133,20 +147,24 @@ class GaitConfig:
     start: tuple[float, float, float] | None = None
 
     @classmethod
-    def from_table(cls, table: Mapping[str, object]) -> "GaitConfig":
+    def from_table(cls, config_table: Mapping[str, object]) -> "GaitConfig":
         """Return the settings of `[gait]`."""
-        _require_known_keys(table, cls.__dataclass_fields__, "[gait]", "settings")
-        steps = _parse_int(table.get("steps", cls.steps), "steps", 1)
-        start = table.get("start")
-        if start is None:
-            return cls(steps)
-        if not (isinstance(start, list) and len(start) == 3):
+        _require_known_keys(config_table, cls.__dataclass_fields__, "[gait]", "settings")
+        n_steps = _parse_whole_number(config_table.get("steps", cls.steps), "steps", 1)
+        start_state = config_table.get("start")
+        if start_state is None:
+            return cls(n_steps)
+        if not (isinstance(start_state, list) and len(start_state) == 3):
             requirement = (
                 "the section state before touchdown, three numbers: angle in rad, angular rate in "
             )
-            raise _make_error("start", start, requirement + "rad/s, rate of Leg 1 in m/s")
-        theta, dtheta, dL1 = (_parse_number(value, "start") for value in start)
-        return cls(steps, (theta, dtheta, dL1))
+            raise _make_value_error(
+                "start", start_state, requirement + "rad/s, rate of Leg 1 in m/s"
+            )
+        theta, dtheta, dL1 = (
+            _parse_finite_number(state_component, "start") for state_component in start_state
+        )
+        return cls(n_steps, (theta, dtheta, dL1))
 
 
 @dataclass(frozen=True)
@@ -166,39 +184,50 @@ class TuneConfig:
     evaluations: int = 200
 
     @classmethod
-    def from_table(cls, table: Mapping[str, object]) -> "TuneConfig":
+    def from_table(cls, config_table: Mapping[str, object]) -> "TuneConfig":
         """Return the settings of `[tune]` and its tables."""
-        _require_known_keys(table, cls.__dataclass_fields__, "[tune]", "settings")
-        objective = table.get("objective", cls.objective)
-        if isinstance(objective, dict):
-            objective = {name: _parse_number(value, name) for name, value in objective.items()}
-        elif not isinstance(objective, str):
+        _require_known_keys(config_table, cls.__dataclass_fields__, "[tune]", "settings")
+        objective_setting = config_table.get("objective", cls.objective)
+        if isinstance(objective_setting, dict):
+            objective_setting = {
+                key_name: _parse_finite_number(given_value, key_name)
+                for key_name, given_value in objective_setting.items()
+            }
+        elif not isinstance(objective_setting, str):
             requirement = (
                 'a measure or weights of several: write objective = "dls_fraction" or objective = '
             )
-            raise _make_error(
-                "objective", objective, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
+            raise _make_value_error(
+                "objective", objective_setting, requirement + "{ dls_fraction = 1.0, speed = 0.1 }"
             )
-        bounds = table.get("bounds")
-        if not isinstance(bounds, dict) or not bounds:
+        bounds_table = config_table.get("bounds")
+        if not isinstance(bounds_table, dict) or not bounds_table:
             raise ValueError(
                 "[tune] has no free parameter, but it needs at least one: add [tune.bounds] with "
                 "lines such as damping = [20.0, 215.0]."
             )
-        _require_known_keys(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
-        constraints = table.get("constraints")
-        if constraints is not None:
-            if not isinstance(constraints, dict):
+        _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+        constraints_table = config_table.get("constraints")
+        if constraints_table is not None:
+            if not isinstance(constraints_table, dict):
                 requirement = "a table: write [tune.constraints] and below it lines such as "
-                raise _make_error(
-                    "constraints", constraints, requirement + "clearance_sls1 = 0.001"
+                raise _make_value_error(
+                    "constraints", constraints_table, requirement + "clearance_sls1 = 0.001"
                 )
-            constraints = {name: _parse_number(value, name) for name, value in constraints.items()}
+            constraints_table = {
+                key_name: _parse_finite_number(given_value, key_name)
+                for key_name, given_value in constraints_table.items()
+            }
         return cls(
-            objective=objective,
-            bounds={name: _parse_range(name, value) for name, value in bounds.items()},
-            constraints=constraints,
-            evaluations=_parse_int(table.get("evaluations", cls.evaluations), "evaluations", 1),
+            objective=objective_setting,
+            bounds={
+                key_name: _parse_parameter_range(key_name, given_value)
+                for key_name, given_value in bounds_table.items()
+            },
+            constraints=constraints_table,
+            evaluations=_parse_whole_number(
+                config_table.get("evaluations", cls.evaluations), "evaluations", 1
+            ),
         )
 
 
@@ -218,36 +247,45 @@ class BranchConfig:
     max_ds: float | None = None
 
     @classmethod
-    def from_table(cls, table: Mapping[str, object], names: tuple[str, ...]) -> "BranchConfig":
-        """Return the settings of `[branch]`; its parameter is one of `names`."""
-        _raise_for_renamed_keys(table, "[branch]")
-        _require_known_keys(table, cls.__dataclass_fields__, "[branch]", "settings")
-        parameter = table.get("parameter")
-        check_parameter_name(parameter, names, "parameter that a branch of this model runs along")
-        assert isinstance(parameter, str)
-        if "bounds" not in table:
+    def from_table(
+        cls, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
+    ) -> "BranchConfig":
+        """Return the settings of `[branch]`, whose parameter must be one of
+        `allowed_parameters`.
+        """
+        _raise_for_renamed_keys(config_table, "[branch]")
+        _require_known_keys(config_table, cls.__dataclass_fields__, "[branch]", "settings")
+        branch_parameter = config_table.get("parameter")
+        check_parameter_name(
+            branch_parameter, allowed_parameters, "parameter that a branch of this model runs along"
+        )
+        assert isinstance(branch_parameter, str)
+        if "bounds" not in config_table:
             raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
-        bounds = check_range(
-            "bounds", _parse_range("bounds of " + parameter, table["bounds"], parameter)
+        parameter_bounds = check_range(
+            "bounds",
+            _parse_parameter_range(
+                "bounds of " + branch_parameter, config_table["bounds"], branch_parameter
+            ),
         )
         max_ds = None
-        if "max_ds" in table:
-            max_ds = _parse_number(table["max_ds"], "max_ds", must_be_positive=True)
+        if "max_ds" in config_table:
+            max_ds = _parse_finite_number(config_table["max_ds"], "max_ds", must_be_positive=True)
             if max_ds > 1.0:
                 raise ValueError(
                     f"max_ds is {max_ds:g}, but it is a share of the range: give 0.02, say."
                 )
         return cls(
-            parameter=parameter,
-            bounds=bounds,
-            period=_parse_int(table.get("period", cls.period), "period", 1),
+            parameter=branch_parameter,
+            bounds=parameter_bounds,
+            period=_parse_whole_number(config_table.get("period", cls.period), "period", 1),
             max_ds=max_ds,
         )
 
 
 @dataclass(frozen=True)
 class Config:
-    """A config as checked values, with the text from which it was read."""
+    """Checked values of a config, and the text from which they were read."""
 
     wheel_values: Mapping[str, float | int] = field(default_factory=dict)
     model_name: str = "viscoelastic"
@@ -257,14 +295,15 @@ class Config:
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
     branch: BranchConfig | None = None
-    design: designs.AbstractDesign | None = None
+    design: designs.AbstractSampleDesign | None = None
     source_text: str = ""
     file_name: str = ""
 
-    def make_wheel(self, changes: Mapping[str, float | int] | None = None) -> WheelParams:
-        """Return the wheel: Table 1 with the values of the config, and then with `changes`."""
-        values: dict[str, Any] = {**self.wheel_values, **(changes or {})}
-        return WheelParams(**values)
+    def make_wheel(self, changed_values: Mapping[str, float | int] | None = None) -> WheelParams:
+        """Return the wheel: Table 1, changed by the values of the config and then by
+        `changed_values`."""
+        parameter_values: dict[str, Any] = {**self.wheel_values, **(changed_values or {})}
+        return WheelParams(**parameter_values)
 
     def make_model(self) -> AbstractWheel:
         """Return the model with its settings."""
@@ -272,317 +311,398 @@ class Config:
 
     def make_options(self) -> StepOptions:
         """Return the numerical options of the steps."""
-        options: dict[str, Any] = {**self.option_values}
-        return StepOptions(**options)
+        option_values: dict[str, Any] = {**self.option_values}
+        return StepOptions(**option_values)
 
 
-def load_config(path: str | Path) -> Config:
-    """Return the config of a file after checks; raise a ValueError if it is invalid."""
-    path = Path(path)
-    if not path.exists():
-        suggestion = suggest_name(
-            path.name, (neighbor.name for neighbor in path.parent.glob("*.toml"))
+def load_config(config_path: str | Path) -> Config:
+    """Return the checked config of a file. Raise a ValueError if the file is invalid."""
+    config_path = Path(config_path)
+    if not config_path.exists():
+        name_suggestion = suggest_name(
+            config_path.name,
+            (neighbor_path.name for neighbor_path in config_path.parent.glob("*.toml")),
         )
         raise ValueError(
-            f"there is no config file {path}{suggestion}: give the path of a TOML file, "
+            f"there is no config file {config_path}{name_suggestion}: give the path of a TOML "
+            "file, "
             "such as configs/quickstart.toml, which `vrw init` writes."
         )
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder, but a config is a TOML file: give its path.")
+    if config_path.is_dir():
+        raise ValueError(f"{config_path} is a folder, but a config is a TOML file: give its path.")
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        config_text = config_path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as read_error:
         raise ValueError(
-            f"{path} can't be read ({error}): give a readable text file in UTF-8."
-        ) from error
-    return parse_config(text, path.name)
+            f"{config_path} can't be read ({read_error}): give a readable text file in UTF-8."
+        ) from read_error
+    return parse_config(config_text, config_path.name)
 
 
-def parse_config(text: str, file_name: str = "config") -> Config:
-    """Return the config of a text after checks; `file_name` begins every message about an error."""
+def parse_config(config_text: str, file_name: str = "config") -> Config:
+    """Return the checked config of a text. Every error message begins with `file_name`."""
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        config_tables = tomllib.loads(config_text)
+    except tomllib.TOMLDecodeError as config_error:
         raise ValueError(
-            f"{file_name}: this is not valid TOML ({error}): mend that line."
-        ) from error
-    except ValueError as error:
+            f"{file_name}: this is not valid TOML ({config_error}): mend that line."
+        ) from config_error
+    except ValueError as config_error:
         raise ValueError(
             f"{file_name}: a number has more digits than any key takes: give a shorter one."
-        ) from error
-    except RecursionError as error:
+        ) from config_error
+    except RecursionError as config_error:
         raise ValueError(
             f"{file_name}: lists or tables lie in each other too deeply: no key takes more than "
             f"two."
-        ) from error
+        ) from config_error
     try:
-        return _make_config(tables, text, file_name)
-    except ValueError as error:
-        raise ValueError(f"{file_name}: {error}") from error
+        return _parse_config_tables(config_tables, config_text, file_name)
+    except ValueError as config_error:
+        raise ValueError(f"{file_name}: {config_error}") from config_error
 
 
-def _make_config(tables: Mapping[str, object], text: str, file_name: str) -> Config:
-    """Return the config of the tables of a file; raise a ValueError if a table is invalid."""
-    _require_known_keys(tables, TABLE_NAMES, "the file", "tables")
-    for key, table in tables.items():
-        if not isinstance(table, dict):
-            requirement = f"a table: write [{key}] on a line of its own and its settings below"
-            raise _make_error(f"[{key}]", table, requirement)
-    design_kinds = [design_kind for design_kind in DESIGN_KINDS if design_kind in tables]
+def _parse_config_tables(
+    config_tables: Mapping[str, object], config_text: str, file_name: str
+) -> Config:
+    """Return the config of the tables of a file. Raise a ValueError if a table is invalid."""
+    _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
+    for table_key, config_table in config_tables.items():
+        if not isinstance(config_table, dict):
+            requirement = (
+                f"a table: write [{table_key}] on a line of its own and its settings below"
+            )
+            raise _make_value_error(f"[{table_key}]", config_table, requirement)
+    design_kinds = [
+        design_kind for design_kind in DESIGN_TABLE_NAMES if design_kind in config_tables
+    ]
     if len(design_kinds) > 1:
         raise ValueError(
             f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one "
             "design: keep one."
         )
-    model_name, model = _parse_model(_get_table(tables, "model"))
+    model_name, model_settings = _parse_model_table(_get_config_table(config_tables, "model"))
     model_class = find_model_class(model_name)
-    names = model_class.parameter_names
-    design = (
-        _parse_design(design_kinds[0], _get_table(tables, design_kinds[0]), names)
+    parameter_names = model_class.parameter_names
+    sample_design = (
+        _parse_design_table(
+            design_kinds[0], _get_config_table(config_tables, design_kinds[0]), parameter_names
+        )
         if design_kinds
         else None
     )
-    wheel = _parse_wheel(_get_table(tables, "wheel"))
+    wheel_values = _parse_wheel_table(_get_config_table(config_tables, "wheel"))
     doubly_given_names = [
-        key for key in _get_table(tables, "wheel") if design is not None and key in design.names
+        table_key
+        for table_key in _get_config_table(config_tables, "wheel")
+        if sample_design is not None and table_key in sample_design.swept_parameters
     ]
     if doubly_given_names:
         raise ValueError(
             f"{doubly_given_names[0]} is fixed in [wheel] and swept in [{design_kinds[0]}], but it "
             "can only be one: drop one of the two."
         )
-    option_table = _get_table(tables, "options")
-    _raise_for_renamed_keys(option_table, "[options]")
-    _require_known_keys(option_table, _OPTION_KEYS, "[options]", "options")
-    default_options = {key: getattr(StepOptions(), key) for key in _OPTION_KEYS}
-    option_values = _parse_like_defaults(option_table, default_options)
-    config = Config(
-        wheel_values=wheel,
+    options_table = _get_config_table(config_tables, "options")
+    _raise_for_renamed_keys(options_table, "[options]")
+    _require_known_keys(options_table, _STEP_OPTION_KEYS, "[options]", "options")
+    default_options = {
+        table_key: getattr(StepOptions(), table_key) for table_key in _STEP_OPTION_KEYS
+    }
+    option_values = _parse_with_default_types(options_table, default_options)
+    checked_config = Config(
+        wheel_values=wheel_values,
         model_name=model_name,
-        model_settings=model,
+        model_settings=model_settings,
         option_values=option_values,
-        scan=ScanConfig.from_table(_get_table(tables, "scan"), model_class),
-        gait=GaitConfig.from_table(_get_table(tables, "gait")),
-        tune=TuneConfig.from_table(_get_table(tables, "tune")) if "tune" in tables else None,
-        branch=BranchConfig.from_table(_get_table(tables, "branch"), names)
-        if "branch" in tables
+        scan=ScanConfig.from_table(_get_config_table(config_tables, "scan"), model_class),
+        gait=GaitConfig.from_table(_get_config_table(config_tables, "gait")),
+        tune=TuneConfig.from_table(_get_config_table(config_tables, "tune"))
+        if "tune" in config_tables
         else None,
-        design=design,
-        source_text=text,
+        branch=BranchConfig.from_table(_get_config_table(config_tables, "branch"), parameter_names)
+        if "branch" in config_tables
+        else None,
+        design=sample_design,
+        source_text=config_text,
         file_name=file_name,
     )
-    config.make_wheel()
+    checked_config.make_wheel()
     try:
-        config.make_model()
+        checked_config.make_model()
     # The wheel has a setting that no file can contain, such as uneven ground.
-    except TypeError as error:
-        raise ValueError(str(error)) from error
-    options = config.make_options()
-    options.check_tolerances(np.dtype(float))
-    make_solver(options.solver, options)
-    return config
+    except TypeError as model_error:
+        raise ValueError(str(model_error)) from model_error
+    step_options = checked_config.make_options()
+    step_options.check_tolerances(np.dtype(float))
+    make_solver(step_options.solver, step_options)
+    return checked_config
 
 
-def _get_table(tables: Mapping[str, object], key: str) -> dict[str, object]:
-    """Return a table of the file; an empty one if it is missing."""
-    table = tables.get(key, {})
-    assert isinstance(table, dict)
-    return table
+def _get_config_table(config_tables: Mapping[str, object], table_name: str) -> dict[str, object]:
+    """Return a table of the file, or an empty table if the file does not contain it."""
+    config_table = config_tables.get(table_name, {})
+    assert isinstance(config_table, dict)
+    return config_table
 
 
-def parse_assignment(text: str) -> tuple[str, float | int]:
-    """Return a parameter and its value from `name=value` of the command line."""
-    name, equals_sign, value = (key.strip() for key in text.partition("="))
+def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
+    """Return a parameter and its value from `parameter_name=value_text` of the command line."""
+    parameter_name, equals_sign, value_text = (
+        text_part.strip() for text_part in assignment_text.partition("=")
+    )
     if not equals_sign:
-        raise ValueError(f"--set {text} has no '=': write a parameter and its value, damping=150.")
+        raise ValueError(
+            f"--set {assignment_text} has no '=': write a parameter and its value, damping=150."
+        )
     try:
-        number = int(value) if name == "n_legs" else float(value)
+        given_number = int(value_text) if parameter_name == "n_legs" else float(value_text)
     except ValueError:
-        number = value  # type: ignore[assignment]  # The check below reports the error.
-    return name, _parse_wheel({name: number})[name]
+        given_number = value_text  # type: ignore[assignment]  # The check below reports the error.
+    return parameter_name, _parse_wheel_table({parameter_name: given_number})[parameter_name]
 
 
-def _parse_wheel(table: Mapping[str, object]) -> dict[str, float | int]:
+def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | int]:
     """Return the parameters of `[wheel]` by name."""
     known_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
-    _require_known_keys(table, known_keys, "[wheel]", "parameters")
-    values: dict[str, float | int] = {}
-    if (set_name := table.get(PARAMETER_SET_KEY)) is not None:
-        check_known_name(set_name, tuple(parameter_sets), "parameter set")
-        values |= parameter_sets[str(set_name)].values
-    for name, value in table.items():
-        if name == PARAMETER_SET_KEY:
+    _require_known_keys(config_table, known_keys, "[wheel]", "parameters")
+    parameter_values: dict[str, float | int] = {}
+    if (parameter_set_name := config_table.get(PARAMETER_SET_KEY)) is not None:
+        check_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
+        parameter_values |= parameter_sets[str(parameter_set_name)].values
+    for parameter_name, given_value in config_table.items():
+        if parameter_name == PARAMETER_SET_KEY:
             continue
-        if name == "n_legs":
-            values[name] = _parse_int(value, name, 5)
-            if values[name] > MAX_CONFIG_LEGS:
-                raise _make_error(name, value, f"at most {MAX_CONFIG_LEGS:,}")
+        if parameter_name == "n_legs":
+            parameter_values[parameter_name] = _parse_whole_number(given_value, parameter_name, 5)
+            if parameter_values[parameter_name] > MAX_CONFIG_LEGS:
+                raise _make_value_error(parameter_name, given_value, f"at most {MAX_CONFIG_LEGS:,}")
         else:
-            values[name] = _parse_parameter(name, value)
-    return values
+            parameter_values[parameter_name] = _parse_parameter_value(parameter_name, given_value)
+    return parameter_values
 
 
-def _parse_model(table: Mapping[str, object]) -> tuple[str, dict[str, float | int | str | bool]]:
+def _parse_model_table(
+    config_table: Mapping[str, object],
+) -> tuple[str, dict[str, float | int | str | bool]]:
     """Return the name and the settings of the model of `[model]`."""
-    _raise_for_renamed_keys(table, "[model]")
-    model_name = table.get("name", Config.model_name)
-    check_known_name(model_name, list_config_names(), "model")
+    _raise_for_renamed_keys(config_table, "[model]")
+    model_name = config_table.get("name", Config.model_name)
+    check_known_name(model_name, list_model_config_names(), "model")
     assert isinstance(model_name, str)
-    defaults = {setting.name: setting.default for setting in fields(find_model_class(model_name))}
+    default_settings = {
+        model_field.name: model_field.default
+        for model_field in fields(find_model_class(model_name))
+    }
     _require_known_keys(
-        table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
+        config_table, ("name", *default_settings), f'[model] with name = "{model_name}"', "settings"
     )
-    model_settings = {name: value for name, value in table.items() if name != "name"}
-    return model_name, _parse_like_defaults(model_settings, defaults)
+    model_settings = {
+        setting_name: setting_value
+        for setting_name, setting_value in config_table.items()
+        if setting_name != "name"
+    }
+    return model_name, _parse_with_default_types(model_settings, default_settings)
 
 
-def _parse_like_defaults(
-    table: Mapping[str, object], defaults: Mapping[str, object]
+def _parse_with_default_types(
+    config_table: Mapping[str, object], default_values: Mapping[str, object]
 ) -> dict[str, float | int | str | bool]:
-    """Return settings with the types of their defaults; numbers must be positive."""
-    values: dict[str, float | int | str | bool] = {}
-    for key, value in table.items():
-        default = defaults[key]
-        if isinstance(default, bool):
-            if not isinstance(value, bool):
-                raise _make_error(key, value, "true or false")
-            values[key] = value
-        elif isinstance(default, str):
-            if not isinstance(value, str):
-                raise _make_error(key, value, f'a name, "{default}"')
-            values[key] = value
-        elif isinstance(default, int):
-            values[key] = _parse_int(value, key, 1)
-        elif key == FRICTION_NAME and value == math.inf:
-            values[key] = math.inf  # Infinite friction means that feet do not slip.
+    """Return settings converted to the types of their defaults. Numbers must be positive."""
+    parsed_values: dict[str, float | int | str | bool] = {}
+    for setting_name, given_value in config_table.items():
+        default_value = default_values[setting_name]
+        if isinstance(default_value, bool):
+            if not isinstance(given_value, bool):
+                raise _make_value_error(setting_name, given_value, "true or false")
+            parsed_values[setting_name] = given_value
+        elif isinstance(default_value, str):
+            if not isinstance(given_value, str):
+                raise _make_value_error(setting_name, given_value, f'a name, "{default_value}"')
+            parsed_values[setting_name] = given_value
+        elif isinstance(default_value, int):
+            parsed_values[setting_name] = _parse_whole_number(given_value, setting_name, 1)
+        elif setting_name == FRICTION_NAME and given_value == math.inf:
+            parsed_values[setting_name] = math.inf  # Infinite friction means that feet do not slip.
         else:
-            values[key] = _parse_number(value, key, must_be_positive=True)
-    return values
+            parsed_values[setting_name] = _parse_finite_number(
+                given_value, setting_name, must_be_positive=True
+            )
+    return parsed_values
 
 
-def _parse_design(
-    design_kind: str, table: Mapping[str, object], names: tuple[str, ...]
-) -> designs.AbstractDesign:
-    """Return the design of a table that sweeps some of the parameters `names`."""
-    design_keys = ("n", "seed") if design_kind in RANDOM_DESIGNS else ()
-    if FRICTION_NAME in table and FRICTION_NAME not in names:
+def _parse_design_table(
+    design_kind: str, config_table: Mapping[str, object], allowed_parameters: tuple[str, ...]
+) -> designs.AbstractSampleDesign:
+    """Return the design of a table that sweeps some of the parameters `allowed_parameters`."""
+    design_keys = ("n", "seed") if design_kind in RANDOM_DESIGN_FUNCTIONS else ()
+    if FRICTION_NAME in config_table and FRICTION_NAME not in allowed_parameters:
         model_choices = [
-            f'name = "{list_value}"' for list_value in list_config_names("scan", FRICTION_NAME)
+            f'name = "{config_name}"'
+            for config_name in list_model_config_names("scan", FRICTION_NAME)
         ]
         raise ValueError(
             f"[{design_kind}] sweeps friction, which does not affect this model: write [model] "
             f"and below it {' or '.join(model_choices)}."
         )
-    _require_known_keys(table, (*design_keys, *names), f"[{design_kind}]", "settings")
-    swept_names = {name: value for name, value in table.items() if name not in design_keys}
+    _require_known_keys(
+        config_table, (*design_keys, *allowed_parameters), f"[{design_kind}]", "settings"
+    )
+    swept_settings = {
+        parameter_name: given_value
+        for parameter_name, given_value in config_table.items()
+        if parameter_name not in design_keys
+    }
     if design_keys:
-        if "n" not in table:
+        if "n" not in config_table:
             raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
-        n, seed = _parse_int(table["n"], "n", 1), _parse_int(table.get("seed", 0), "seed", 0)
-        ranges = {name: _parse_range(name, value) for name, value in swept_names.items()}
-        return RANDOM_DESIGNS[design_kind](ranges, n, seed)
+        n, random_seed = (
+            _parse_whole_number(config_table["n"], "n", 1),
+            _parse_whole_number(config_table.get("seed", 0), "seed", 0),
+        )
+        parameter_ranges = {
+            parameter_name: _parse_parameter_range(parameter_name, given_value)
+            for parameter_name, given_value in swept_settings.items()
+        }
+        return RANDOM_DESIGN_FUNCTIONS[design_kind](parameter_ranges, n, random_seed)
     if design_kind == "grid":
         return designs.grid(
-            **{name: _parse_axis(name, value) for name, value in swept_names.items()}
+            **{
+                parameter_name: _parse_grid_axis(parameter_name, given_value)
+                for parameter_name, given_value in swept_settings.items()
+            }
         )
-    return designs.samples({name: _parse_list(name, value) for name, value in swept_names.items()})
+    return designs.samples(
+        {
+            parameter_name: _parse_value_list(parameter_name, given_value)
+            for parameter_name, given_value in swept_settings.items()
+        }
+    )
 
 
-def _parse_axis(name: str, value: object) -> np.ndarray:
+def _parse_grid_axis(parameter_name: str, axis_setting: object) -> np.ndarray:
     """Return the values of a grid's axis, given as a list or as from, to and count."""
-    if not isinstance(value, dict):
-        return _parse_list(name, value, " or { from = ..., to = ..., count = ... }")
-    _require_known_keys(value, _AXIS_KEYS, f"the axis of {name}", "keys")
-    missing_keys = [key for key in _AXIS_KEYS if key not in value]
+    if not isinstance(axis_setting, dict):
+        return _parse_value_list(
+            parameter_name, axis_setting, " or { from = ..., to = ..., count = ... }"
+        )
+    _require_known_keys(axis_setting, _GRID_AXIS_KEYS, f"the axis of {parameter_name}", "keys")
+    missing_keys = [axis_key for axis_key in _GRID_AXIS_KEYS if axis_key not in axis_setting]
     if missing_keys:
         raise ValueError(
-            f"the axis of {name} has no '{missing_keys[0]}': "
-            f"write {name} = {{ from = ..., to = ..., count = ... }}."
+            f"the axis of {parameter_name} has no '{missing_keys[0]}': "
+            f"write {parameter_name} = {{ from = ..., to = ..., count = ... }}."
         )
-    lower, upper = (_parse_parameter(name, value[key]) for key in ("from", "to"))
-    count = _parse_int(value["count"], f"count of {name}", 1)
-    if count > MAX_LISTED_SAMPLES:
+    first_value, last_value = (
+        _parse_parameter_value(parameter_name, axis_setting[axis_key])
+        for axis_key in ("from", "to")
+    )
+    n_axis_values = _parse_whole_number(axis_setting["count"], f"count of {parameter_name}", 1)
+    if n_axis_values > MAX_LISTED_SAMPLES:
         raise ValueError(
-            f"the axis of {name} has {count:,} values, but {MAX_LISTED_SAMPLES:,} is the most: "
+            f"the axis of {parameter_name} has {n_axis_values:,} values, but "
+            f"{MAX_LISTED_SAMPLES:,} is the most: "
             "give fewer."
         )
-    return np.linspace(lower, upper, count)
+    return np.linspace(first_value, last_value, n_axis_values)
 
 
-def _parse_list(name: str, value: object, alternative_text: str = "") -> np.ndarray:
-    """Return a list of values in the domain of the parameter `name` as an array."""
-    if not isinstance(value, list):
-        raise _make_error(name, value, f"a list of numbers{alternative_text}")
-    return np.asarray([_parse_parameter(name, list_value) for list_value in value])
+def _parse_value_list(
+    parameter_name: str, given_list: object, alternative_text: str = ""
+) -> np.ndarray:
+    """Return a list of values in the domain of a parameter as an array."""
+    if not isinstance(given_list, list):
+        raise _make_value_error(parameter_name, given_list, f"a list of numbers{alternative_text}")
+    return np.asarray(
+        [_parse_parameter_value(parameter_name, given_value) for given_value in given_list]
+    )
 
 
-def _parse_range(name: str, value: object, parameter: str = "") -> tuple[float, float]:
-    """Return lower and upper bound in the domain of `parameter`, by default `name` itself."""
-    if not (isinstance(value, list) and len(value) == 2):
-        raise _make_error(name, value, f"a range of two numbers: write {name} = [lower, upper]")
-    lower, upper = (_parse_parameter(parameter or name, bound_value) for bound_value in value)
-    return lower, upper
+def _parse_parameter_range(
+    range_name: str, given_range: object, parameter_name: str = ""
+) -> tuple[float, float]:
+    """Return lower and upper bound in the domain of a parameter, by default the parameter
+    `range_name`."""
+    if not (isinstance(given_range, list) and len(given_range) == 2):
+        raise _make_value_error(
+            range_name, given_range, f"a range of two numbers: write {range_name} = [lower, upper]"
+        )
+    lower_bound, upper_bound = (
+        _parse_parameter_value(parameter_name or range_name, bound_value)
+        for bound_value in given_range
+    )
+    return lower_bound, upper_bound
 
 
-def _parse_parameter(name: str, value: object) -> float:
-    """Return a value as a number; raise a ValueError if it is not in the domain of the
-    parameter.
-    """
-    number = _parse_number(value, name, must_be_positive=name == FRICTION_NAME)
-    if name != FRICTION_NAME:
-        PARAMETER_DOMAINS[name].require_inside(name, number)
-    return number
+def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
+    """Return a value as a number. Raise a ValueError if the value is not in the domain of the
+    parameter."""
+    parameter_value = _parse_finite_number(
+        given_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
+    )
+    if parameter_name != FRICTION_NAME:
+        PARAMETER_DOMAINS[parameter_name].require_inside(parameter_name, parameter_value)
+    return parameter_value
 
 
-def _parse_number(value: object, name: str, must_be_positive: bool = False) -> float:
-    """Return a value as a finite float; raise a ValueError if it is none."""
-    number = math.nan
-    if isinstance(value, int | float) and not isinstance(value, bool):
+def _parse_finite_number(
+    given_value: object, setting_name: str, must_be_positive: bool = False
+) -> float:
+    """Return a value as a finite float. Raise a ValueError if the value is not a finite number."""
+    finite_number = math.nan
+    if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         # An integer of hundreds of digits is too large for a float.
         with contextlib.suppress(OverflowError):
-            number = float(value)
-    if not math.isfinite(number):
-        raise _make_error(name, value, "a finite number")
-    if must_be_positive and not number > 0:
-        raise ValueError(f"{name} is {number:g}, but it must be positive.")
-    return number
+            finite_number = float(given_value)
+    if not math.isfinite(finite_number):
+        raise _make_value_error(setting_name, given_value, "a finite number")
+    if must_be_positive and not finite_number > 0:
+        raise ValueError(f"{setting_name} is {finite_number:g}, but it must be positive.")
+    return finite_number
 
 
-def _parse_int(value: object, name: str, minimum: int) -> int:
-    """Return a value as a whole number of at least `minimum`; raise a ValueError if it is none."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
-        raise _make_error(name, value, f"a whole number of at least {minimum}")
-    if value > MAX_CONFIG_INTEGER:
-        raise _make_error(name, value, f"at most {MAX_CONFIG_INTEGER:,}")
-    return value
+def _parse_whole_number(given_value: object, setting_name: str, min_value: int) -> int:
+    """Return a value as a whole number of at least `min_value`. Raise a ValueError otherwise."""
+    if isinstance(given_value, bool) or not isinstance(given_value, int) or given_value < min_value:
+        raise _make_value_error(
+            setting_name, given_value, f"a whole number of at least {min_value}"
+        )
+    if given_value > MAX_CONFIG_INTEGER:
+        raise _make_value_error(setting_name, given_value, f"at most {MAX_CONFIG_INTEGER:,}")
+    return given_value
 
 
 def _require_known_keys(
-    table: Mapping[str, object], allowed_keys: Iterable[str], location: str, key_kind: str
+    config_table: Mapping[str, object],
+    allowed_keys: Iterable[str],
+    table_location: str,
+    key_kind: str,
 ) -> None:
     """Raise a ValueError if a table has a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
-    for key in table:
+    for key in config_table:
         refuse_symbol(key, allowed_keys)
         if key not in allowed_keys:
             raise ValueError(
-                f"{location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "
+                f"{table_location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
             )
 
 
-def _raise_for_renamed_keys(table: Mapping[str, object], location: str) -> None:
+def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: str) -> None:
     """Raise a ValueError if a table has an old key."""
-    for key, new_key in RENAMED_KEYS[location].items():
-        if key in table:
-            raise ValueError(f"{location} has the old key '{key}': write {new_key} in its place.")
+    for old_key, new_key in RENAMED_CONFIG_KEYS[table_location].items():
+        if old_key in config_table:
+            raise ValueError(
+                f"{table_location} has the old key '{old_key}': write {new_key} in its place."
+            )
 
 
-def _make_error(name: str, value: object, requirement: str) -> ValueError:
-    """Return the error about a value, written as in TOML, that does not satisfy a requirement."""
-    value_text = format_value(value)
-    if isinstance(value, bool):
+def _make_value_error(setting_name: str, given_value: object, requirement_text: str) -> ValueError:
+    """Return the error about a value that does not satisfy a requirement. The message writes the
+    value as in TOML."""
+    value_text = format_value(given_value)
+    if isinstance(given_value, bool):
         value_text = value_text.lower()
-    elif isinstance(value, str):
+    elif isinstance(given_value, str):
         value_text = value_text.replace("'", '"')
-    return ValueError(f"{name} is {value_text}, but it must be {requirement}.")
+    return ValueError(f"{setting_name} is {value_text}, but it must be {requirement_text}.")

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from vrw_jax.cli.encoding import format_for_encoding
+from vrw_jax.cli.encoding import replace_unencodable_characters
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
     from vrw_jax.cycles import LimitCycle, ReturnMapCycle
-    from vrw_jax.models import AbstractStep, StepResult
-    from vrw_jax.paper import Fact
+    from vrw_jax.models import StepResult
+    from vrw_jax.paper import PaperFact
     from vrw_jax.scans import ScanProgress
     from vrw_jax.wheel import WheelParams
 
@@ -41,58 +41,67 @@ stderr_console = Console(stderr=True)
 
 
 @contextlib.contextmanager
-def report_errors(interruption_message: str = "stopped; nothing was written.") -> Iterator[None]:
+def report_command_errors(
+    interruption_message: str = "stopped; nothing was written.",
+) -> Iterator[None]:
     """Return a context that reports an error in one sentence with exit code 2, and a Ctrl-C with
-    130.
-    """
+    exit code 130."""
     try:
         yield
     except KeyboardInterrupt:
-        print_error(interruption_message)
+        print_error_sentence(interruption_message)
         raise typer.Exit(ExitCode.INTERRUPTED) from None
-    except MemoryError as error:
-        print_error(
+    except MemoryError as command_error:
+        print_error_sentence(
             "this asks for more memory than there is: give smaller designs, or fewer at once."
         )
-        raise typer.Exit(ExitCode.USER_ERROR) from error
-    except (ValueError, OSError) as error:
-        print_error(str(error) if isinstance(error, ValueError) else _format_system_error(error))
-        raise typer.Exit(ExitCode.USER_ERROR) from error
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except (ValueError, OSError) as command_error:
+        print_error_sentence(
+            str(command_error)
+            if isinstance(command_error, ValueError)
+            else _format_system_error(command_error)
+        )
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
 
 
 @contextlib.contextmanager
-def report_output_errors() -> Iterator[None]:
-    """Return a context that reports, with exit code 2, that standard output cannot be written."""
+def report_stdout_errors() -> Iterator[None]:
+    """Return a context that reports with exit code 2 that standard output cannot be written."""
     exit_code: Any = 0
     try:
         yield
-    except SystemExit as end:
-        exit_code = end.code
-    except OSError as error:
-        _abandon_output(error)
+    except SystemExit as system_exit:
+        exit_code = system_exit.code
+    except OSError as output_error:
+        _discard_output_and_exit(output_error)
     try:
         sys.stdout.flush()
-    except OSError as error:
-        _abandon_output(error)
+    except OSError as output_error:
+        _discard_output_and_exit(output_error)
     raise SystemExit(exit_code)
 
 
-def _abandon_output(error: OSError) -> None:
-    """Discard the remaining output, which Python would write at the end, and exit."""
+def _discard_output_and_exit(output_error: OSError) -> None:
+    """Discard the remaining output, which Python would write at its end, and exit with code 2."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if not isinstance(error, BrokenPipeError):  # The reader has closed the pipe on purpose.
-        print_error(f"standard output can't be written: {_format_system_error(error)}")
+    if not isinstance(output_error, BrokenPipeError):  # The reader has closed the pipe on purpose.
+        print_error_sentence(
+            f"standard output can't be written: {_format_system_error(output_error)}"
+        )
     raise SystemExit(ExitCode.USER_ERROR)
 
 
-def print_error(sentence: str) -> None:
+def print_error_sentence(error_sentence: str) -> None:
     """Print a sentence about an error on stderr."""
-    stderr_console.print(f"[bold red]vrw:[/] {escape(sentence)}", highlight=False, soft_wrap=True)
+    stderr_console.print(
+        f"[bold red]vrw:[/] {escape(error_sentence)}", highlight=False, soft_wrap=True
+    )
 
 
 def show_warnings_as_sentences() -> None:
     """Print the library's warnings as sentences, without their location in the code."""
-    default_showwarning = warnings.showwarning
+    default_show_warning = warnings.showwarning
 
     def show_warning(
         message: Warning | str,
@@ -103,32 +112,34 @@ def show_warnings_as_sentences() -> None:
         line: str | None = None,
     ) -> None:
         if category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1]):
-            print_error(str(message))
+            print_error_sentence(str(message))
         else:
-            default_showwarning(message, category, filename, lineno, file, line)
+            default_show_warning(message, category, filename, lineno, file, line)
 
     warnings.showwarning = show_warning
 
 
-def _format_system_error(error: OSError) -> str:
+def _format_system_error(system_error: OSError) -> str:
     """Return a sentence about an error of the operating system."""
-    location = f"{error.filename}: " if error.filename else ""
-    return f"{location}{str(error.strerror or error).rstrip('.')}."
+    file_text = f"{system_error.filename}: " if system_error.filename else ""
+    return f"{file_text}{str(system_error.strerror or system_error).rstrip('.')}."
 
 
 @contextlib.contextmanager
-def show_stages(first_stage: str) -> Iterator[Callable[[str], None]]:
+def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], None]]:
     """Show the stage of a computation and its duration, and yield the function that sets the next
     stage.
 
-    If stderr is no terminal, each stage that is passed to this function is printed as one line.
+    If stderr is not a terminal, each stage that is passed to this function is printed as one line.
     """
     if not stderr_console.is_terminal:
-        yield lambda stage: stderr_console.print(f"{stage} ...", highlight=False, soft_wrap=True)
+        yield lambda stage_name: stderr_console.print(
+            f"{stage_name} ...", highlight=False, soft_wrap=True
+        )
         return
     with make_progress_bar("stages") as progress_bar:
-        task = progress_bar.add_task(first_stage, total=None)
-        yield lambda stage: progress_bar.update(task, description=stage)
+        progress_task = progress_bar.add_task(first_stage_name, total=None)
+        yield lambda stage_name: progress_bar.update(progress_task, description=stage_name)
 
 
 def print_written_paths(paths: Iterable[Path]) -> None:
@@ -137,231 +148,272 @@ def print_written_paths(paths: Iterable[Path]) -> None:
         stdout_console.print(f"written: {path}", highlight=False, soft_wrap=True)
 
 
-def print_table(
-    title: str | None,
-    rows: Iterable[Sequence[str]],
-    headings: Sequence[str] = (),
-    right_aligned: Sequence[str] = (),
+def print_text_table(
+    table_title: str | None,
+    text_rows: Iterable[Sequence[str]],
+    column_headings: Sequence[str] = (),
+    right_aligned_headings: Sequence[str] = (),
 ) -> None:
     """Print a table; without headings the first column is bold.
 
     Texts are printed literally, except that a column with the heading "" may contain color markup.
     """
-    table = Table(title=title, title_justify="left", show_header=bool(headings), box=None)
-    for heading in headings or ("name", "text"):
-        table.add_column(heading, justify="right" if heading in right_aligned else "left")
-    for row in rows:
-        texts = [format_for_encoding(text, stdout_console.encoding) for text in row]
-        cells = [
-            text if heading == "" else escape(text)
-            for heading, text in zip(headings or ("name", "text"), texts, strict=True)
+    rich_table = Table(
+        title=table_title, title_justify="left", show_header=bool(column_headings), box=None
+    )
+    for column_heading in column_headings or ("name", "text"):
+        rich_table.add_column(
+            column_heading, justify="right" if column_heading in right_aligned_headings else "left"
+        )
+    for text_row in text_rows:
+        encodable_texts = [
+            replace_unencodable_characters(cell_text, stdout_console.encoding)
+            for cell_text in text_row
         ]
-        table.add_row(*(cells if headings else (f"[bold]{cells[0]}[/]", *cells[1:])))
-    stdout_console.print(table)
+        cell_texts = [
+            cell_text if column_heading == "" else escape(cell_text)
+            for column_heading, cell_text in zip(
+                column_headings or ("name", "text"), encodable_texts, strict=True
+            )
+        ]
+        rich_table.add_row(
+            *(cell_texts if column_headings else (f"[bold]{cell_texts[0]}[/]", *cell_texts[1:]))
+        )
+    stdout_console.print(rich_table)
 
 
-def print_facts(facts: "list[Fact]", folder: Path) -> None:
-    """Print the table of facts and how many hold."""
+def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
+    """Print the table of facts, and the number of facts that hold."""
     verdict_texts = ("[bold red]does not hold[/]", "[green]holds[/]")
-    print_table(
+    print_text_table(
         None,
         (
             (
-                fact.claim,
-                fact.source,
-                fact.published_value,
-                fact.computed,
-                verdict_texts[fact.holds],
+                paper_fact.claim,
+                paper_fact.source,
+                paper_fact.published_value,
+                paper_fact.computed,
+                verdict_texts[paper_fact.holds],
             )
-            for fact in facts
+            for paper_fact in paper_facts
         ),
         ("fact", "where", "published", "found", ""),
     )
-    from vrw_jax.paper import summarize_facts
+    from vrw_jax.paper import summarize_paper_facts
 
-    stdout_console.print(f"{summarize_facts(facts)}; see the figures and {folder / 'facts.md'}.")
+    stdout_console.print(
+        f"{summarize_paper_facts(paper_facts)}; see the figures and {folder / 'facts.md'}."
+    )
 
 
-def make_progress_bar(task: str) -> "Bar":
-    """Return a progress bar on stderr; the bar of a scan counts samples and shows a note."""
+def make_progress_bar(task_name: str) -> "Bar":
+    """Return a progress bar on stderr. The bar of a scan counts samples and shows a note."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    columns = (
+    bar_columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        *((MofNCompleteColumn(),) if task == "scan" else ()),
-        TextColumn("{task.fields[note]}") if task == "scan" else TimeElapsedColumn(),
+        *((MofNCompleteColumn(),) if task_name == "scan" else ()),
+        TextColumn("{task.fields[note]}") if task_name == "scan" else TimeElapsedColumn(),
     )
-    return Bar(*columns, console=stderr_console)
+    return Bar(*bar_columns, console=stderr_console)
 
 
-def make_scan_reporter(update_bar: Callable, task: int) -> Callable[["ScanProgress"], None]:
+def make_scan_progress_reporter(
+    update_bar: Callable, progress_task: int
+) -> Callable[["ScanProgress"], None]:
     """Return the function that shows rate, fraction without a gait and remaining time of a scan.
 
-    The rate is measured from the second chunk on, because the first one includes compilation. The
-    bar includes the samples of an earlier run; rate and fraction are those of this run.
+    The rate is measured from the second chunk on, because the first chunk includes compilation. The
+    bar includes the samples of an earlier run. Rate and fraction are those of this run.
     """
     import time
 
-    from vrw_jax.scans import format_seconds
+    from vrw_jax.scans import format_duration
 
-    first_report: list[tuple[float, int]] = []
+    first_reports: list[tuple[float, int]] = []
 
-    def report(progress: "ScanProgress") -> None:
-        """Update the bar."""
-        time_now, n_done = time.monotonic(), progress.n_done
-        bar_note = f"{progress.n_reused:,} from an earlier run" if progress.n_reused else ""
-        if n_done:
-            first_report.append((time_now, n_done))
-            first_time, n_before = first_report[0]
-            bar_note = f"{100 * progress.n_failed / n_done:.0f} % without a gait"
-            if time_now > first_time:
-                samples_per_second = (n_done - n_before) / (time_now - first_time)
-                seconds_left = (progress.n_samples - n_done) / samples_per_second
+    def report_progress(scan_progress: "ScanProgress") -> None:
+        """Update the progress bar of the scan."""
+        present_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
+        bar_note = (
+            f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
+        )
+        if n_samples_done:
+            first_reports.append((present_seconds, n_samples_done))
+            first_report_seconds, n_samples_at_first_report = first_reports[0]
+            bar_note = f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
+            if present_seconds > first_report_seconds:
+                samples_per_second = (n_samples_done - n_samples_at_first_report) / (
+                    present_seconds - first_report_seconds
+                )
+                seconds_left = (scan_progress.n_samples - n_samples_done) / samples_per_second
                 bar_note = (
                     f"{samples_per_second:,.0f} per s, {bar_note}, "
-                    f"{format_seconds(seconds_left)} left"
+                    f"{format_duration(seconds_left)} left"
                 )
         update_bar(
-            task,
-            total=progress.n_reused + progress.n_samples,
-            completed=progress.n_reused + n_done,
-            description="scanning" if n_done else "compiling",
+            progress_task,
+            total=scan_progress.n_reused + scan_progress.n_samples,
+            completed=scan_progress.n_reused + n_samples_done,
+            description="scanning" if n_samples_done else "compiling",
             note=bar_note,
         )
 
-    return report
+    return report_progress
 
 
-def print_outcomes(scan: "xr.Dataset") -> None:
+def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
     """Print the number of samples of a scan by outcome."""
     import numpy as np
 
     from vrw_jax.wheel import Outcome
 
-    codes, count_by_code = np.unique(scan.outcome.values, return_counts=True)
-    ending_texts = [Outcome(int(code)) for code in codes]
-    print_table(
+    outcome_codes, n_samples_by_code = np.unique(scan_dataset.outcome.values, return_counts=True)
+    outcomes = [Outcome(int(outcome_code)) for outcome_code in outcome_codes]
+    print_text_table(
         "Outcomes",
         (
             (
-                f"{count:,}",
-                f"{100 * count / count_by_code.sum():.1f} %",
-                ending_text.name,
-                ending_text.meaning,
+                f"{n_samples:,}",
+                f"{100 * n_samples / n_samples_by_code.sum():.1f} %",
+                outcome.name,
+                outcome.meaning,
             )
-            for count, ending_text in zip(count_by_code, ending_texts, strict=True)
+            for n_samples, outcome in zip(n_samples_by_code, outcomes, strict=True)
         ),
         ("samples", "share", "outcome", "meaning"),
         ("samples", "share"),
     )
 
 
-def print_gait(
+def print_wheel_and_gait(
     params: "WheelParams",
-    result: Any,  # `result` is the step of any model.
-    start: "ArrayLike | tuple[float, ...]",
+    step_result: Any,  # `step_result` is the step of any model.
+    start_state: "ArrayLike | tuple[float, ...]",
     n_walked: int,
-    cycle: "LimitCycle | ReturnMapCycle",
-    peaks: "xr.Dataset | None",
+    limit_cycle_result: "LimitCycle | ReturnMapCycle",
+    force_peak_dataset: "xr.Dataset | None",
 ) -> None:
-    """Print a wheel, the last step of its walk, which began at the state `start`, its limit cycle,
-    and the force peaks of the gait's first step.
+    """Print a wheel, the last step of its walk, its limit cycle, and the force peaks of the gait's
+    first step.
+
+    `start_state` is the state at which the last step began.
     """
     import numpy as np
 
     from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome
 
     parameter_texts = [
-        f"{name} {float(getattr(params, name)):g} {difference.unit}"
-        for name, difference in PARAMETER_DOMAINS.items()
+        f"{parameter_name} {float(getattr(params, parameter_name)):g} {parameter_domain.unit}"
+        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items()
     ]
     stdout_console.print(
         "[bold]Wheel[/]  " + ", ".join(parameter_texts) + f", {params.n_legs} legs"
     )
-    outcome = Outcome(int(result.outcome))
-    if outcome == Outcome.STEPPED:
-        change = float(np.abs(np.asarray(result.section_state) - np.asarray(start)).max())
-        stdout_console.print(
-            f"Walked {n_walked} steps; the last changed the section state by {change:.1e}."
+    step_outcome = Outcome(int(step_result.outcome))
+    if step_outcome == Outcome.STEPPED:
+        state_change = float(
+            np.abs(np.asarray(step_result.section_state) - np.asarray(start_state)).max()
         )
-        _print_step(result)
+        stdout_console.print(
+            f"Walked {n_walked} steps; the last changed the section state by {state_change:.1e}."
+        )
+        from vrw_jax.measures import MARGIN_MEASURES
+
+        excluded_names = ("outcome", "solver_steps", *MARGIN_MEASURES)
+        shown_measures = {
+            parameter_name: measure_value
+            for parameter_name, measure_value in step_result.measures().items()
+            if parameter_name not in excluded_names
+        }
+        _print_measure_table("Last step", shown_measures)
     else:
         stdout_console.print(
-            f"[bold]Step {n_walked + 1} ended as {outcome.name}:[/] {outcome.meaning}"
+            f"[bold]Step {n_walked + 1} ended as {step_outcome.name}:[/] {step_outcome.meaning}"
         )
-    _print_cycle(cycle)
-    if peaks is not None:
-        _print_measures("Force in the gait", {str(name): x.item() for name, x in peaks.items()})
+    _print_limit_cycle(limit_cycle_result)
+    if force_peak_dataset is not None:
+        _print_measure_table(
+            "Force in the gait",
+            {str(parameter_name): x.item() for parameter_name, x in force_peak_dataset.items()},
+        )
     # This is a cycle of the paper's model.
-    if outcome == Outcome.STEPPED and "lambda_4_plus" in result.measures():
-        _print_margins(result)
+    if step_outcome == Outcome.STEPPED and "lambda_4_plus" in step_result.measures():
+        _print_step_margins(step_result)
 
 
-def _print_step(result: "AbstractStep") -> None:
-    """Print the measures of a step."""
-    from vrw_jax.measures import MARGIN_MEASURES
-
-    excluded = ("outcome", "solver_steps", *MARGIN_MEASURES)
-    values = {name: value for name, value in result.measures().items() if name not in excluded}
-    _print_measures("Last step", values)
-
-
-def _print_measures(title: str, values: "Mapping[str, Any]") -> None:
+def _print_measure_table(table_title: str, measure_values: "Mapping[str, Any]") -> None:
     """Print a table of measures by name."""
     from vrw_jax.measures import MEASURES
 
-    rows = (
-        (measure.long_name, measure.symbol, f"{float(values[name]):.5g}", measure.display_unit)
-        for name, measure in MEASURES.items()
-        if name in values
+    measure_rows = (
+        (
+            measure_description.long_name,
+            measure_description.symbol,
+            f"{float(measure_values[measure_name]):.5g}",
+            measure_description.display_unit,
+        )
+        for measure_name, measure_description in MEASURES.items()
+        if measure_name in measure_values
     )
-    print_table(title, rows, ("quantity", "symbol", "value", "unit"), ("value",))
+    print_text_table(table_title, measure_rows, ("quantity", "symbol", "value", "unit"), ("value",))
 
 
-def _print_cycle(cycle: "LimitCycle | ReturnMapCycle") -> None:
+def _print_limit_cycle(limit_cycle_result: "LimitCycle | ReturnMapCycle") -> None:
     """Print stability, period, speed and DLS fraction of a limit cycle."""
     import numpy as np
 
     from vrw_jax.cycles import format_multipliers
     from vrw_jax.wheel import Outcome
 
-    if not bool(cycle.found):
-        ending_text = Outcome(int(cycle.outcome))
-        stdout_console.print(f"[bold]Limit cycle[/]  {ending_text.name}: {ending_text.meaning}")
+    if not bool(limit_cycle_result.found):
+        search_outcome = Outcome(int(limit_cycle_result.outcome))
+        stdout_console.print(
+            f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
+        )
         return
-    spectral_radius, multipliers = format_multipliers(np.asarray(cycle.monodromy_value))
+    spectral_radius, multipliers = format_multipliers(
+        np.asarray(limit_cycle_result.monodromy_value)
+    )
     stability_text = "stable" if spectral_radius < 1.0 else "unstable"
     stdout_console.print(
         f"[bold]Limit cycle[/]  {stability_text}: multipliers {multipliers}; period "
-        f"{float(cycle.period):.5f} s, speed {float(cycle.speed):.5f} m/s, "
-        f"DLS {100 * float(cycle.dls_fraction):.2f} %."
+        f"{float(limit_cycle_result.period):.5f} s, speed {float(limit_cycle_result.speed):.5f} "
+        "m/s, "
+        f"DLS {100 * float(limit_cycle_result.dls_fraction):.2f} %."
     )
 
 
-def _print_margins(result: "StepResult") -> None:
+def _print_step_margins(step_result: "StepResult") -> None:
     """Print the margins of a step."""
     import numpy as np
 
     from vrw_jax.measures import MARGIN_MEASURES
 
-    rows = []
-    for name, measure in MARGIN_MEASURES.items():
-        values = np.atleast_1d(np.asarray(getattr(result.margins, name)))
-        least_margin, label = float(values.min()), measure.long_name
-        violation_mark = "[green]holds[/]" if least_margin >= 0.0 else "[bold red]broken[/]"
-        if measure.dimension and least_margin < 0.0:
-            legs = [str(leg + 3) for leg in np.flatnonzero(values < 0.0)]
-            label += f" (broken at legs {', '.join(legs)})"
-        rows.append(
-            (violation_mark, label, measure.symbol, f"{least_margin:.4g}", measure.display_unit)
+    margin_rows = []
+    for margin_name, margin_description in MARGIN_MEASURES.items():
+        margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))
+        lowest_margin, margin_label = float(margin_values.min()), margin_description.long_name
+        violation_mark = "[green]holds[/]" if lowest_margin >= 0.0 else "[bold red]broken[/]"
+        if margin_description.dimension and lowest_margin < 0.0:
+            leg_texts = [str(leg_index + 3) for leg_index in np.flatnonzero(margin_values < 0.0)]
+            margin_label += f" (broken at legs {', '.join(leg_texts)})"
+        margin_rows.append(
+            (
+                violation_mark,
+                margin_label,
+                margin_description.symbol,
+                f"{lowest_margin:.4g}",
+                margin_description.display_unit,
+            )
         )
-    headings = ("", "margin of", "symbol", "least", "unit")
-    print_table("Margins of the paper's model", rows, headings, ("least",))
+    column_headings = ("", "margin of", "symbol", "least", "unit")
+    print_text_table("Margins of the paper's model", margin_rows, column_headings, ("least",))
     n_margins, n_violated = (
-        len(rows),
-        sum("broken[" in violation_mark for violation_mark, *_ in rows),
+        len(margin_rows),
+        sum("broken[" in violation_mark for violation_mark, *_ in margin_rows),
     )
     stdout_console.print(
         f"{n_margins - n_violated} of {n_margins} margins hold, {n_violated} are broken. The model "

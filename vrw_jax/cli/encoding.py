@@ -5,10 +5,10 @@ import io
 import sys
 import unicodedata
 
-ERROR_HANDLER_NAME = "vrw_spell"
+ENCODING_ERROR_HANDLER_NAME = "vrw_spell"
 """Name of the handler of encoding errors, chosen because no other library uses it."""
 
-ASCII_SPELLINGS = {
+ASCII_REPLACEMENTS = {
     "α": "alpha", "θ": "theta", "κ": "kappa", "λ": "lambda", "μ": "mu", "ρ": "rho", "σ": "sigma",
     "φ": "phi", "Δ": "Delta ", "∂": "d", "\u0307": "'", "\u0308": "''", "²": "^2", "ᵀ": "^T",
     "·": ".", "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'",
@@ -17,34 +17,37 @@ ASCII_SPELLINGS = {
 """Replacements of the characters beyond ASCII that commands print."""
 
 
-def spell_unencodable_characters() -> None:
+def replace_unencodable_output() -> None:
     """Make standard output and standard error replace the characters that their encoding lacks."""
-    codecs.register_error(ERROR_HANDLER_NAME, _spell_unencodable)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=ERROR_HANDLER_NAME)
+    codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
+    for output_stream in (sys.stdout, sys.stderr):
+        if isinstance(output_stream, io.TextIOWrapper):
+            output_stream.reconfigure(errors=ENCODING_ERROR_HANDLER_NAME)
 
 
-def format_for_encoding(text: str, encoding: str) -> str:
-    """Return the text as a terminal of that encoding shows it."""
-    codecs.register_error(ERROR_HANDLER_NAME, _spell_unencodable)
-    return text.encode(encoding, ERROR_HANDLER_NAME).decode(encoding)
+def replace_unencodable_characters(text: str, encoding_name: str) -> str:
+    """Return the text with replacements of all characters that the encoding lacks."""
+    codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
+    return text.encode(encoding_name, ENCODING_ERROR_HANDLER_NAME).decode(encoding_name)
 
 
-def _spell_unencodable(error: UnicodeError) -> tuple[str, int]:
-    """Return the replacement of characters that an encoding lacks, and the index after them."""
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    return "".join(map(_spell_in_ascii, error.object[error.start : error.end])), error.end
+def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
+    """Return the replacement of characters that an encoding lacks, and the index after these
+    characters."""
+    if not isinstance(encoding_error, UnicodeEncodeError):
+        raise encoding_error
+    return "".join(
+        map(_replace_with_ascii, encoding_error.object[encoding_error.start : encoding_error.end])
+    ), encoding_error.end
 
 
-def _spell_in_ascii(character: str) -> str:
-    """Return a character in ASCII: its replacement, or those of the characters of which it is
-    composed.
+def _replace_with_ascii(character: str) -> str:
+    """Return a character in ASCII, which is its replacement or the replacements of its
+    components.
     """
-    if character.isascii() or character in ASCII_SPELLINGS:
-        return ASCII_SPELLINGS.get(character, character)
+    if character.isascii() or character in ASCII_REPLACEMENTS:
+        return ASCII_REPLACEMENTS.get(character, character)
     decomposed_characters = unicodedata.normalize("NFKD", character)
     if decomposed_characters == character:
         return "" if unicodedata.combining(character) else "?"
-    return "".join(map(_spell_in_ascii, decomposed_characters))
+    return "".join(map(_replace_with_ascii, decomposed_characters))

@@ -37,7 +37,7 @@ from vrw_jax.contact.walk_kernel import (
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
-from vrw_jax.runtime import cached_lane_program
+from vrw_jax.runtime import compile_cached_lane_program
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, compute_symbols, compute_wheel_units_of_rows
 
 
@@ -339,8 +339,8 @@ def _compile_for_rows(
             SECTION_STATE_FUNCTIONS[function_name](compute_symbols(n, *parameter_values), x)
         )
 
-    if simd.is_available():
-        return cached_lane_program(
+    if simd.is_machine_code_available():
+        return compile_cached_lane_program(
             evaluate_section_function, [], n_rows, dtype, ("on real ground", function_name, n)
         )
     return _compile_with_xla(evaluate_section_function)
@@ -530,9 +530,9 @@ def _compile_walk(
             )
         )
 
-    if simd.is_available():
+    if simd.is_machine_code_available():
         scalar_dtypes = [np.dtype(np.int32), *[dtype] * options_structure.num_leaves]
-        return cached_lane_program(
+        return compile_cached_lane_program(
             run_compiled_walk,
             scalar_dtypes,
             sum(config.input_row_counts()),

@@ -30,7 +30,7 @@ from vrw_jax.contact.mechanics import (
     prevent_fusion,
     sum_over_legs,
 )
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.wheel import Symbols
 
 
@@ -187,7 +187,7 @@ def _differentiable_solution(
     )
 
     @solve.defjvp
-    @with_default_settings
+    @with_default_jax_settings
     def solution_jvp(primals: tuple, tangents: tuple) -> tuple[ForceSolution, ForceSolution]:
         configuration, tangent = assemble(*primals), assemble(tangents[0], primals[1])
         inertia, free_motion, solution = _solve_with_free_motion(free_motion_fn, configuration)

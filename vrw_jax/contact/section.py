@@ -6,7 +6,12 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.contact.contact_modes import ContactMode
 from vrw_jax.contact.contact_state import ContactState
 from vrw_jax.contact.mechanics import WheelMotion, leg_directions
-from vrw_jax.models import PAPER_START, is_valid_slope, is_valid_start, replace_invalid
+from vrw_jax.models import (
+    PAPER_START_STATE,
+    is_valid_slope,
+    is_valid_start_state,
+    replace_invalid_inputs,
+)
 from vrw_jax.numerics import Elementwise
 from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, length_at_touchdown
 
@@ -74,16 +79,16 @@ def replace_invalid_start(
       the line that continues the one of the last foothold.
     """
     safe_state = embed_section_state(
-        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START, x.dtype)
+        WheelParams(n_legs=params.n_legs).symbols(), jnp.asarray(PAPER_START_STATE, x.dtype)
     )
     safe_column = safe_state.reshape(-1, *(1,) * (x.ndim - 1))
-    is_valid = is_valid_start(params, x) & (friction >= 0.0)
+    is_valid = is_valid_start_state(params, x) & (friction >= 0.0)
     is_valid = is_valid & (
         is_valid_slope(params.slope + tilt)
         if tilt is not None
         else _is_consistent_posture(params.symbols(), x)
     )
-    params, x = replace_invalid(is_valid, params, x, safe_column)
+    params, x = replace_invalid_inputs(is_valid, params, x, safe_column)
     return is_valid, params, jnp.where(is_valid, friction, 1.0), x
 
 

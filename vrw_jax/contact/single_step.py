@@ -45,9 +45,9 @@ from vrw_jax.contact.walk_kernel import (
 )
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import ButcherTableau, load_explicit_tableau, sample_at_equal_times
-from vrw_jax.models import split_jacobian
+from vrw_jax.models import split_jacobian_by_leaf
 from vrw_jax.numerics import ForwardFunction, StepOptions, unbatch
-from vrw_jax.runtime import cached_lane_function
+from vrw_jax.runtime import compile_cached_lane_function
 from vrw_jax.wheel import stack_parameters
 
 
@@ -140,7 +140,9 @@ def build_contact_step_function(argument_structure: Any, is_detailed: bool) -> F
     """
     config = ContactStepConfig(argument_structure, is_detailed)
     cache_key = "step on real ground", str(argument_structure), is_detailed
-    return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
+    return unbatch(
+        compile_cached_lane_function(config.compute_outputs, config.make_template, cache_key)
+    )
 
 
 def build_contact_step_jacobian(
@@ -159,7 +161,7 @@ def build_contact_step_jacobian(
 
     cache_key = "step on real ground along directions", str(argument_structure), is_detailed
     compute_tangents = unbatch(
-        cached_lane_function(config.compute_tangents, make_template, cache_key)
+        compile_cached_lane_function(config.compute_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
@@ -180,7 +182,7 @@ def build_contact_step_jacobian(
         )(leaves, tuple(tangents))
         float_outputs, other_outputs = jax.tree.map(lambda x: x[0], (float_outputs, other_outputs))
         return (
-            split_jacobian(jacobian_columns, leaves, input_indices),
+            split_jacobian_by_leaf(jacobian_columns, leaves, input_indices),
             float_outputs,
         ), other_outputs
 
@@ -354,14 +356,16 @@ def build_contact_step_sampler(
         )
 
     compiled_start = unbatch(
-        cached_lane_function(begin_lane, begin_lane, ("start on real ground", cache_key))
+        compile_cached_lane_function(begin_lane, begin_lane, ("start on real ground", cache_key))
     )
     make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
     compiled_advance = unbatch(
-        cached_lane_function(advance_to_event, make_template, ("to the next event", cache_key))
+        compile_cached_lane_function(
+            advance_to_event, make_template, ("to the next event", cache_key)
+        )
     )
     compiled_sampling = unbatch(
-        cached_lane_function(
+        compile_cached_lane_function(
             sample_intervals,
             lambda leaves, log: log.duration,
             ("samples on real ground", cache_key, n_samples),

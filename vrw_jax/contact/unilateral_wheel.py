@@ -67,15 +67,15 @@ from vrw_jax.contact.step_record import (
 from vrw_jax.contact.walk_kernel import StepSummary
 from vrw_jax.hybrid import MonitoredFunctions, integrate_in_units, sample_in_units
 from vrw_jax.models import (
-    PAPER_START,
+    PAPER_START_STATE,
     AbstractWheel,
     AdvanceResult,
     GaitMethod,
     ModelCapabilities,
-    StepGround,
-    can_use_lanes,
-    check_step_values,
-    complete_slopes,
+    StepGroundValues,
+    can_use_batch_kernel,
+    check_stepwise_shape,
+    complete_line_slopes,
 )
 from vrw_jax.numerics import (
     Elementwise,
@@ -246,7 +246,9 @@ class UnilateralWheel(AbstractWheel):
 
     def default_start(self, params: WheelParams) -> FullState:
         """Return a full section state close to the paper's gait of Table 1."""
-        return embed_section_state(params.symbols(), jnp.asarray(PAPER_START, params.damping.dtype))
+        return embed_section_state(
+            params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
+        )
 
     def section_size(self, params: WheelParams) -> int:
         return full_section_size(params.n_legs)
@@ -263,7 +265,7 @@ class UnilateralWheel(AbstractWheel):
         """
         return _embed_compiled(params, x) if x.shape == (3,) else x
 
-    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
+    def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground of each step, or None on flat ground of one friction.
 
         The ground is (slope, friction, friction of the earlier feet, tilt of the next line), each
@@ -273,17 +275,19 @@ class UnilateralWheel(AbstractWheel):
         if slope.ndim == friction.ndim == 0:
             return None
         is_flat = slope.ndim == 0
-        slopes = jnp.full(n_steps + 1, slope) if is_flat else complete_slopes(slope, n_steps)
+        line_slopes = (
+            jnp.full(n_steps + 1, slope) if is_flat else complete_line_slopes(slope, n_steps)
+        )
         if friction.ndim:
-            check_step_values(FRICTION_NAME, friction, n_steps)
+            check_stepwise_shape(FRICTION_NAME, friction, n_steps)
         friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
         previous_friction = jnp.append(friction[:1], friction[:-1])
-        return slopes[:-1], friction, previous_friction, slopes[1:] - slopes[:-1]
+        return line_slopes[:-1], friction, previous_friction, line_slopes[1:] - line_slopes[:-1]
 
     def with_ground(
-        self, params: WheelParams, ground: StepGround
+        self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["UnilateralWheel", WheelParams]:
-        slope, friction, previous_friction, tilt = ground
+        slope, friction, previous_friction, tilt = step_ground
         model = dataclasses.replace(
             self, friction=friction, uneven=UnevenGround(previous_friction, tilt)
         )
@@ -302,7 +306,7 @@ class UnilateralWheel(AbstractWheel):
     ) -> tuple[Any, str]:
         """Return the outputs of a step, and the name of the engine that computed them."""
         leaves, argument_structure = self._flatten_arguments(params, x, options)
-        engine = "lanes" if can_use_lanes(options) else "diffrax"
+        engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
         return eqx.combine(*_compile_step(argument_structure, is_detailed, engine)(*leaves)), engine
 
     def _flatten_arguments(
@@ -316,7 +320,7 @@ class UnilateralWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        if can_use_lanes(options):
+        if can_use_batch_kernel(options):
             leaves, argument_structure = self._flatten_arguments(params, x, options)
             samples = build_contact_step_sampler(argument_structure, n_samples)(*leaves)
         else:

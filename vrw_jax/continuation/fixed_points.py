@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.hybrid import ReturnMap, Termination, find_program
 from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
 from vrw_jax.printing import describe_elements, format_numbers, format_quantity, format_text
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import (
     check_callable,
     check_int,
@@ -291,7 +291,7 @@ def _run_newton_loop(
 
 
 @_run_newton_loop.defjvp
-@with_default_settings
+@with_default_jax_settings
 def _run_newton_jvp(
     converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:
@@ -333,7 +333,7 @@ def _run_newton_implicit(
 
 
 @_run_newton_implicit.defjvp
-@with_default_settings
+@with_default_jax_settings
 def _run_newton_implicit_jvp(
     converted_map: ClosureConvertedMap, iterations: int, primals: tuple, tangents: tuple
 ) -> tuple[FixedPointResult, FixedPointResult]:

@@ -16,7 +16,7 @@ from vrw_jax.cycles.gait_walks import (
     walk_to_gaits,
 )
 from vrw_jax.numerics import concat_rows, take_rows
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
 DUPLICATE_GAIT_DISTANCE = 1e-5
@@ -72,7 +72,7 @@ def _find_gaits_from_starts(
     n_wheels = len(parameter_values)
     with ThreadPoolExecutor(1) as compile_thread:
         compile_thread.submit(
-            with_default_settings(gait_finder.precompile_newton_programs), parameter_values[:1]
+            with_default_jax_settings(gait_finder.precompile_newton_programs), parameter_values[:1]
         )
         candidate_wheel_indices, walk_states, _ = walk_to_gaits(
             gait_finder, parameter_values, compute_starts

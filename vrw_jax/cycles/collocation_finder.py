@@ -45,7 +45,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, value_and_jacobian
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import validate_arguments
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -243,13 +243,13 @@ class CollocationFinder(AbstractGaitFinder):
         )
         with ThreadPoolExecutor(2) as compile_pool:
             cycle_future = compile_pool.submit(
-                with_default_settings(compute_cycle_and_derivatives),
+                with_default_jax_settings(compute_cycle_and_derivatives),
                 self.system,
                 parameter_values,
                 self.make_initial_guess(parameter_values),
             )
             step_future = compile_pool.submit(
-                with_default_settings(compute_step_and_derivatives),
+                with_default_jax_settings(compute_step_and_derivatives),
                 self.model,
                 self.n_legs,
                 parameter_values,

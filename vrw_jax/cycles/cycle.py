@@ -15,12 +15,12 @@ from vrw_jax.continuation import floquet
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.printing import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_ending,
     format_numbers,
     format_outcome_counts,
 )
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -196,7 +196,7 @@ class AbstractCycle(AbstractPrintable):
         newton_matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
         return self._zero_without_gait(jnp.linalg.cond(newton_matrix))
 
-    @with_default_settings
+    @with_default_jax_settings
     def measure(self, measure_name: str) -> Array:
         """Return a measure of the cycle by its name in `CYCLE_MEASURE_FUNCTIONS`; batch axes come
         first.
@@ -211,7 +211,7 @@ class AbstractCycle(AbstractPrintable):
         """Return several measures by name. Measures that are not named are not traced."""
         return {name: self.measure(name) for name in names}
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts of the printed cycle; for a batch, the number of found cycles."""
         outcome_codes = np.asarray(self.outcome)
         if outcome_codes.ndim:
@@ -234,7 +234,7 @@ class AbstractCycle(AbstractPrintable):
         ]
 
     @abc.abstractmethod
-    def model_summary_rows(self) -> list[TextRow]:
+    def model_summary_rows(self) -> list[LabelAndText]:
         """Return the labels and texts that only this model's cycles print."""
 
 

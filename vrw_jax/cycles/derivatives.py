@@ -38,7 +38,11 @@ from vrw_jax.numerics import (
     with_implicit_derivative,
     zero_tangent,
 )
-from vrw_jax.runtime import cached_lane_function, cached_trace, with_default_settings
+from vrw_jax.runtime import (
+    compile_cached_lane_function,
+    with_default_jax_settings,
+    wrap_with_saved_trace,
+)
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, compute_wheel_units
 
 
@@ -87,7 +91,7 @@ def _compute_monodromy_tangents(
     plain_indices = [
         i
         for i in range(len(parameters))
-        if i not in (hub_index, leg_index, *scales.SCALING_BY_PARAMETER)
+        if i not in (hub_index, leg_index, *scales.UNIT_SCALING_BY_PARAMETER_INDEX)
     ]
     unit_weights, zero_weights = jnp.ones_like(total_mass), jnp.zeros_like(total_mass)
     first_indices = jnp.asarray([*plain_indices, leg_index])
@@ -122,7 +126,7 @@ def _compute_monodromy_tangents(
     )
     tangent_by_parameter = dict(zip(plain_indices, monodromy_tangents[:-1], strict=True))
     mass_scale_tangent = (
-        scales.MASS_SCALING.subtract_columns(
+        scales.MASS_UNIT_SCALING.subtract_known_columns(
             jnp.zeros_like(monodromy_tangents[0]), tuple(parameters), tangent_by_parameter
         )
         / total_mass
@@ -139,11 +143,11 @@ def _compute_monodromy_tangents(
     )  # derivative of the monodromy matrix by the logarithm of the time unit
     time_scale_tangents = {
         i: time_scale_tangent
-        if unit_scale is scales.TIME_SCALING
+        if unit_scale is scales.TIME_UNIT_SCALING
         else jnp.zeros_like(time_scale_tangent)
-        for i, unit_scale in scales.SCALING_BY_PARAMETER.items()
+        for i, unit_scale in scales.UNIT_SCALING_BY_PARAMETER_INDEX.items()
     }
-    tangent_by_parameter = scales.complete_by_scaling(
+    tangent_by_parameter = scales.complete_jacobian_by_scaling(
         tuple(parameters), tangent_by_parameter, time_scale_tangents
     )
     return jnp.stack([tangent_by_parameter[i] for i in range(len(parameters))])
@@ -161,10 +165,10 @@ def compile_batch_function(
 
     The fastest form is machine code on a CPU, else XLA in blocks of `batch_size` lanes.
     """
-    if simd.is_available():
-        return cached_lane_function(function, make_output_template, cache_key)
+    if simd.is_machine_code_available():
+        return compile_cached_lane_function(function, make_output_template, cache_key)
     register_export_types()
-    return cached_trace(make_blockwise(function, batch_size), cache_key)
+    return wrap_with_saved_trace(make_blockwise(function, batch_size), cache_key)
 
 
 def _make_derivative_compiler(
@@ -285,7 +289,7 @@ def solve_cycle_with_derivatives(
         return collocation_state, tuple(diagnostics)
 
     @solve_with_rule.defjvp
-    @with_default_settings
+    @with_default_jax_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         collocation_state, diagnostics = solve_with_rule(*primals)
         tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
@@ -321,7 +325,7 @@ def attach_monodromy_derivatives(
         return monodromy_value
 
     @attach_with_rule.defjvp
-    @with_default_settings
+    @with_default_jax_settings
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         return attach_with_rule(*primals), apply_jacobian(
             compute_parameter_jacobian(*primals[1:]), tangents[1]

@@ -22,9 +22,9 @@ from vrw_jax.printing import format_numbers
 from vrw_jax.simulation import (
     ModelLike,
     check_model,
-    check_options,
     check_section_state,
     check_single_wheel,
+    check_step_options,
 )
 from vrw_jax.validation import check_type, is_traced
 from vrw_jax.wheel import WheelParams
@@ -54,8 +54,9 @@ def make_finder(
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = check_model(model)
     make_finder_from_options = FINDER_CLASSES[resolved_model.capabilities.gait_method].from_options
-    return make_finder_from_options(resolved_model, n_legs, check_options(step_options), period_n,
-                CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
+    return make_finder_from_options(
+        resolved_model, n_legs, check_step_options(step_options), period_n,
+        CycleOptions() if cycle_options is None else cycle_options)  # fmt: skip
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vrw_jax.batches import SolverIndex, select_solver, step_batch
+from vrw_jax.batches import SolverIndex, select_cheapest_solver, step_batch
 from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
@@ -33,7 +33,7 @@ from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
@@ -103,7 +103,7 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
-@with_default_settings
+@with_default_jax_settings
 @raise_for_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
@@ -178,7 +178,7 @@ def limit_cycle(
     return cycle.replace_missing_gaits_by_nan(params) if returns_nan else cycle
 
 
-@with_default_settings
+@with_default_jax_settings
 def limit_cycles(
     params: WheelParams,
     *,
@@ -418,7 +418,8 @@ def _find_walk_end_states(
     implicit solver.
     """
     parameter_rows = _stack_concrete_parameters(params)
-    is_solver_explicit = select_solver(parameter_rows, StepOptions()) != SolverIndex.IMPLICIT
+    solver_indices = select_cheapest_solver(parameter_rows, StepOptions())
+    is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
     unsettled_wheels = np.flatnonzero(needs_walk & is_solver_explicit)
     parameter_values, walk_end_states = parameter_rows.T, np.full((len(needs_walk), 3), np.nan)
     smallest_period_defects = np.full(len(needs_walk), GAIT_WALK_OPTIONS.max_newton_start_defect)

@@ -42,8 +42,8 @@ from vrw_jax.cycles.slope_response import (
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
-from vrw_jax.printing import TextRow, describe_elements, format_numbers
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.printing import LabelAndText, describe_elements, format_numbers
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
@@ -113,7 +113,7 @@ class LimitCycle(AbstractCycle):
         """Return `function` of one cycle, mapped over the batch axes of this cycle."""
         for _ in range(self.outcome.ndim):
             function = jax.vmap(function)
-        return with_default_settings(function)
+        return with_default_jax_settings(function)
 
     @property
     def monodromy(self) -> Float[Array, "... 2 2"]:
@@ -246,7 +246,7 @@ class LimitCycle(AbstractCycle):
             describe_outcome, self.outcome, self.collocation_state.failed_check
         )
 
-    def model_summary_rows(self) -> list[TextRow]:
+    def model_summary_rows(self) -> list[LabelAndText]:
         landing_indicators = self.indicators
         indicator_text = (
             f"{format_numbers(landing_indicators.lambda_I4)} N s, "

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from vrw_jax.collocation import PhasePoints
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import Elementwise
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Motion, Symbols, WheelParams, dynamics
 
@@ -40,7 +40,7 @@ DEFAULT_MARGIN_SHARE = 1e-3
 """Default least value of a margin, as a fraction of the wheel's weight, leg length or gravity."""
 
 
-@with_default_settings
+@with_default_jax_settings
 def default_margins(params: WheelParams) -> Mapping[str, float]:
     """Return least values of `KEPT_MARGIN_NAMES`: a thousandth of each unit's natural scale on this
     wheel.

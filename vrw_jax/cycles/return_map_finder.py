@@ -33,7 +33,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
-from vrw_jax.printing import TextRow, format_numbers
+from vrw_jax.printing import LabelAndText, format_numbers
 from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
@@ -114,7 +114,7 @@ class ReturnMapCycle(AbstractCycle):
     def monodromy(self) -> Array:
         return self.monodromy_value
 
-    def model_summary_rows(self) -> list[TextRow]:
+    def model_summary_rows(self) -> list[LabelAndText]:
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
 
 

@@ -10,14 +10,14 @@ from vrw_jax.cycles.finder_selection import CycleGuess, check_guess, resolve_fin
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_names, check_not_traced, suggest_name
 from vrw_jax.wheel import Outcome, WheelParams
 
 
-@with_default_settings
+@with_default_jax_settings
 def sensitivities(
     params: WheelParams,
     *,

@@ -4,11 +4,11 @@ from vrw_jax.figures import branch_figures, style
 from vrw_jax.figures.branch_figures import basin_figure, branch_figure
 from vrw_jax.figures.scan_figures import map_figure, scan_figures
 from vrw_jax.figures.style import (
-    DARK_GRAY,
+    DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    LIGHT_GRAY,
-    PAGE_WIDTH_INCHES,
+    LIGHT_GRAY_COLOR,
+    PAGE_FIGURE_WIDTH_INCHES,
     figure_style,
     save,
 )

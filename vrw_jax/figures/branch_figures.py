@@ -8,43 +8,43 @@ from matplotlib.lines import Line2D
 
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.figures.style import (
-    DARK_GRAY,
-    GREEN,
+    DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    PAGE_WIDTH_INCHES,
-    PINK,
-    YELLOW,
+    OKABE_ITO_GREEN,
+    OKABE_ITO_PINK,
+    OKABE_ITO_YELLOW,
+    PAGE_FIGURE_WIDTH_INCHES,
     draw_outcome_cells,
+    draw_panel_letter,
     figure_style,
     format_axis_label,
     format_value_label,
-    label_panel,
     make_outcome_patches,
-    require_variables_of_all,
-    typeset_symbols,
+    require_variables_of_datasets,
+    typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES, describe_violation
-from vrw_jax.simulation import PRE_TOUCHDOWN_NAMES
+from vrw_jax.simulation import PRE_TOUCHDOWN_COMPONENT_NAMES
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
-BRANCH_END_COLOR = PINK
+BRANCH_END_COLOR = OKABE_ITO_PINK
 """Color of the end of a branch, chosen because no curve has this color."""
 
 SPECIAL_POINT_LINE_STYLE = (0, (1, 1.2))
 """Dotted line style of a special point, chosen because no curve has this style."""
 
-SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": GREEN}
-"""Colors of special points by kind; the other kinds, which change the stability, are black."""
+SPECIAL_POINT_COLORS = {"lost": BRANCH_END_COLOR, "border_collision": OKABE_ITO_GREEN}
+"""Colors of special points by kind. Other kinds, which change the stability, are black."""
 
-COMMON_PANELS = (
+COMMON_BRANCH_PANELS = (
     ("DLS fraction", {"dls_fraction": LEG_1_COLOR}),
     ("moduli of multipliers", {"spectral_radius": "black"}),
 )
 """Panels of every branch: label, and the color of each measure."""
-PAPER_PANELS = (
-    *COMMON_PANELS,
+PAPER_BRANCH_PANELS = (
+    *COMMON_BRANCH_PANELS,
     (
         f"${MEASURES['lambda_2_plus'].mathtext}$, ${MEASURES['lambda_4_plus'].mathtext}$ [N]",
         {"lambda_2_plus": LEG_1_COLOR, "lambda_4_plus": LEG_2_COLOR},
@@ -52,8 +52,8 @@ PAPER_PANELS = (
     ("clearance in SLS-I [mm]", {"clearance_sls1": LEG_2_COLOR}),
 )
 """Panels of a branch of the paper's model."""
-OTHER_MODEL_PANELS = (
-    *COMMON_PANELS,
+OTHER_MODEL_BRANCH_PANELS = (
+    *COMMON_BRANCH_PANELS,
     ("walking speed [m/s]", {"speed": "black"}),
     ("step period [s]", {"period": "black"}),
 )
@@ -63,12 +63,13 @@ OTHER_MODEL_PANELS = (
 def _split_by_stability(branch: Branch) -> list[tuple[np.ndarray, bool]]:
     """Return the point indices of pieces of equal stability, and whether each piece is stable.
 
-    A piece ends at the point where the next one starts.
+    A piece ends at the point where the next piece starts.
     """
     change_indices = np.flatnonzero(np.diff(branch.stable.astype(int))) + 1
     piece_indices = np.split(np.arange(branch.values.size), change_indices)
+    last_index = branch.values.size - 1
     return [
-        (np.append(piece, piece[-1] + 1) if piece[-1] + 1 < branch.values.size else piece,
+        (np.append(piece, piece[-1] + 1) if piece[-1] < last_index else piece,
          bool(branch.stable[piece[0]]))
         for piece in piece_indices
     ]  # fmt: skip
@@ -93,53 +94,59 @@ def branch_figure(branch: Branch) -> Figure:
         >>> figure = vrw.plot.branch_figure(branch)
     """
     check_type("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
-    values, data = branch.values, branch.dataset
+    parameter_values, branch_dataset = branch.values, branch.dataset
     special_points = sorted(branch.special_points, key=lambda special_point: special_point.value)
-    n_rows = -(-len(special_points) // 2)
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 4.0 + 0.16 * n_rows))
-    panels = figure.subplots(2, 2, sharex=True)
-    has_indicators = "lambda_2_plus" in data
-    shown_panels = PAPER_PANELS if has_indicators else OTHER_MODEL_PANELS
-    for axes, (label, panel_series), panel_letter in zip(
-        panels.ravel(), shown_panels, "abcd", strict=True
+    n_legend_rows = -(-len(special_points) // 2)
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.0 + 0.16 * n_legend_rows))
+    panel_axes = figure.subplots(2, 2, sharex=True)
+    has_indicators = "lambda_2_plus" in branch_dataset
+    stability_pieces = _split_by_stability(branch)
+    shown_panels = PAPER_BRANCH_PANELS if has_indicators else OTHER_MODEL_BRANCH_PANELS
+    for axes, (panel_label, panel_series), panel_letter in zip(
+        panel_axes.ravel(), shown_panels, "abcd", strict=True
     ):
-        label_panel(axes, panel_letter)
-        for name, color in panel_series.items():
-            columns = [data[name].values]
-            if name == "clearance_sls1":
+        draw_panel_letter(axes, panel_letter)
+        for measure_name, line_color in panel_series.items():
+            plotted_columns = [branch_dataset[measure_name].values]
+            if measure_name == "clearance_sls1":
                 # The clearance is in mm, with a gap at a jump, where a lowest point vanishes.
-                clearance_mm = 1e3 * data[name].values
+                clearance_mm = 1e3 * branch_dataset[measure_name].values
                 clearance_mm[1:][clearance_mm[:-1] * clearance_mm[1:] < 0.0] = np.nan
-                columns = [clearance_mm]
-            if name == "spectral_radius":
-                columns = list(np.abs(branch.multipliers).T)
-            for column in columns:
-                for indices, is_stable in _split_by_stability(branch):
+                plotted_columns = [clearance_mm]
+            if measure_name == "spectral_radius":
+                plotted_columns = list(np.abs(branch.multipliers).T)
+            for plotted_column in plotted_columns:
+                for piece_of_indices, is_stable in stability_pieces:
                     line_style = "-" if is_stable else "--"
-                    axes.plot(values[indices], column[indices], line_style, color=color)
-        _draw_special_points(axes, special_points, has_numbers=panel_letter in "ab")
-        axes.set_ylabel(label)
-    panels[0, 1].axhline(1.0, color=DARK_GRAY, linewidth=0.5)
-    panels[0, 1].set_ylim(0.0, None)
-    force_axes, clearance_axes = panels[1]
+                    axes.plot(
+                        parameter_values[piece_of_indices],
+                        plotted_column[piece_of_indices],
+                        line_style,
+                        color=line_color,
+                    )
+        _draw_special_points(axes, special_points, draws_numbers=panel_letter in "ab")
+        axes.set_ylabel(panel_label)
+    panel_axes[0, 1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
+    panel_axes[0, 1].set_ylim(0.0, None)
+    force_axes, clearance_axes = panel_axes[1]
     if has_indicators:
         for axes in (force_axes, clearance_axes):
-            axes.axhline(0.0, color=DARK_GRAY, linewidth=0.5)
-        for name, color in PAPER_PANELS[2][1].items():
-            force_axes.plot([], [], color=color, label=f"${MEASURES[name].mathtext}$")
+            axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
+        for measure_name, line_color in PAPER_BRANCH_PANELS[2][1].items():
+            force_axes.plot([], [], color=line_color, label=f"${MEASURES[measure_name].mathtext}$")
         force_axes.legend(loc="center left")
-        clearance_mm = 1e3 * data.clearance_sls1.values
+        clearance_mm = 1e3 * branch_dataset.clearance_sls1.values
         clearance_axes.set_yscale("symlog", linthresh=0.1)
         clearance_axes.set_ylim(
             2.0 * min(clearance_mm.min(), -0.1), 2.0 * max(clearance_mm.max(), 0.1)
         )
-    for axes in panels[1]:
+    for axes in panel_axes[1]:
         axes.set_xlabel(format_axis_label(branch.parameter))
-    _add_legend(figure, special_points, branch.parameter)
+    _add_branch_legend(figure, special_points, branch.parameter)
     return figure
 
 
-def _select_color(special_point: SpecialPoint) -> str:
+def _select_special_point_color(special_point: SpecialPoint) -> str:
     """Return the color of a special point."""
     return (
         BRANCH_END_COLOR
@@ -148,19 +155,21 @@ def _select_color(special_point: SpecialPoint) -> str:
     )
 
 
-def _draw_special_points(axes: Axes, special_points: list[SpecialPoint], has_numbers: bool) -> None:
-    """Draw vertical lines at the special points, with numbers if `has_numbers`."""
+def _draw_special_points(
+    axes: Axes, special_points: list[SpecialPoint], draws_numbers: bool
+) -> None:
+    """Draw vertical lines at the special points, with numbers if `draws_numbers` is set."""
     lower_limit, upper_limit = axes.get_xlim()
     label_position = -np.inf
     for point_number, special_point in enumerate(special_points):
         axes.axvline(
             special_point.value,
-            color=_select_color(special_point),
+            color=_select_special_point_color(special_point),
             lw=0.7,
             linestyle=SPECIAL_POINT_LINE_STYLE,
             zorder=0,
         )
-        if has_numbers:
+        if draws_numbers:
             label_position = max(
                 special_point.value, label_position + 0.03 * (upper_limit - lower_limit)
             )
@@ -171,30 +180,32 @@ def _draw_special_points(axes: Axes, special_points: list[SpecialPoint], has_num
                 ha="center",
                 va="bottom",
                 fontsize=7.0,
-                color=_select_color(special_point),
+                color=_select_special_point_color(special_point),
             )
 
 
-def _add_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
+def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
     """Add a legend of the special points and of the line styles to a figure."""
-    handles = []
+    legend_handles = []
     for point_number, special_point in enumerate(special_points):
-        violation = typeset_symbols(describe_violation(special_point.name))
-        text = f"{format_value_label(parameter, special_point.value, 6)}: {violation}"
-        text = f"{point_number + 1}  {text}" + (" (ends here)" if special_point.ends_branch else "")
-        handles.append(
+        violation_text = typeset_greek_symbols(describe_violation(special_point.name))
+        legend_text = f"{format_value_label(parameter, special_point.value, 6)}: {violation_text}"
+        legend_text = f"{point_number + 1}  {legend_text}" + (
+            " (ends here)" if special_point.ends_branch else ""
+        )
+        legend_handles.append(
             Line2D(
                 [],
                 [],
-                color=_select_color(special_point),
+                color=_select_special_point_color(special_point),
                 linewidth=0.9,
                 linestyle=SPECIAL_POINT_LINE_STYLE,
-                label=text,
+                label=legend_text,
             )
         )
-    handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
-    handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=7.5)
+    legend_handles.append(Line2D([], [], color="black", linestyle="-", label="stable"))
+    legend_handles.append(Line2D([], [], color="black", linestyle="--", label="unstable"))
+    figure.legend(handles=legend_handles, loc="outside lower center", ncols=2, fontsize=7.5)
 
 
 @figure_style()
@@ -217,46 +228,67 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
         >>> basins = vrw.basin(vrw.WheelParams(), starts)
         >>> figure = vrw.plot.basin_figure([basins], ["Table 1"])
     """
-    require_variables_of_all(
+    require_variables_of_datasets(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
     )
-    codes = sorted(
+    fall_codes = sorted(
         {
-            int(length_index)
-            for rate_index in results
-            for length_index in np.unique(rate_index.outcome)
-            if length_index != Outcome.STEPPED
+            int(outcome_code)
+            for basin_dataset in results
+            for outcome_code in np.unique(basin_dataset.outcome)
+            if outcome_code != Outcome.STEPPED
         }
     )
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 3.3))
-    panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.3))
+    panel_axes = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
     max_steps = max(
-        float(rate_index.steps.where(rate_index.attractor >= 0).max()) for rate_index in results
+        float(basin_dataset.steps.where(basin_dataset.attractor >= 0).max())
+        for basin_dataset in results
     )
-    for axes, result, title in zip(panels, results, titles, strict=True):
-        y, x = (str(step_counts) for step_counts in result.attractor.dims)
-        steps = result.steps.where(result.attractor >= 0)
-        image = axes.pcolormesh(
-            result[x], result[y], steps, cmap="Greys_r", vmin=0.0, vmax=2.2 * max_steps
+    for axes, basin_dataset, panel_title in zip(panel_axes, results, titles, strict=True):
+        vertical_name, horizontal_name = (
+            str(axis_name) for axis_name in basin_dataset.attractor.dims
         )
-        image.set_rasterized(True)
-        if codes:
+        steps_to_gait = basin_dataset.steps.where(basin_dataset.attractor >= 0)
+        step_image = axes.pcolormesh(
+            basin_dataset[horizontal_name],
+            basin_dataset[vertical_name],
+            steps_to_gait,
+            cmap="Greys_r",
+            vmin=0.0,
+            vmax=2.2 * max_steps,
+        )
+        step_image.set_rasterized(True)
+        if fall_codes:
             draw_outcome_cells(
-                axes, result[x].values, result[y].values, result.outcome.values, codes
+                axes,
+                basin_dataset[horizontal_name].values,
+                basin_dataset[vertical_name].values,
+                basin_dataset.outcome.values,
+                fall_codes,
             )
-        if {x, y} <= set(PRE_TOUCHDOWN_NAMES):
-            states = result.orbit_state.values.reshape(-1, len(PRE_TOUCHDOWN_NAMES))
-            shown_columns = [PRE_TOUCHDOWN_NAMES.index(x), PRE_TOUCHDOWN_NAMES.index(y)]
+        if {horizontal_name, vertical_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
+            orbit_states = basin_dataset.orbit_state.values.reshape(
+                -1, len(PRE_TOUCHDOWN_COMPONENT_NAMES)
+            )
+            shown_columns = [
+                PRE_TOUCHDOWN_COMPONENT_NAMES.index(horizontal_name),
+                PRE_TOUCHDOWN_COMPONENT_NAMES.index(vertical_name),
+            ]
             axes.plot(
-                *states[:, shown_columns].T, "+", color=YELLOW, markersize=7.0, markeredgewidth=1.6
+                *orbit_states[:, shown_columns].T,
+                "+",
+                color=OKABE_ITO_YELLOW,
+                markersize=7.0,
+                markeredgewidth=1.6,
             )
-        axes.set_title(title)
-        axes.set_xlabel(format_axis_label(x, "{symbol}"))
-    panels[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
-    color_bar = figure.colorbar(image, ax=list(panels), aspect=25, pad=0.01)
+        axes.set_title(panel_title)
+        axes.set_xlabel(format_axis_label(horizontal_name, "{symbol}"))
+    panel_axes[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
+    color_bar = figure.colorbar(step_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")
     color_bar.ax.set_ylim(0.0, max_steps)
     figure.legend(
-        handles=make_outcome_patches(codes), loc="outside lower center", ncols=4, fontsize=7.5
+        handles=make_outcome_patches(fall_codes), loc="outside lower center", ncols=4, fontsize=7.5
     )
     return figure

@@ -14,51 +14,52 @@ from matplotlib.patheffects import Normal, Stroke
 
 from vrw_jax.branches import SpecialPointCurve
 from vrw_jax.figures.style import (
-    AMBER,
-    BLUE,
-    COLUMN_WIDTH_INCHES,
-    LIGHT_GRAY,
-    OUTCOME_STYLES,
-    PAGE_WIDTH_INCHES,
-    UNSTABLE_CODE,
+    COLUMN_FIGURE_WIDTH_INCHES,
+    LIGHT_GRAY_COLOR,
+    OKABE_ITO_AMBER,
+    OKABE_ITO_BLUE,
+    OUTCOME_LABELS_AND_COLORS,
+    PAGE_FIGURE_WIDTH_INCHES,
+    UNSTABLE_CYCLE_CODE,
     draw_outcome_cells,
     figure_style,
     format_axis_label,
     format_value_label,
     make_outcome_patches,
-    require_variables,
+    require_dataset_variables,
     select_outcome_style,
     select_special_point_style,
-    typeset_symbols,
+    typeset_greek_symbols,
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, describe_violation
 from vrw_jax.scans import (
     DIFFERENTIABLE_MEASURES,
-    SALTELLI_KIND,
+    SALTELLI_DESIGN_KIND,
     SWEEPABLE_PARAMETERS,
-    read_manifest,
+    read_scan_manifest,
     sobol_indices,
 )
 from vrw_jax.wheel import Outcome
 
-AXIS_ORDER = ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
+PARAMETER_AXIS_ORDER = ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
 """Parameters in the order in which figures use them: horizontal, vertical, then columns."""
 
-DRAWN_MARGINS = (
+DRAWN_MARGIN_NAMES = (
     "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
     "locked_stopper_force", "rear_stopper_force", "contraction", "friction_fore",
     "landing_friction_fore", "hit_planted_impulse",
 )  # fmt: skip
 """Margins whose zero lines are drawn."""
 
-MAX_COLUMNS = 4
-"""Largest number of columns of panels, chosen because more leave no space for labels."""
+MAX_PANEL_COLUMNS = 4
+"""Largest number of columns of panels, chosen because more columns leave no space for labels."""
 
 MAX_PAIRED_PARAMETERS = 6
-"""Largest number of parameters shown in pairs, chosen because more leave no space for labels."""
+"""Largest number of parameters shown in pairs, chosen because more parameters leave no space for
+labels."""
 
 MAX_DRAWN_SAMPLES = 20_000
-"""Largest number of samples drawn in pairs, chosen because more would cover each other."""
+"""Largest number of samples drawn in pairs, chosen because more samples would cover each other."""
 
 
 def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
@@ -75,212 +76,269 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
         >>> sorted(vrw.plot.scan_figures(gaits))
         ['scan']
     """
-    require_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
-    names = [name for name in dict.fromkeys(AXIS_ORDER) if name in scan.coords]
+    require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
+    swept_axes = [
+        parameter_name
+        for parameter_name in dict.fromkeys(PARAMETER_AXIS_ORDER)
+        if parameter_name in scan.coords
+    ]
     if "sample" in scan.dims:
-        swept_names = [name for name in names if np.ptp(scan[name].values) > 0.0] or names
-        if len(swept_names) < 3:
-            return {"scan": draw_samples(scan, swept_names)}
-        figures = {"scan_pairs": draw_pairs(scan, swept_names[:MAX_PAIRED_PARAMETERS])}
-        if read_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_KIND:
-            measures = [n_axes for n_axes in DIFFERENTIABLE_MEASURES if n_axes in scan]
-            figures["sobol_indices"] = draw_sobol_indices(sobol_indices(scan, measures))
-        return figures
-    long_axes = [name for name in names if scan.sizes[name] > 1] or names
-    if len(long_axes) == 1:
-        return {"scan": draw_curves(scan, long_axes[0])}
-    other_axes = long_axes[2:]
-    if not other_axes:
-        return {"scan": draw_slices(scan, long_axes[0], long_axes[1])}
+        varied_parameters = [
+            parameter_name
+            for parameter_name in swept_axes
+            if np.ptp(scan[parameter_name].values) > 0.0
+        ] or swept_axes
+        if len(varied_parameters) < 3:
+            return {"scan": draw_scan_samples(scan, varied_parameters)}
+        figures_by_name = {
+            "scan_pairs": draw_parameter_pairs(scan, varied_parameters[:MAX_PAIRED_PARAMETERS])
+        }
+        if read_scan_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_DESIGN_KIND:
+            measure_names = [
+                measure_name for measure_name in DIFFERENTIABLE_MEASURES if measure_name in scan
+            ]
+            figures_by_name["sobol_indices"] = draw_sobol_indices(
+                sobol_indices(scan, measure_names)
+            )
+        return figures_by_name
+    long_axis_names = [
+        parameter_name for parameter_name in swept_axes if scan.sizes[parameter_name] > 1
+    ] or swept_axes
+    if len(long_axis_names) == 1:
+        return {"scan": draw_measure_curves(scan, long_axis_names[0])}
+    further_axis_names = long_axis_names[2:]
+    if not further_axis_names:
+        return {"scan": draw_scan_slices(scan, long_axis_names[0], long_axis_names[1])}
     return {
-        f"scan_over_{name}": draw_slices(scan, long_axes[0], long_axes[1], name)
-        for name in other_axes
+        f"scan_over_{parameter_name}": draw_scan_slices(
+            scan, long_axis_names[0], long_axis_names[1], parameter_name
+        )
+        for parameter_name in further_axis_names
     }
 
 
 @figure_style()
-def draw_slices(scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None) -> Figure:
+def draw_scan_slices(
+    scan: xr.Dataset, x: str, y: str, column_parameter: str | None = None
+) -> Figure:
     """Return a figure over the parameters (x, y), with one column per value of `column_parameter`.
 
-    The figure shows DLS fraction, speed and outcome. Other parameters have their middle value,
-    which the title gives. Gray cells have no gait.
+    The figure shows DLS fraction, speed and outcome. All other parameters have their middle value,
+    which the title states. Gray cells have no gait.
     """
     cut_indices = {
-        n_columns: scan.sizes[n_columns] // 2
-        for n_columns in SWEEPABLE_PARAMETERS
-        if n_columns in scan.dims
+        n_column_values: scan.sizes[n_column_values] // 2
+        for n_column_values in SWEEPABLE_PARAMETERS
+        if n_column_values in scan.dims
     }
     cut_indices = {
-        name: index for name, index in cut_indices.items() if name not in (x, y, column_parameter)
+        measure_name: axis_index
+        for measure_name, axis_index in cut_indices.items()
+        if measure_name not in (x, y, column_parameter)
     }
     scan_slice = scan.isel(cut_indices)
-    columns = [scan_slice]
+    column_datasets = [scan_slice]
     if column_parameter is not None:
-        n_columns = scan.sizes[column_parameter]
-        indices = np.unique(
-            np.linspace(0, n_columns - 1, min(n_columns, MAX_COLUMNS)).round().astype(int)
+        n_column_values = scan.sizes[column_parameter]
+        column_indices = np.unique(
+            np.linspace(0, n_column_values - 1, min(n_column_values, MAX_PANEL_COLUMNS))
+            .round()
+            .astype(int)
         )
-        columns = [scan_slice.isel({column_parameter: int(index)}) for index in indices]
-    panel_rows = _shown_measures(scan)
-    width = PAGE_WIDTH_INCHES if len(columns) > 1 else COLUMN_WIDTH_INCHES
-    figure = Figure(figsize=(width, 1.65 * (len(panel_rows) + 1) + 1.0))
-    panels = figure.subplots(
-        len(panel_rows) + 1, len(columns), sharex=True, sharey=True, squeeze=False
-    )
-    for row, name in zip(panels, panel_rows, strict=False):
-        values = [column[name].transpose(y, x).values for column in columns]
-        is_stable = [
-            _outcome_codes(column).transpose(y, x).values == Outcome.STEPPED for column in columns
+        column_datasets = [
+            scan_slice.isel({column_parameter: int(axis_index)}) for axis_index in column_indices
         ]
-        color_limits = _find_color_limits(values, is_stable)
-        for axes, column, value in zip(row, columns, values, strict=True):
-            image = _draw_cells(axes, column[x].values, column[y].values, value, color_limits)
-        extended_ends = _find_extended_ends(values, color_limits)
+    panel_measures = _list_shown_measures(scan)
+    figure_width = (
+        PAGE_FIGURE_WIDTH_INCHES if len(column_datasets) > 1 else COLUMN_FIGURE_WIDTH_INCHES
+    )
+    figure = Figure(figsize=(figure_width, 1.65 * (len(panel_measures) + 1) + 1.0))
+    panel_axes = figure.subplots(
+        len(panel_measures) + 1, len(column_datasets), sharex=True, sharey=True, squeeze=False
+    )
+    for axes_of_row, measure_name in zip(panel_axes, panel_measures, strict=False):
+        column_values = [
+            column_dataset[measure_name].transpose(y, x).values
+            for column_dataset in column_datasets
+        ]
+        is_stable = [
+            _get_outcome_codes(column_dataset).transpose(y, x).values == Outcome.STEPPED
+            for column_dataset in column_datasets
+        ]
+        color_limits = _find_color_limits(column_values, is_stable)
+        for axes, column_dataset, cell_values in zip(
+            axes_of_row, column_datasets, column_values, strict=True
+        ):
+            cell_image = _draw_measure_cells(
+                axes, column_dataset[x].values, column_dataset[y].values, cell_values, color_limits
+            )
+        extended_ends = _find_extended_color_bar_ends(column_values, color_limits)
         color_bar = figure.colorbar(
-            image, ax=row.tolist(), aspect=12, pad=0.01, extend=extended_ends
+            cell_image, ax=axes_of_row.tolist(), aspect=12, pad=0.01, extend=extended_ends
         )
-        color_bar.set_label(format_axis_label(name, "{name}"))
-    codes = np.unique([_outcome_codes(column).values for column in columns])
-    for axes, column in zip(panels[-1], columns, strict=True):
-        codes_of_cells = _outcome_codes(column).transpose(y, x).values
+        color_bar.set_label(format_axis_label(measure_name, "{name}"))
+    outcome_codes = np.unique(
+        [_get_outcome_codes(column_dataset).values for column_dataset in column_datasets]
+    )
+    for axes, column_dataset in zip(panel_axes[-1], column_datasets, strict=True):
+        cell_outcome_codes = _get_outcome_codes(column_dataset).transpose(y, x).values
         draw_outcome_cells(
             axes,
-            _find_cell_edges(column[x].values),
-            _find_cell_edges(column[y].values),
-            codes_of_cells,
-            codes,
+            _find_cell_edges(column_dataset[x].values),
+            _find_cell_edges(column_dataset[y].values),
+            cell_outcome_codes,
+            outcome_codes,
         )
     legend_lines: dict[str, Line2D] = {}
-    for panel_row in panels:
-        for axes, column in zip(panel_row, columns, strict=True):
-            legend_lines |= _draw_margin_zeros(axes, column, x, y)
-    for axes, column in zip(panels[0], columns, strict=True):
+    for panel_row in panel_axes:
+        for axes, column_dataset in zip(panel_row, column_datasets, strict=True):
+            legend_lines |= _draw_margin_zero_lines(axes, column_dataset, x, y)
+    for axes, column_dataset in zip(panel_axes[0], column_datasets, strict=True):
         if column_parameter is not None:
-            axes.set_title(format_value_label(column_parameter, column[column_parameter].item()))
-    for axes in panels[-1]:
+            axes.set_title(
+                format_value_label(column_parameter, column_dataset[column_parameter].item())
+            )
+    for axes in panel_axes[-1]:
         axes.set_xlabel(
-            format_axis_label(x) if len(columns) < 3 else format_axis_label(x, "{symbol}")
+            format_axis_label(x) if len(column_datasets) < 3 else format_axis_label(x, "{symbol}")
         )
-    for axes in panels[:, 0]:
+    for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
-    _add_legend(figure, codes, legend_lines, len(columns))
+    _add_scan_legend(figure, outcome_codes, legend_lines, len(column_datasets))
     if cut_indices:
         fixed_values_text = ", ".join(
-            format_value_label(n_columns, scan[n_columns].values[i])
-            for n_columns, i in cut_indices.items()
+            format_value_label(n_column_values, scan[n_column_values].values[axis_index])
+            for n_column_values, axis_index in cut_indices.items()
         )
         figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
     return figure
 
 
 @figure_style()
-def draw_samples(scan: xr.Dataset, names: Sequence[str]) -> Figure:
+def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
     """Return a figure of single samples over the first two parameters."""
-    x, y = (names[0], names[1]) if len(names) > 1 else (names[0], "sample")
-    measure_names = _shown_measures(scan)
+    x, y = (
+        (parameter_names[0], parameter_names[1])
+        if len(parameter_names) > 1
+        else (parameter_names[0], "sample")
+    )
+    measure_names = _list_shown_measures(scan)
     marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.9))
-    panels = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, measure_names, strict=False):
-        points = _draw_values(axes, scan, x, y, name, marker_size)
-        extended_ends = _find_extended_ends([scan[name].values], points.get_clim())
-        color_bar = figure.colorbar(
-            points, ax=axes, location="top", aspect=25, extend=extended_ends
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
+    panel_axes = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
+    for axes, measure_name in zip(panel_axes, measure_names, strict=False):
+        point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
+        extended_ends = _find_extended_color_bar_ends(
+            [scan[measure_name].values], point_collection.get_clim()
         )
-        color_bar.set_label(format_axis_label(name))
-    codes = _outcome_codes(scan).values
-    _draw_outcomes(panels[-1], scan[x].values, scan[y].values, codes, marker_size)
-    for axes in panels:
+        color_bar = figure.colorbar(
+            point_collection, ax=axes, location="top", aspect=25, extend=extended_ends
+        )
+        color_bar.set_label(format_axis_label(measure_name))
+    outcome_codes = _get_outcome_codes(scan).values
+    _draw_outcome_samples(
+        panel_axes[-1], scan[x].values, scan[y].values, outcome_codes, marker_size
+    )
+    for axes in panel_axes:
         axes.set_xlabel(format_axis_label(x, "{symbol}"))
-    panels[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}"))
-    _add_legend(figure, np.unique(codes), {}, 3)
+    panel_axes[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}"))
+    _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
     return figure
 
 
 @figure_style()
-def draw_pairs(scan: xr.Dataset, names: Sequence[str]) -> Figure:
+def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
     """Return a figure of samples over each pair of parameters.
 
     The figure shows the DLS fraction below the diagonal and the outcome above it. The diagonal
     shows the fraction of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples
-    are drawn, which are as evenly spread as all.
+    are drawn, which are spread as evenly as all samples.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
-    value = next(iter(_shown_measures(scan)), None)
-    codes = _outcome_codes(drawn_samples).values
-    n_parameters = len(names)
-    marker_size = float(np.clip(8000.0 / len(codes), 0.6, 8.0))
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, PAGE_WIDTH_INCHES * 0.9))
-    panels = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
-    points = None
-    for (i, j), axes in np.ndenumerate(panels):
-        x, y = drawn_samples[names[j]].values, drawn_samples[names[i]].values
+    measure_name = next(iter(_list_shown_measures(scan)), None)
+    outcome_codes = _get_outcome_codes(drawn_samples).values
+    n_parameters = len(parameter_names)
+    marker_size = float(np.clip(8000.0 / len(outcome_codes), 0.6, 8.0))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, PAGE_FIGURE_WIDTH_INCHES * 0.9))
+    panel_axes = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
+    point_collection = None
+    for (i, j), axes in np.ndenumerate(panel_axes):
+        x, y = drawn_samples[parameter_names[j]].values, drawn_samples[parameter_names[i]].values
         if i == j:
-            _draw_stable_share(axes, x, codes == Outcome.STEPPED)
+            _draw_stable_fraction(axes, x, outcome_codes == Outcome.STEPPED)
         elif i < j:
-            _draw_outcomes(axes, x, y, codes, marker_size)
-        elif value is not None:
-            points = _draw_values(axes, drawn_samples, names[j], names[i], value, marker_size)
+            _draw_outcome_samples(axes, x, y, outcome_codes, marker_size)
+        elif measure_name is not None:
+            point_collection = _draw_measure_samples(
+                axes,
+                drawn_samples,
+                parameter_names[j],
+                parameter_names[i],
+                measure_name,
+                marker_size,
+            )
         if i == n_parameters - 1:
-            axes.set_xlabel(format_axis_label(names[j], "{symbol}"))
+            axes.set_xlabel(format_axis_label(parameter_names[j], "{symbol}"))
         if j == 0 and i > 0:
-            axes.set_ylabel(format_axis_label(names[i], "{symbol}"))
+            axes.set_ylabel(format_axis_label(parameter_names[i], "{symbol}"))
         elif i != j:
             axes.tick_params(labelleft=False)
-    panels[0, 0].set_ylabel("share that walks")
-    if value is not None and points is not None:
-        extended_ends = _find_extended_ends([drawn_samples[value].values], points.get_clim())
-        all_panels = panels.ravel().tolist()
-        color_bar = figure.colorbar(
-            points, ax=all_panels, aspect=40, pad=0.01, extend=extended_ends
+    panel_axes[0, 0].set_ylabel("share that walks")
+    if measure_name is not None and point_collection is not None:
+        extended_ends = _find_extended_color_bar_ends(
+            [drawn_samples[measure_name].values], point_collection.get_clim()
         )
-        color_bar.set_label(format_axis_label(value, "{name}"))
-    _add_legend(figure, np.unique(codes), {}, 3)
+        all_panels = panel_axes.ravel().tolist()
+        color_bar = figure.colorbar(
+            point_collection, ax=all_panels, aspect=40, pad=0.01, extend=extended_ends
+        )
+        color_bar.set_label(format_axis_label(measure_name, "{name}"))
+    _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
     return figure
 
 
-def _draw_values(
-    axes: Axes, scan: xr.Dataset, x: str, y: str, name: str, marker_size: float
+def _draw_measure_samples(
+    axes: Axes, scan: xr.Dataset, x: str, y: str, measure_name: str, marker_size: float
 ) -> PathCollection:
     """Draw samples in the colors of a measure, or in gray if they have no gait, and return the
-    points.
-    """
+    collection of points."""
     dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
-    has_gait, values = scan.outcome.values == Outcome.STEPPED, scan[name].values
+    has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
     min_value, max_value = _find_color_limits(
-        [values], [_outcome_codes(scan).values == Outcome.STEPPED]
+        [measure_values], [_get_outcome_codes(scan).values == Outcome.STEPPED]
     )
     x_values, y_values = scan[x].values, scan[y].values
-    axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY, **dot_style)
+    axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **dot_style)
     return axes.scatter(
         x_values[has_gait],
         y_values[has_gait],
-        c=values[has_gait],
+        c=measure_values[has_gait],
         vmin=min_value,
         vmax=max_value,
         **dot_style,
     )
 
 
-def _draw_outcomes(
-    axes: Axes, x: np.ndarray, y: np.ndarray, codes: np.ndarray, marker_size: float
+def _draw_outcome_samples(
+    axes: Axes, x: np.ndarray, y: np.ndarray, outcome_codes: np.ndarray, marker_size: float
 ) -> None:
     """Draw samples in the colors of their outcomes."""
-    colors = [select_outcome_style(int(code))[1] for code in codes]
-    axes.scatter(x, y, s=marker_size, color=colors, linewidths=0.0, rasterized=True)
+    outcome_colors = [select_outcome_style(int(outcome_code))[1] for outcome_code in outcome_codes]
+    axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
 
-def _draw_stable_share(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
+def _draw_stable_fraction(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -> None:
     """Draw the fraction of samples with a stable gait along a parameter."""
-    edges = np.linspace(x.min(), x.max(), 13)
+    histogram_edges = np.linspace(x.min(), x.max(), 13)
     n_samples, n_stable = (
-        np.histogram(positions, edges)[0] for positions in (x, x[has_stable_gait])
+        np.histogram(parameter_values, histogram_edges)[0]
+        for parameter_values in (x, x[has_stable_gait])
     )
     axes.stairs(
         n_stable / np.maximum(n_samples, 1),
-        edges,
+        histogram_edges,
         fill=True,
-        color=OUTCOME_STYLES[Outcome.STEPPED][1],
+        color=OUTCOME_LABELS_AND_COLORS[Outcome.STEPPED][1],
     )
     axes.set_ylim(0.0, 1.0)
 
@@ -288,52 +346,54 @@ def _draw_stable_share(axes: Axes, x: np.ndarray, has_stable_gait: np.ndarray) -
 @figure_style()
 def draw_sobol_indices(indices: xr.Dataset) -> Figure:
     """Return a figure of the Sobol' indices of each measure with their intervals."""
-    measures, parameters = (
+    measure_names, parameter_names = (
         indices.measure.values,
-        [str(parameter_positions) for parameter_positions in indices.parameter.values],
+        [str(parameter_name) for parameter_name in indices.parameter.values],
     )
-    n_columns = min(len(measures), 3)
-    n_rows = -(-len(measures) // n_columns)
-    positions = np.arange(len(parameters))
-    height = (0.26 * len(parameters) + 0.5) * n_rows + 0.6
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, height))
-    panels = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
-    for axes in panels.ravel()[len(measures) :]:
+    n_columns = min(len(measure_names), 3)
+    n_rows = -(-len(measure_names) // n_columns)
+    bar_positions = np.arange(len(parameter_names))
+    figure_height = (0.26 * len(parameter_names) + 0.5) * n_rows + 0.6
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height))
+    panel_axes = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
+    for axes in panel_axes.ravel()[len(measure_names) :]:
         axes.set_axis_off()
-    for axes, name in zip(panels.ravel(), measures, strict=False):
-        measure_indices = indices.sel(measure=name)
-        for kind, label, shift, color in (
-            ("first_order", "by itself (first order)", -0.19, BLUE),
-            ("total", "with all it meets (total)", 0.19, AMBER),
+    for axes, measure_name in zip(panel_axes.ravel(), measure_names, strict=False):
+        measure_indices = indices.sel(measure=measure_name)
+        for index_kind, legend_text, bar_shift, bar_color in (
+            ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
+            ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
         ):
-            value = measure_indices[kind].values
+            index_values = measure_indices[index_kind].values
             lower_ends, upper_ends = (
-                measure_indices[f"{kind}_lower"].values,
-                measure_indices[f"{kind}_upper"].values,
+                measure_indices[f"{index_kind}_lower"].values,
+                measure_indices[f"{index_kind}_upper"].values,
             )
-            interval_lengths = np.maximum([value - lower_ends, upper_ends - value], 0.0)
-            bars = {"height": 0.36, "color": color, "label": label}
+            interval_lengths = np.maximum(
+                [index_values - lower_ends, upper_ends - index_values], 0.0
+            )
+            bar_style = {"height": 0.36, "color": bar_color, "label": legend_text}
             axes.barh(
-                positions + shift,
-                value,
+                bar_positions + bar_shift,
+                index_values,
                 xerr=interval_lengths,
                 error_kw={"elinewidth": 0.7},
-                **bars,
+                **bar_style,
             )
-        if measure_indices.is_constant:
+        if measure_indices.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
-        axes.set_title(typeset_symbols(MEASURES[str(name)].long_name))
+        axes.set_title(typeset_greek_symbols(MEASURES[str(measure_name)].long_name))
         axes.set_yticks(
-            positions,
-            [f"${MEASURES[parameter_positions].mathtext}$" for parameter_positions in parameters],
+            bar_positions,
+            [f"${MEASURES[parameter_name].mathtext}$" for parameter_name in parameter_names],
         )
         axes.set_xlim(0.0, 1.05)
-    panels[0, 0].invert_yaxis()
-    for axes in panels.ravel()[max(len(measures) - n_columns, 0) : len(measures)]:
+    panel_axes[0, 0].invert_yaxis()
+    for axes in panel_axes.ravel()[max(len(measure_names) - n_columns, 0) : len(measure_names)]:
         axes.set_xlabel("share of the variance")
         axes.tick_params(labelbottom=True)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    legend_handles, legend_texts = panel_axes[0, 0].get_legend_handles_labels()
+    figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     left_out_fraction = 100.0 * indices.attrs["left_out"]
     note_text = (
         f"{indices.attrs['rows']:,} rows; {left_out_fraction:.1f} % left out, without a gait"
@@ -343,43 +403,52 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 
 
 @figure_style()
-def draw_curves(scan: xr.Dataset, x: str) -> Figure:
+def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
     """Return a figure of DLS fraction and speed along one parameter; gray cells have no gait."""
     scan = scan.isel(
         {
-            n_measures: 0
-            for n_measures in SWEEPABLE_PARAMETERS
-            if n_measures in scan.dims and n_measures != x
+            parameter_name: 0
+            for parameter_name in SWEEPABLE_PARAMETERS
+            if parameter_name in scan.dims and parameter_name != x
         }
     ).sortby(x)
-    measure_names = _shown_measures(scan) or ["fore_foot_force"]
-    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
-    panels = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
-    edges = _find_cell_edges(scan[x].values)
+    measure_names = _list_shown_measures(scan) or ["fore_foot_force"]
+    figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
+    panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
+    cell_edges = _find_cell_edges(scan[x].values)
     has_failed = scan.outcome.values != Outcome.STEPPED
-    for axes, name in zip(panels, measure_names, strict=True):
-        axes.plot(scan[x].values, scan[name].values, marker=".", color=BLUE)
-        axes.set_ylabel(format_axis_label(name, "{name}"))
-        for cell in np.flatnonzero(has_failed):
-            axes.axvspan(edges[cell], edges[cell + 1], color=LIGHT_GRAY, linewidth=0.0, zorder=0)
-    panels[-1].set_xlabel(format_axis_label(x))
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
+        axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
+        axes.set_ylabel(format_axis_label(measure_name, "{name}"))
+        for cell_index in np.flatnonzero(has_failed):
+            axes.axvspan(
+                cell_edges[cell_index],
+                cell_edges[cell_index + 1],
+                color=LIGHT_GRAY_COLOR,
+                linewidth=0.0,
+                zorder=0,
+            )
+    panel_axes[-1].set_xlabel(format_axis_label(x))
     return figure
 
 
-def _shown_measures(scan: xr.Dataset) -> list[str]:
-    """Return the names of the measures that figures show."""
-    return [name for name in ("dls_fraction", "speed") if name in scan]
+def _list_shown_measures(scan: xr.Dataset) -> list[str]:
+    """Return the names of those measures of a scan that figures show."""
+    return [measure_name for measure_name in ("dls_fraction", "speed") if measure_name in scan]
 
 
 def _find_color_limits(
-    values: Sequence[np.ndarray], is_stable: Sequence[np.ndarray]
+    panel_values: Sequence[np.ndarray], stable_masks: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the color range of a row of panels: the range of stable gaits if there are any.
+    """Return the color range of a row of panels, which is the range of stable gaits if there are
+    any.
 
     A few distant unstable gaits would otherwise give all other gaits the same color.
     """
-    finite_values = [value[np.isfinite(value)] for value in values]
-    stable_values = [v[s & np.isfinite(v)] for v, s in zip(values, is_stable, strict=True)]
+    finite_values = [
+        values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values
+    ]
+    stable_values = [v[s & np.isfinite(v)] for v, s in zip(panel_values, stable_masks, strict=True)]
     values_in_range = np.concatenate(
         stable_values if any(map(len, stable_values)) else finite_values
     )
@@ -390,11 +459,14 @@ def _find_color_limits(
     )
 
 
-def _find_extended_ends(
-    values: Sequence[np.ndarray], color_limits: tuple[float, float]
+def _find_extended_color_bar_ends(
+    panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
-    """Return the ends of a color bar beyond which there are values."""
-    finite_values = np.concatenate([value[np.isfinite(value)] for value in values])
+    """Return the ends of a color bar beyond which there are values: "neither", "min", "max" or
+    "both"."""
+    finite_values = np.concatenate(
+        [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
+    )
     is_any_below, is_any_above = (
         np.any(finite_values < color_limits[0]),
         np.any(finite_values > color_limits[1]),
@@ -406,12 +478,16 @@ def _find_extended_ends(
     )
 
 
-def _draw_cells(
-    axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, color_limits: tuple[float, float]
+def _draw_measure_cells(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    cell_values: np.ndarray,
+    color_limits: tuple[float, float],
 ) -> AxesImage:
     """Draw one colored cell per sample, without interpolation, and return the image."""
-    axes.set_facecolor(LIGHT_GRAY)
-    masked_values = np.ma.masked_invalid(values)
+    axes.set_facecolor(LIGHT_GRAY_COLOR)
+    masked_values = np.ma.masked_invalid(cell_values)
     cell_image = axes.pcolormesh(
         _find_cell_edges(x),
         _find_cell_edges(y),
@@ -424,62 +500,71 @@ def _draw_cells(
     return cell_image  # type: ignore[return-value]  # A color bar accepts it.
 
 
-def _find_cell_edges(positions: np.ndarray) -> np.ndarray:
+def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
     """Return the edges of the cells around sample positions."""
-    if len(positions) == 1:
-        return positions[0] + np.array([-0.5, 0.5]) * max(abs(positions[0]) * 0.01, 1e-6)
-    inner_edges = 0.5 * (positions[1:] + positions[:-1])
+    if len(sample_positions) == 1:
+        return sample_positions[0] + np.array([-0.5, 0.5]) * max(
+            abs(sample_positions[0]) * 0.01, 1e-6
+        )
+    inner_edges = 0.5 * (sample_positions[1:] + sample_positions[:-1])
     first_edge, last_edge = (
-        2.0 * positions[0] - inner_edges[0],
-        2.0 * positions[-1] - inner_edges[-1],
+        2.0 * sample_positions[0] - inner_edges[0],
+        2.0 * sample_positions[-1] - inner_edges[-1],
     )
     return np.concatenate([[first_edge], inner_edges, [last_edge]])
 
 
-def _outcome_codes(scan: xr.Dataset) -> xr.DataArray:
-    """Return the outcomes, with `UNSTABLE_CODE` for unstable cycles if the spectral radius is
-    known.
-    """
-    codes = scan.outcome.astype(int)
+def _get_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
+    """Return the outcome codes of a scan, with `UNSTABLE_CYCLE_CODE` for unstable cycles if the
+    spectral radius is known."""
+    outcome_codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
-        return codes
-    return codes.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CODE)
+        return outcome_codes
+    return outcome_codes.where(~(scan.spectral_radius >= 1.0), UNSTABLE_CYCLE_CODE)
 
 
-def _draw_margin_zeros(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
-    """Draw lines of zero margin, and return their legend entries by name."""
+def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
+    """Draw the lines along which a margin is zero, and return their legend entries by name."""
     legend_lines = {}
-    for name in DRAWN_MARGINS:
-        if name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
+    for margin_name in DRAWN_MARGIN_NAMES:
+        if margin_name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
             continue
-        margin = scan[name]
-        if MARGIN_MEASURES[name].dimension:
-            margin = margin.min("leg")
-        if name == "clearance_sls1" and "takeoff_acceleration" in scan:
+        margin_array = scan[margin_name]
+        if MARGIN_MEASURES[margin_name].dimension:
+            margin_array = margin_array.min("leg")
+        if margin_name == "clearance_sls1" and "takeoff_acceleration" in scan:
             # Without missing values the line has no steps.
-            margin = margin.where(scan.takeoff_acceleration >= 0.0)
-        values = margin.transpose(y, x).values
-        finite_values = values[np.isfinite(values)]
+            margin_array = margin_array.where(scan.takeoff_acceleration >= 0.0)
+        margin_values = margin_array.transpose(y, x).values
+        finite_values = margin_values[np.isfinite(margin_values)]
         if not len(finite_values) or finite_values.min() >= 0.0 or finite_values.max() <= 0.0:
             continue
-        color, line = select_special_point_style(name)
+        line_color, line_style = select_special_point_style(margin_name)
         axes.contour(
-            scan[x].values, scan[y].values, np.ma.masked_invalid(values), levels=[0.0],
-            colors=[color], linestyles=[line], linewidths=1.4,
+            scan[x].values, scan[y].values, np.ma.masked_invalid(margin_values), levels=[0.0],
+            colors=[line_color], linestyles=[line_style], linewidths=1.4,
         ).set_path_effects([Stroke(linewidth=2.6, foreground="white"), Normal()])  # fmt: skip
-        legend_lines[name] = Line2D(
-            [], [], color=color, linestyle=line, label=MARGIN_MEASURES[name].violation
+        legend_lines[margin_name] = Line2D(
+            [],
+            [],
+            color=line_color,
+            linestyle=line_style,
+            label=MARGIN_MEASURES[margin_name].violation,
         )
     return legend_lines
 
 
-def _add_legend(
-    figure: Figure, codes: np.ndarray, legend_lines: Mapping[str, Line2D], n_columns: int
+def _add_scan_legend(
+    figure: Figure, outcome_codes: np.ndarray, legend_lines: Mapping[str, Line2D], n_columns: int
 ) -> None:
     """Add the legend of outcomes and lines below a figure."""
-    lines = [legend_lines[name] for name in DRAWN_MARGINS if name in legend_lines]
+    margin_lines = [
+        legend_lines[margin_name]
+        for margin_name in DRAWN_MARGIN_NAMES
+        if margin_name in legend_lines
+    ]
     figure.legend(
-        handles=[*make_outcome_patches(codes), *lines],
+        handles=[*make_outcome_patches(outcome_codes), *margin_lines],
         loc="outside lower center",
         ncols=4 if n_columns > 1 else 2,
         fontsize=7.5,
@@ -505,36 +590,49 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
         >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
         >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
     """
-    require_variables(
+    require_dataset_variables(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
     x, y = (
         curves[0].parameters
         if curves
-        else [n_samples for n_samples in SWEEPABLE_PARAMETERS if n_samples in scan.dims]
+        else [
+            parameter_name for parameter_name in SWEEPABLE_PARAMETERS if parameter_name in scan.dims
+        ]
     )
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 0.62 * PAGE_WIDTH_INCHES))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 0.62 * PAGE_FIGURE_WIDTH_INCHES))
     axes = figure.subplots()
-    axes.set_facecolor(LIGHT_GRAY)
-    values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
-    image = axes.pcolormesh(
-        scan[x].values, scan[y].values, values, shading="nearest", cmap="cividis", rasterized=True
+    axes.set_facecolor(LIGHT_GRAY_COLOR)
+    measure_values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
+    measure_image = axes.pcolormesh(
+        scan[x].values,
+        scan[y].values,
+        measure_values,
+        shading="nearest",
+        cmap="cividis",
+        rasterized=True,
     )
-    figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(format_axis_label(measure))
-    names = sorted({curve.name for curve in curves})
-    labels = {name: typeset_symbols(describe_violation(name)) for name in names}
+    figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
+        format_axis_label(measure)
+    )
+    special_point_names = sorted({curve.name for curve in curves})
+    legend_texts = {
+        special_point_name: typeset_greek_symbols(describe_violation(special_point_name))
+        for special_point_name in special_point_names
+    }
     for curve in curves:
-        color, line_style = select_special_point_style(curve.name)
+        curve_color, line_style = select_special_point_style(curve.name)
         is_stable = curve.dataset.spectral_radius.values < 1.0
-        for is_drawn, width in ((is_stable, 1.2), (~is_stable, 0.5)):
+        for is_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
             # Each piece includes the first point of the next one; the curve has one legend entry.
             is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
-            points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
-            label = labels.pop(curve.name, None) if is_drawn.any() else None
-            text_outline = [Stroke(linewidth=width + 1.0, foreground="white"), Normal()]
+            curve_points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
+            legend_text = legend_texts.pop(curve.name, None) if is_drawn.any() else None
+            line_outline = [Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()]
             axes.plot(
-                *points.T, color=color, linestyle=line_style, linewidth=width, label=label,
-                path_effects=text_outline,
+                *curve_points.T, color=curve_color, linestyle=line_style, linewidth=line_width,
+                label=legend_text,
+                path_effects=line_outline,
             )  # fmt: skip
     codim2_points = np.array(
         [codim2_point.values for curve in curves for codim2_point in curve.codim2_points]

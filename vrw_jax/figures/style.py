@@ -24,22 +24,22 @@ from vrw_jax.printing import format_mathtext
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 
-BLUE = "#0072B2"
-ORANGE = "#D55E00"
-GREEN = "#009E73"
-PINK = "#CC79A7"
-SKY = "#56B4E9"
-AMBER = "#E69F00"
-YELLOW = "#F0E442"
-"""Last of the colors of Okabe and Ito, which color-blind readers can distinguish."""
+OKABE_ITO_BLUE = "#0072B2"
+OKABE_ITO_ORANGE = "#D55E00"
+OKABE_ITO_GREEN = "#009E73"
+OKABE_ITO_PINK = "#CC79A7"
+OKABE_ITO_SKY_BLUE = "#56B4E9"
+OKABE_ITO_AMBER = "#E69F00"
+OKABE_ITO_YELLOW = "#F0E442"
+"""Last of the seven colors of Okabe and Ito, which color-blind readers can distinguish."""
 
-LEG_1_COLOR = BLUE
-LEG_2_COLOR = ORANGE
-DARK_GRAY = "#555555"
-LIGHT_GRAY = "#E9E9E9"
+LEG_1_COLOR = OKABE_ITO_BLUE
+LEG_2_COLOR = OKABE_ITO_ORANGE
+DARK_GRAY_COLOR = "#555555"
+LIGHT_GRAY_COLOR = "#E9E9E9"
 """Color of areas without a gait, and of double support."""
 
-MATPLOTLIB_STYLE: dict[Any, Any] = {
+MATPLOTLIB_SETTINGS: dict[Any, Any] = {
     "font.family": "serif",
     "font.serif": ["STIXGeneral"],
     "mathtext.fontset": "stix",
@@ -59,26 +59,35 @@ MATPLOTLIB_STYLE: dict[Any, Any] = {
     "ytick.major.width": 0.6,
     "xtick.direction": "out",
     "ytick.direction": "out",
-    "axes.prop_cycle": cycler(color=[BLUE, ORANGE, GREEN, PINK, SKY]),
+    "axes.prop_cycle": cycler(
+        color=[
+            OKABE_ITO_BLUE,
+            OKABE_ITO_ORANGE,
+            OKABE_ITO_GREEN,
+            OKABE_ITO_PINK,
+            OKABE_ITO_SKY_BLUE,
+        ]
+    ),
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
     "svg.hashsalt": "vrw_jax",  # The same figure then gives the same file.
 }
-"""Settings of matplotlib, with the serif font that matplotlib includes and the journal uses."""
+"""Settings of matplotlib for all figures, with the serif font that matplotlib includes and the
+journal uses."""
 
-COLUMN_WIDTH_INCHES = 3.4
+COLUMN_FIGURE_WIDTH_INCHES = 3.4
 """Width of a figure in one column, chosen as the column width of the journal."""
 
-PAGE_WIDTH_INCHES = 6.9
+PAGE_FIGURE_WIDTH_INCHES = 6.9
 """Width of a figure over the page, chosen as the text width of the journal."""
 
-OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
-    Outcome.STEPPED: ("stable limit cycle", BLUE),
-    Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", AMBER),
-    Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", GREEN),
-    Outcome.FELL_BACK: ("fell back", SKY),
-    Outcome.COLLAPSED: ("collapsed", ORANGE),
-    Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", PINK),
+OUTCOME_LABELS_AND_COLORS: dict[Outcome, tuple[str, str]] = {
+    Outcome.STEPPED: ("stable limit cycle", OKABE_ITO_BLUE),
+    Outcome.TOUCHDOWN_BEFORE_STOPPER: ("touchdown before stopper", OKABE_ITO_AMBER),
+    Outcome.STOPPER_IN_DOUBLE_SUPPORT: ("stopper in DLS", OKABE_ITO_GREEN),
+    Outcome.FELL_BACK: ("fell back", OKABE_ITO_SKY_BLUE),
+    Outcome.COLLAPSED: ("collapsed", OKABE_ITO_ORANGE),
+    Outcome.LEG_1_LIFTED_OFF: ("Leg 1 lifted off", OKABE_ITO_PINK),
     Outcome.NO_TOUCHDOWN_IN_TIME: ("no touchdown in time", "#999933"),
     Outcome.SOLVER_FAILED: ("solver gave up", "#7A1F7B"),
     Outcome.BAD_INPUT: ("bad input", "#000000"),
@@ -96,29 +105,29 @@ OUTCOME_STYLES: dict[Outcome, tuple[str, str]] = {
 
 SPECIAL_POINT_LINE_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 """Line styles of curves of special points, in the order of the names in
-`SPECIAL_POINT_NAMES_BY_COLOR`.
-"""
+`SPECIAL_POINT_NAMES_BY_COLOR`."""
 
 SPECIAL_POINT_NAMES_BY_COLOR = {
     "black": ("fold", "period_doubling", "neimark_sacker", "branch_point"),
-    BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
-    GREEN: ("clearance_sls1", "clearance_sls2", "", "", "", "takeoff_acceleration"),
-    SKY: ("", "locked_stopper_force"),
-    ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore", "landing_friction_rear"),
-    PINK: ("", "", "", "hit_planted_impulse", "hit_stopper_impulse"),
-    AMBER: (
+    OKABE_ITO_BLUE: ("lambda_2_plus", "lambda_4_plus", "lambda_I4", "fore_foot_force"),
+    OKABE_ITO_GREEN: ("clearance_sls1", "clearance_sls2", "", "", "", "takeoff_acceleration"),
+    OKABE_ITO_SKY_BLUE: ("", "locked_stopper_force"),
+    OKABE_ITO_ORANGE: ("friction_fore", "friction_rear", "landing_friction_fore",
+    "landing_friction_rear"),
+    OKABE_ITO_PINK: ("", "", "", "hit_planted_impulse", "hit_stopper_impulse"),
+    OKABE_ITO_AMBER: (
         "duration_sls2", "duration_sls1", "duration_dls", "rear_stopper_force", "contraction",
         "landing_stopper_impulse",
     ),
 }  # fmt: skip
-"""Names of special points by color. The index of a name gives its line style, which is the same
-in every figure. Green and pink, which color-blind readers may confuse, share no line style.
-"""
+"""Names of special points by color. The index of a name gives the line style of the special point,
+which is the same in every figure. Green and pink, which color-blind readers may confuse, share no
+line style."""
 
-NOT_COMPUTED_STYLE = ("not computed", "#FFFFFF")
+NOT_COMPUTED_SAMPLE_STYLE = ("not computed", "#FFFFFF")
 """Label and color of a sample that is not computed."""
 
-UNSTABLE_CODE = 100
+UNSTABLE_CYCLE_CODE = 100
 """Code of a cycle whose spectral radius is 1 or more, chosen above all codes of `Outcome`."""
 
 
@@ -134,7 +143,7 @@ def figure_style() -> Iterator[None]:
         >>> with vrw.plot.figure_style():
         ...     figure = vrw.plot.sticks(gait)
     """
-    with mpl.rc_context(MATPLOTLIB_STYLE):
+    with mpl.rc_context(MATPLOTLIB_SETTINGS):
         yield
 
 
@@ -169,131 +178,158 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     return paths
 
 
-def require_variables(name: str, data: Any, needed_names: Sequence[str], advice: str) -> None:
-    """Raise an error unless `data` is a dataset that contains the needed variables or
-    attributes.
-    """
-    check_type(name, data, xr.Dataset, advice)
+def require_dataset_variables(
+    argument_name: str, dataset: Any, needed_names: Sequence[str], remedy_text: str
+) -> None:
+    """Raise an error unless `dataset` is a dataset that contains the needed variables or
+    attributes."""
+    check_type(argument_name, dataset, xr.Dataset, remedy_text)
     missing_names = [
-        variable
-        for variable in needed_names
-        if variable not in data.variables and variable not in data.attrs
+        variable_name
+        for variable_name in needed_names
+        if variable_name not in dataset.variables and variable_name not in dataset.attrs
     ]
     if missing_names:
-        raise ValueError(f"{name} holds no {missing_names[0]!r}, which is to be drawn: {advice}.")
+        raise ValueError(
+            f"{argument_name} holds no {missing_names[0]!r}, which is to be drawn: {remedy_text}."
+        )
 
 
-def require_variables_of_all(
-    name: str, datasets: Any, needed_names: Sequence[str], advice: str
+def require_variables_of_datasets(
+    argument_name: str, datasets: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
     """Raise an error unless `datasets` is a nonempty list of datasets that contain the needed
-    variables.
-    """
-    check_type(name, datasets, (list, tuple), f"{advice}, several in a list")
+    variables."""
+    check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
     if not datasets:
-        raise ValueError(f"{name} is empty, but something is to be drawn: {advice}.")
-    for dataset_index, data in enumerate(datasets):
-        require_variables(f"{name}[{dataset_index}]", data, needed_names, advice)
+        raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
+    for dataset_index, dataset in enumerate(datasets):
+        require_dataset_variables(
+            f"{argument_name}[{dataset_index}]", dataset, needed_names, remedy_text
+        )
 
 
-def typeset_symbols(text: str) -> str:
-    """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of them."""
+def typeset_greek_symbols(text: str) -> str:
+    """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of these
+    symbols."""
     return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
 
 
-def _format_unit(name: str) -> str:
+def _format_figure_unit(quantity_name: str) -> str:
     """Return the unit of a quantity as figures write it, such as "N·s/m"."""
-    return MEASURES[name].display_unit.replace(" ", "·").replace("^2", "²")
+    return MEASURES[quantity_name].display_unit.replace(" ", "·").replace("^2", "²")
 
 
-def format_axis_label(name: str, label_format: str = "{name} {symbol}") -> str:
+def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}") -> str:
     """Return the label of a quantity with its unit, formatted by `label_format`.
 
     An unknown name is returned unchanged.
     """
-    if name not in MEASURES:
-        return name
-    measure = MEASURES[name]
-    text = label_format.format(
-        name=typeset_symbols(measure.long_name), symbol=f"${measure.mathtext}$"
+    if quantity_name not in MEASURES:
+        return quantity_name
+    measure_description = MEASURES[quantity_name]
+    label_text = label_format.format(
+        name=typeset_greek_symbols(measure_description.long_name),
+        symbol=f"${measure_description.mathtext}$",
     )
-    return f"{text} [{_format_unit(name)}]" if _format_unit(name) else text
+    return (
+        f"{label_text} [{_format_figure_unit(quantity_name)}]"
+        if _format_figure_unit(quantity_name)
+        else label_text
+    )
 
 
-def format_value_label(name: str, value: float, digits: int = 4) -> str:
+def format_value_label(quantity_name: str, quantity_value: float, n_digits: int = 4) -> str:
     """Return the text of a quantity with its value, as in "c = 50 N·s/m"."""
-    if name not in MEASURES:
-        return f"{name} = {value:.{digits}g}"
-    return f"${MEASURES[name].mathtext}$ = {value:.{digits}g} {_format_unit(name)}".rstrip()
+    if quantity_name not in MEASURES:
+        return f"{quantity_name} = {quantity_value:.{n_digits}g}"
+    symbol_text, unit_text = MEASURES[quantity_name].mathtext, _format_figure_unit(quantity_name)
+    return f"${symbol_text}$ = {quantity_value:.{n_digits}g} {unit_text}".rstrip()
 
 
-def label_panel(axes: Axes, letter: str) -> None:
-    """Write the letter of a panel to the left of its top."""
-    axes.text(-0.12, 1.02, f"({letter})", transform=axes.transAxes, ha="right", va="bottom")
+def draw_panel_letter(axes: Axes, panel_letter: str) -> None:
+    """Write the letter of a panel to the left of its top edge."""
+    axes.text(-0.12, 1.02, f"({panel_letter})", transform=axes.transAxes, ha="right", va="bottom")
 
 
-def draw_marks(
+def draw_markers(
     axes: Axes,
     x: np.ndarray,
     y: np.ndarray,
-    marker: str,
-    color: str,
+    marker_symbol: str,
+    edge_color: str,
     fill_color: str,
     **style_overrides: Any,
 ) -> None:
-    """Draw markers without a line, filled with `fill_color`; "white" makes them open."""
+    """Draw markers without a line, filled with `fill_color`; the fill color "white" makes markers
+    open."""
     marker_style: dict[str, Any] = {
         "markersize": 3.2,
         "markeredgewidth": 0.7,
         "linestyle": "none",
     } | style_overrides
-    axes.plot(x, y, marker, color=color, markerfacecolor=fill_color, **marker_style)
+    axes.plot(x, y, marker_symbol, color=edge_color, markerfacecolor=fill_color, **marker_style)
 
 
-def select_special_point_style(name: str) -> tuple[str, Any]:
-    """Return color and line style of a special point; those of locked legs differ by leg."""
-    for color, names in SPECIAL_POINT_NAMES_BY_COLOR.items():
-        if name in names:
-            return color, SPECIAL_POINT_LINE_STYLES[names.index(name)]
-    leg = name.partition("[")[2]
-    style_index = int(leg[:-1]) - 3 if leg else len(name)
-    return SKY, SPECIAL_POINT_LINE_STYLES[style_index % len(SPECIAL_POINT_LINE_STYLES)]
+def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
+    """Return color and line style of a special point. Special points of locked legs differ by
+    leg.
+    """
+    for line_color, special_point_names in SPECIAL_POINT_NAMES_BY_COLOR.items():
+        if special_point_name in special_point_names:
+            return line_color, SPECIAL_POINT_LINE_STYLES[
+                special_point_names.index(special_point_name)
+            ]
+    leg_suffix = special_point_name.partition("[")[2]
+    style_index = int(leg_suffix[:-1]) - 3 if leg_suffix else len(special_point_name)
+    return OKABE_ITO_SKY_BLUE, SPECIAL_POINT_LINE_STYLES[
+        style_index % len(SPECIAL_POINT_LINE_STYLES)
+    ]
 
 
-def select_outcome_style(code: int) -> tuple[str, str]:
+def select_outcome_style(outcome_code: int) -> tuple[str, str]:
     """Return label and color of an outcome, of an unstable cycle, or of a sample that is not
     computed.
     """
-    if code == UNSTABLE_CODE:
-        return "unstable limit cycle", YELLOW
-    return OUTCOME_STYLES[Outcome(code)] if code >= 0 else NOT_COMPUTED_STYLE
+    if outcome_code == UNSTABLE_CYCLE_CODE:
+        return "unstable limit cycle", OKABE_ITO_YELLOW
+    return (
+        OUTCOME_LABELS_AND_COLORS[Outcome(outcome_code)]
+        if outcome_code >= 0
+        else NOT_COMPUTED_SAMPLE_STYLE
+    )
 
 
 def draw_outcome_cells(
     axes: Axes,
     x: np.ndarray,
     y: np.ndarray,
-    codes: np.ndarray,
-    known_codes: Sequence[int] | np.ndarray,
+    outcome_codes: np.ndarray,
+    drawn_codes: Sequence[int] | np.ndarray,
 ) -> None:
-    """Draw cells over (x, y) in the colors of their outcomes; codes not in `known_codes` are
-    left out.
-    """
-    colors = ListedColormap([select_outcome_style(int(code))[1] for code in known_codes])
+    """Draw cells over (x, y) in the colors of their outcomes. Codes not in `drawn_codes` are
+    omitted."""
+    outcome_color_map = ListedColormap(
+        [select_outcome_style(int(drawn_code))[1] for drawn_code in drawn_codes]
+    )
     code_indices = np.ma.masked_where(
-        ~np.isin(codes, known_codes), np.searchsorted(known_codes, codes)
+        ~np.isin(outcome_codes, drawn_codes), np.searchsorted(drawn_codes, outcome_codes)
     )
     color_norm = (
-        BoundaryNorm(np.arange(len(known_codes) + 1) - 0.5, len(known_codes))
-        if len(known_codes) > 1
+        BoundaryNorm(np.arange(len(drawn_codes) + 1) - 0.5, len(drawn_codes))
+        if len(drawn_codes) > 1
         else None
     )
-    axes.pcolormesh(x, y, code_indices, cmap=colors, norm=color_norm).set_rasterized(True)
+    axes.pcolormesh(x, y, code_indices, cmap=outcome_color_map, norm=color_norm).set_rasterized(
+        True
+    )
 
 
-def make_outcome_patches(codes: Iterable[int]) -> list[Patch]:
+def make_outcome_patches(outcome_codes: Iterable[int]) -> list[Patch]:
     """Return the legend entries of outcomes."""
     return [
-        Patch(facecolor=color, edgecolor="#888888", linewidth=0.4, label=label)
-        for label, color in (select_outcome_style(int(code)) for code in codes)
+        Patch(facecolor=outcome_color, edgecolor="#888888", linewidth=0.4, label=outcome_label)
+        for outcome_label, outcome_color in (
+            select_outcome_style(int(outcome_code)) for outcome_code in outcome_codes
+        )
     ]

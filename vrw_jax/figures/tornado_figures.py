@@ -1,4 +1,5 @@
-"""Tornado plots: the parameters that change a measure most, as bars sorted by length."""
+"""Tornado plots: for each measure, the changes that each parameter causes, as bars sorted by
+length."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -9,26 +10,27 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vrw_jax.figures.style import (
-    AMBER,
-    BLUE,
-    PAGE_WIDTH_INCHES,
+    OKABE_ITO_AMBER,
+    OKABE_ITO_BLUE,
+    PAGE_FIGURE_WIDTH_INCHES,
     figure_style,
     format_axis_label,
-    require_variables,
-    typeset_symbols,
+    require_dataset_variables,
+    typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
 from vrw_jax.validation import check_known_name, check_names, check_positive
 from vrw_jax.wheel import check_parameter_name
 
 MAX_PANELS_PER_ROW = 3
-"""Largest number of panels in a row, chosen because four leave no room for parameter symbols."""
+"""Largest number of panels in a row, chosen because four panels leave no space for parameter
+symbols."""
 
-MAX_DEFAULT_MEASURES = 6
+MAX_DEFAULT_DRAWN_MEASURES = 6
 """Largest number of measures drawn by default, chosen because two rows of panels fit a page."""
 
-BAR_HEIGHT_INCHES = 0.2
-"""Height of the row of one parameter, chosen because its symbol has that height."""
+PARAMETER_ROW_HEIGHT_INCHES = 0.2
+"""Height of the row of one parameter, chosen because the parameter's symbol has that height."""
 
 
 @figure_style()
@@ -61,59 +63,73 @@ def tornado_figure(
         >>> figure = vrw.plot.tornado_figure(table)
         >>> figure = vrw.plot.tornado_figure(table, "speed", spreads={"damping": 10.0})
     """
-    require_variables(
+    require_dataset_variables(
         "table", table, ("derivative", "elasticity"), "give vrw.sensitivities(params)"
     )
     known_measures = tuple(map(str, table.measure.values))
-    names = known_measures[:MAX_DEFAULT_MEASURES]
+    measure_names = known_measures[:MAX_DEFAULT_DRAWN_MEASURES]
     if measures is not None:
-        names = check_names("measures", measures)
-    for name in names:
-        check_known_name(name, known_measures, "measure of this table")
-    if not names:
+        measure_names = check_names("measures", measures)
+    for measure_name in measure_names:
+        check_known_name(measure_name, known_measures, "measure of this table")
+    if not measure_names:
         raise ValueError('measures is empty, but something is to be drawn: give "speed", say.')
-    changes = _compute_changes(table, spreads)
-    n_columns = min(len(names), MAX_PANELS_PER_ROW)
-    n_rows = math.ceil(len(names) / n_columns)
-    height = n_rows * (BAR_HEIGHT_INCHES * changes.sizes["parameter"] + 0.8) + 0.3
-    width = PAGE_WIDTH_INCHES if n_columns > 1 else 0.6 * PAGE_WIDTH_INCHES
-    figure = Figure(figsize=(width, height))
-    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
-    for axes in panels[len(names) :]:
+    measure_changes = table.elasticity  # changes in per cent for 1 %
+    if spreads is not None:
+        known_parameters = tuple(map(str, table.parameter.values))
+        for parameter_name in spreads:
+            check_parameter_name(parameter_name, known_parameters, "parameter of this table")
+        if not spreads:
+            raise ValueError('spreads is empty, but bars need one: give {"damping": 10.0}, say.')
+        parameter_changes = [
+            check_positive(f"spreads[{parameter_name!r}]", parameter_change)
+            for parameter_name, parameter_change in spreads.items()
+        ]
+        measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(
+            parameter_changes
+        )
+    n_columns = min(len(measure_names), MAX_PANELS_PER_ROW)
+    n_rows = math.ceil(len(measure_names) / n_columns)
+    figure_height = (
+        n_rows * (PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8) + 0.3
+    )
+    figure_width = PAGE_FIGURE_WIDTH_INCHES if n_columns > 1 else 0.6 * PAGE_FIGURE_WIDTH_INCHES
+    figure = Figure(figsize=(figure_width, figure_height))
+    panel_axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for axes in panel_axes[len(measure_names) :]:
         axes.set_axis_off()
-    for axes, name in zip(panels, names, strict=False):
-        _draw_bars(axes, changes.sel(measure=name))
-        axes.set_title(typeset_symbols(MEASURES[name].long_name))
-        change_label = format_axis_label(name, "change of {symbol}")
+    for axes, measure_name in zip(panel_axes, measure_names, strict=False):
+        _draw_sorted_bars(axes, measure_changes.sel(measure=measure_name))
+        axes.set_title(typeset_greek_symbols(MEASURES[measure_name].long_name))
+        change_label = format_axis_label(measure_name, "change of {symbol}")
         axes.set_xlabel("change [%]" if spreads is None else change_label)
     parameter_change_text = "1 %" if spreads is None else "by its spread"
-    handles, _ = panels[0].get_legend_handles_labels()
-    labels = [f"parameter {direction} {parameter_change_text}" for direction in ("up", "down")]
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    legend_handles, _ = panel_axes[0].get_legend_handles_labels()
+    legend_texts = [
+        f"parameter {change_direction} {parameter_change_text}"
+        for change_direction in ("up", "down")
+    ]
+    figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
     return figure
 
 
-def _compute_changes(table: xr.Dataset, spreads: Mapping[str, float] | None) -> xr.DataArray:
-    """Return the change of each measure for an increase of each parameter."""
-    if spreads is None:
-        return table.elasticity  # changes in per cent for 1 %
-    known_parameters = tuple(map(str, table.parameter.values))
-    for name in spreads:
-        check_parameter_name(name, known_parameters, "parameter of this table")
-    if not spreads:
-        raise ValueError('spreads is empty, but bars need one: give {"damping": 10.0}, say.')
-    widths = [check_positive(f"spreads[{name!r}]", width) for name, width in spreads.items()]
-    return table.derivative.sel(parameter=list(spreads)) * np.array(widths)
-
-
-def _draw_bars(axes: Axes, changes: xr.DataArray) -> None:
+def _draw_sorted_bars(axes: Axes, measure_changes: xr.DataArray) -> None:
     """Draw the bars of one measure, the longest on top."""
-    changes = changes[np.isfinite(changes.values)]
-    changes = changes[np.argsort(-np.abs(changes.values), kind="stable")]
-    positions = np.arange(changes.size)
-    for signs, color in ((1.0, BLUE), (-1.0, AMBER)):
-        axes.barh(positions, signs * changes.values, 0.7, color=color, label=str(signs))
+    measure_changes = measure_changes[np.isfinite(measure_changes.values)]
+    measure_changes = measure_changes[np.argsort(-np.abs(measure_changes.values), kind="stable")]
+    bar_positions = np.arange(measure_changes.size)
+    for change_sign, bar_color in ((1.0, OKABE_ITO_BLUE), (-1.0, OKABE_ITO_AMBER)):
+        axes.barh(
+            bar_positions,
+            change_sign * measure_changes.values,
+            0.7,
+            color=bar_color,
+            label=str(change_sign),
+        )
     axes.axvline(0.0, color="black", linewidth=0.6)
-    symbols = [f"${MEASURES[str(name)].mathtext}$" for name in changes.parameter.values]
-    axes.set_yticks(positions, symbols)
-    axes.set_ylim(changes.size - 0.5, -0.5)
+    parameter_symbols = [
+        f"${MEASURES[str(parameter_name)].mathtext}$"
+        for parameter_name in measure_changes.parameter.values
+    ]
+    axes.set_yticks(bar_positions, parameter_symbols)
+    axes.set_ylim(measure_changes.size - 0.5, -0.5)

@@ -7,18 +7,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.figures.style import (
-    BLUE,
-    DARK_GRAY,
-    LIGHT_GRAY,
-    ORANGE,
-    PAGE_WIDTH_INCHES,
-    draw_marks,
+    DARK_GRAY_COLOR,
+    LIGHT_GRAY_COLOR,
+    OKABE_ITO_BLUE,
+    OKABE_ITO_ORANGE,
+    PAGE_FIGURE_WIDTH_INCHES,
+    draw_markers,
     figure_style,
     format_axis_label,
-    typeset_symbols,
+    typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
-from vrw_jax.tuning import MAXIMIZATION_OPTIONS, TrialKind, TuneResult
+from vrw_jax.tuning import DEFAULT_MAXIMIZATION_OPTIONS, TrialKind, TuneResult
 from vrw_jax.validation import check_type
 
 
@@ -41,68 +41,86 @@ def tuning_figure(tuned: TuneResult) -> Figure:
         >>> figure = vrw.plot.tuning_figure(tuned)
     """
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
-    path = tuned.path
-    n_constraints = path.sizes["constraint"]
-    height_inches = max(3.2, 0.19 * n_constraints + 1.0)  # Each constraint has one row of text.
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, height_inches))
-    panels = figure.subplot_mosaic(
+    path_dataset = tuned.path
+    n_constraints = path_dataset.sizes["constraint"]
+    figure_height_inches = max(
+        3.2, 0.19 * n_constraints + 1.0
+    )  # Each constraint has one row of text.
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height_inches))
+    panel_axes = figure.subplot_mosaic(
         [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
     )
-    panels["objective"].sharex(panels["parameters"])
-    _draw_objective(panels["objective"], path)
-    _draw_parameters(panels["parameters"], path)
-    _draw_slack(panels["slack"], tuned)
+    panel_axes["objective"].sharex(panel_axes["parameters"])
+    _draw_objective_path(panel_axes["objective"], path_dataset)
+    _draw_parameter_paths(panel_axes["parameters"], path_dataset)
+    _draw_constraint_slacks(panel_axes["slack"], tuned)
     return figure
 
 
-def _draw_objective(axes: Axes, path: xr.Dataset) -> None:
+def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     """Draw the objective over the evaluated gaits."""
-    evaluation_numbers, value = path.evaluation.values, path.objective.values
-    is_gait_lost = np.isin(path.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
-    keeps_constraints = path.breach.values <= MAXIMIZATION_OPTIONS.active_bound_tolerance
+    evaluation_numbers, objective_values = (
+        path_dataset.gait_evaluation.values,
+        path_dataset.objective.values,
+    )
+    is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
+    keeps_constraints = (
+        path_dataset.breach.values <= DEFAULT_MAXIMIZATION_OPTIONS.active_bound_tolerance
+    )
     axes.plot(
         evaluation_numbers[~is_gait_lost],
-        value[~is_gait_lost],
-        color=DARK_GRAY,
+        objective_values[~is_gait_lost],
+        color=DARK_GRAY_COLOR,
         linewidth=0.7,
         zorder=1,
     )
-    for is_feasible, fill_color, text in (
-        (True, BLUE, "keeps the constraints"),
+    for is_feasible, fill_color, marker_text in (
+        (True, OKABE_ITO_BLUE, "keeps the constraints"),
         (False, "white", "breaks one"),
     ):
-        is_drawn = ~is_gait_lost & (keeps_constraints == is_feasible)
-        draw_marks(
+        is_marker_drawn = ~is_gait_lost & (keeps_constraints == is_feasible)
+        draw_markers(
             axes,
-            evaluation_numbers[is_drawn],
-            value[is_drawn],
+            evaluation_numbers[is_marker_drawn],
+            objective_values[is_marker_drawn],
             "o",
-            BLUE,
+            OKABE_ITO_BLUE,
             fill_color,
             markersize=4.0,
-            label=text,
+            label=marker_text,
         )
     if is_gait_lost.any():
-        for evaluation_index, evaluation in enumerate(evaluation_numbers[is_gait_lost]):
+        for evaluation_index, evaluation_number in enumerate(evaluation_numbers[is_gait_lost]):
             legend_text = (
                 "gait or finite value lost, step shortened" if evaluation_index == 0 else None
             )
-            axes.axvline(evaluation, color=ORANGE, linewidth=0.8, linestyle=":", label=legend_text)
-    axes.set_ylabel(format_axis_label(path.objective.attrs["long_name"], "{name}"))
+            axes.axvline(
+                evaluation_number,
+                color=OKABE_ITO_ORANGE,
+                linewidth=0.8,
+                linestyle=":",
+                label=legend_text,
+            )
+    axes.set_ylabel(format_axis_label(path_dataset.objective.attrs["long_name"], "{name}"))
     axes.legend(loc="best", fontsize=7.0)
 
 
-def _draw_parameters(axes: Axes, path: xr.Dataset) -> None:
+def _draw_parameter_paths(axes: Axes, path_dataset: xr.Dataset) -> None:
     """Draw the parameters over the evaluated gaits, scaled to their bounds."""
-    lower, upper = np.asarray(path.attrs["lower"]), np.asarray(path.attrs["upper"])
-    for i, name in enumerate(path.attrs["free"].split()):
-        scaled_values = (path[name].values - lower[i]) / (upper[i] - lower[i])
+    lower_bounds, upper_bounds = (
+        np.asarray(path_dataset.attrs["lower"]),
+        np.asarray(path_dataset.attrs["upper"]),
+    )
+    for i, parameter_name in enumerate(path_dataset.attrs["free"].split()):
+        scaled_values = (path_dataset[parameter_name].values - lower_bounds[i]) / (
+            upper_bounds[i] - lower_bounds[i]
+        )
         axes.plot(
-            path.evaluation,
+            path_dataset.gait_evaluation,
             scaled_values,
             marker=".",
             markersize=4.0,
-            label=f"${MEASURES[name].mathtext}$",
+            label=f"${MEASURES[parameter_name].mathtext}$",
         )
     axes.set_ylim(-0.05, 1.05)
     axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
@@ -111,51 +129,67 @@ def _draw_parameters(axes: Axes, path: xr.Dataset) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _draw_slack(axes: Axes, result: TuneResult) -> None:
-    """Draw the slack of each constraint at the start and at the tuned gait."""
-    path = result.path
-    names = [str(name) for name in path.constraint.values]
-    values = path.constraint_value.values
-    margin = path.margin.values
+def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
+    """Draw the slack of each constraint at the start and at the tuned gait as bars."""
+    path_dataset = tune_result.path
+    constraint_names = [str(constraint_name) for constraint_name in path_dataset.constraint.values]
+    constraint_values = path_dataset.constraint_value.values
+    min_constraint_values = path_dataset.margin.values
     tuned_index = np.nanargmin(
         np.sum(
             [
-                np.abs(path[name].values / float(getattr(result.params, name)) - 1.0)
-                for name in path.attrs["free"].split()
+                np.abs(
+                    path_dataset[constraint_name].values
+                    / float(getattr(tune_result.params, constraint_name))
+                    - 1.0
+                )
+                for constraint_name in path_dataset.attrs["free"].split()
             ],
             axis=0,
         )
     )
     with np.errstate(invalid="ignore"):
-        slack_scale = np.maximum(np.nanmax(np.abs(values - margin), axis=0), 1e-12)
-    positions = np.arange(len(names))[::-1]
-    active_names = {active_constraint.name for active_constraint in result.active}
-    for slack_fraction, vertical_offset, color, text in (
-        ((values[0] - margin) / slack_scale, 0.19, LIGHT_GRAY, "at the start"),
-        ((values[tuned_index] - margin) / slack_scale, -0.19, BLUE, "tuned"),
+        slack_scale = np.maximum(
+            np.nanmax(np.abs(constraint_values - min_constraint_values), axis=0), 1e-12
+        )
+    bar_positions = np.arange(len(constraint_names))[::-1]
+    active_names = {active_constraint.name for active_constraint in tune_result.active}
+    for slack_fraction, vertical_offset, bar_color, legend_text in (
+        (
+            (constraint_values[0] - min_constraint_values) / slack_scale,
+            0.19,
+            LIGHT_GRAY_COLOR,
+            "at the start",
+        ),
+        (
+            (constraint_values[tuned_index] - min_constraint_values) / slack_scale,
+            -0.19,
+            OKABE_ITO_BLUE,
+            "tuned",
+        ),
     ):
         axes.barh(
-            positions + vertical_offset,
+            bar_positions + vertical_offset,
             slack_fraction,
             0.36,
-            color=color,
-            label=text,
-            edgecolor=DARK_GRAY,
+            color=bar_color,
+            label=legend_text,
+            edgecolor=DARK_GRAY_COLOR,
             linewidth=0.3,
         )
     axes.axvline(0.0, color="black", linewidth=0.6)
-    texts = []
-    for name in names:
-        measure_name, _, leg_suffix = name.partition("[")
-        texts.append(
-            typeset_symbols(MEASURES[measure_name].long_name)
+    constraint_labels = []
+    for constraint_name in constraint_names:
+        measure_name, _, leg_suffix = constraint_name.partition("[")
+        constraint_labels.append(
+            typeset_greek_symbols(MEASURES[measure_name].long_name)
             + (f", {leg_suffix[:-1]}" if leg_suffix else "")
         )
-    axes.set_yticks(positions, texts, fontsize=7.0)
-    for tick, name in zip(axes.get_yticklabels(), names, strict=True):
-        if name in active_names:
-            tick.set_color(ORANGE)
-            tick.set_fontweight("bold")
+    axes.set_yticks(bar_positions, constraint_labels, fontsize=7.0)
+    for tick_label, constraint_name in zip(axes.get_yticklabels(), constraint_names, strict=True):
+        if constraint_name in active_names:
+            tick_label.set_color(OKABE_ITO_ORANGE)
+            tick_label.set_fontweight("bold")
     axes.set_xlim(min(-0.05, axes.get_xlim()[0]), 1.05)
     axes.set_xlabel("slack, share of the largest on the path\n(active in bold)")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

@@ -11,80 +11,83 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vrw_jax.figures.contact_figures import (
-    FootMotion,
+    HubAndFootMotion,
     compute_foot_motion,
     draw_contact_sticks,
     draw_feet,
+    make_contact_mode_handles,
     make_contact_panels,
-    make_mode_handles,
     reports_contact_modes,
     select_leg_color,
 )
 from vrw_jax.figures.style import (
-    COLUMN_WIDTH_INCHES,
-    DARK_GRAY,
+    COLUMN_FIGURE_WIDTH_INCHES,
+    DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    LIGHT_GRAY,
-    PAGE_WIDTH_INCHES,
-    SKY,
-    draw_marks,
+    LIGHT_GRAY_COLOR,
+    OKABE_ITO_SKY_BLUE,
+    PAGE_FIGURE_WIDTH_INCHES,
+    draw_markers,
+    draw_panel_letter,
     figure_style,
     format_axis_label,
     format_value_label,
-    label_panel,
-    require_variables,
-    require_variables_of_all,
+    require_dataset_variables,
+    require_variables_of_datasets,
 )
 from vrw_jax.measures import MEASURES, PHASE_NAMES
 from vrw_jax.validation import check_int, check_path, check_positive, check_type
 
-Coordinate = float | np.ndarray
+PointCoordinates = float | np.ndarray
 """One coordinate of points, in m."""
 
-FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
-"""Names of the ground forces on the feet of Leg 1 and Leg 2, N."""
+GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces on the feet of Leg 1 and Leg 2, which are in N."""
 
 
-WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
-"""Remedy in the message about a dataset that is no walk."""
+NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
+"""Remedy in the error message about a dataset that is not a walk."""
 
-PAPER_WALK_REMEDY = (
+NO_PAPER_WALK_REMEDY = (
     "give vrw.simulate(params) of the paper's wheel; vrw.plot.gait_panels, sticks and walk_frames "
     "draw walks of any model"
 )
-"""Remedy in the message about a walk without the phases of the paper."""
+"""Remedy in the error message about a walk without the phases of the paper."""
 
 
-def _require_walk(name: str, walk: xr.Dataset) -> None:
+def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
     """Raise an error unless `walk` is a trajectory with at least one sample."""
     needed_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
-    require_variables(name, walk, needed_names, WALK_REMEDY)
+    require_dataset_variables(argument_name, walk, needed_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
         raise ValueError(
-            f"{name} has no samples, because the walk ended at once as {walk.attrs['outcome']}: "
+            f"{argument_name} has no samples, because the walk ended at once as "
+            f"{walk.attrs['outcome']}: "
             "give one that takes a step."
         )
 
 
 def find_phase_spans(gait: xr.Dataset) -> list[tuple[float, float, int]]:
-    """Return (start time, end time, phase) of every phase of a trajectory, times in s."""
+    """Return the start time, the end time (s) and the code of every phase of a trajectory."""
     step_and_phase = 3 * gait.step.values + gait.phase.values
     change_indices = np.flatnonzero(np.diff(step_and_phase)) + 1
-    times = np.split(gait.time.values, change_indices)
-    phases = gait.phase.values[np.r_[0, change_indices]]
+    times_by_phase = np.split(gait.time.values, change_indices)
+    phase_codes = gait.phase.values[np.r_[0, change_indices]]
     return [
         (phase_times[0], phase_times[-1], int(phase_code))
-        for phase_times, phase_code in zip(times, phases, strict=True)
+        for phase_times, phase_code in zip(times_by_phase, phase_codes, strict=True)
     ]
 
 
 def insert_landing_gaps(gait: xr.Dataset, *names: str) -> list[np.ndarray]:
-    """Return time and variables with a gap at each landing, at which the legs are relabeled."""
+    """Return time and variables with a gap at each landing, because the legs are relabeled
+    there.
+    """
     landing_indices = np.flatnonzero(np.diff(gait.step.values)) + 1
     return [
-        np.insert(gait[name].values.astype(float), landing_indices, np.nan)
-        for name in ("time", *names)
+        np.insert(gait[variable_name].values.astype(float), landing_indices, np.nan)
+        for variable_name in ("time", *names)
     ]
 
 
@@ -105,55 +108,68 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.gait_panels(gait)
     """
-    _require_walk("gait", gait)
+    _require_nonempty_walk("gait", gait)
     if reports_contact_modes(gait):
         return make_contact_panels(gait)
-    time, theta, L1, L2, z2, *forces = insert_landing_gaps(
-        gait, "theta", "L1", "L2", "foot_2_z", *FORCE_NAMES
+    times_with_gaps, theta, L1, L2, rear_foot_height, *ground_forces = insert_landing_gaps(
+        gait, "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES
     )
-    load_share = 100.0 * forces[3] / (forces[1] + forces[3])
-    figure = Figure(figsize=(0.8 * PAGE_WIDTH_INCHES, 7.4))
-    panels = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
-    for axes, panel_letter in zip(panels, "abcde", strict=True):
-        label_panel(axes, panel_letter)
-        for start_time, end_time, phase in find_phase_spans(gait):
-            if phase == 0:
-                axes.axvspan(start_time, end_time, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
-            if phase == 2:
+    load_share = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
+    figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 7.4))
+    panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
+    for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
+        draw_panel_letter(axes, panel_letter)
+        for start_time, end_time, phase_code in find_phase_spans(gait):
+            if phase_code == 0:
+                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+            if phase_code == 2:
                 axes.axvline(
-                    start_time, color=DARK_GRAY, linewidth=0.5, linestyle=(0, (1, 2)), zorder=0
+                    start_time,
+                    color=DARK_GRAY_COLOR,
+                    linewidth=0.5,
+                    linestyle=(0, (1, 2)),
+                    zorder=0,
                 )
-    panels[0].plot(time, theta, color="black")
-    panels[0].set_ylabel(format_axis_label("theta", "{symbol}"))
-    for start_time, end_time, phase in find_phase_spans(gait)[:3]:
-        panels[0].annotate(
-            PHASE_NAMES[phase],
+    panel_axes[0].plot(times_with_gaps, theta, color="black")
+    panel_axes[0].set_ylabel(format_axis_label("theta", "{symbol}"))
+    for start_time, end_time, phase_code in find_phase_spans(gait)[:3]:
+        panel_axes[0].annotate(
+            PHASE_NAMES[phase_code],
             (0.5 * (start_time + end_time), 1.0),
             xycoords=("data", "axes fraction"),
             ha="center",
             va="bottom",
             fontsize=7.5,
-            rotation=90 if phase == 2 else 0,
+            rotation=90 if phase_code == 2 else 0,
         )
-    panels[1].plot(time, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
-    panels[1].plot(time, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
-    panels[1].set_ylabel("$L_1,\\ L_2$ [m]")
-    panels[2].plot(time, 100.0 - load_share, color=LEG_1_COLOR, label="foot 1")
-    panels[2].plot(time, load_share, color=LEG_2_COLOR, linestyle="--", label="foot 2")
-    panels[2].set_ylabel("share of the\nnormal force [%]")
-    panels[3].plot(time, z2, color=LEG_2_COLOR, linestyle="--")
-    panels[3].set_ylabel("$z_2$ [m]")
-    for i, force in enumerate(forces):
-        color, line = (LEG_1_COLOR, "-") if i < 2 else (LEG_2_COLOR, "--")
-        name, width = f"${MEASURES[FORCE_NAMES[i]].mathtext}$", (0.7, 1.4)[i % 2]
-        panels[4].plot(time, force, color=color, linestyle=line, linewidth=width, label=name)
-    panels[4].axhline(0.0, color=DARK_GRAY, linewidth=0.4)
-    panels[4].set_ylabel("ground reaction\nforce [N]")
-    panels[4].set_xlabel("time [s]")
-    panels[4].set_xlim(time[0], time[-1])
-    for axes in panels[[1, 2, 4]]:
+    panel_axes[1].plot(times_with_gaps, L1, color=LEG_1_COLOR, label="Leg 1, $L_1$")
+    panel_axes[1].plot(times_with_gaps, L2, color=LEG_2_COLOR, linestyle="--", label="Leg 2, $L_2$")
+    panel_axes[1].set_ylabel("$L_1,\\ L_2$ [m]")
+    panel_axes[2].plot(times_with_gaps, 100.0 - load_share, color=LEG_1_COLOR, label="foot 1")
+    panel_axes[2].plot(
+        times_with_gaps, load_share, color=LEG_2_COLOR, linestyle="--", label="foot 2"
+    )
+    panel_axes[2].set_ylabel("share of the\nnormal force [%]")
+    panel_axes[3].plot(times_with_gaps, rear_foot_height, color=LEG_2_COLOR, linestyle="--")
+    panel_axes[3].set_ylabel("$z_2$ [m]")
+    for i, ground_force in enumerate(ground_forces):
+        line_color, line_style = (LEG_1_COLOR, "-") if i < 2 else (LEG_2_COLOR, "--")
+        force_label, line_width = f"${MEASURES[GROUND_FORCE_NAMES[i]].mathtext}$", (0.7, 1.4)[i % 2]
+        panel_axes[4].plot(
+            times_with_gaps,
+            ground_force,
+            color=line_color,
+            linestyle=line_style,
+            linewidth=line_width,
+            label=force_label,
+        )
+    panel_axes[4].axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
+    panel_axes[4].set_ylabel("ground reaction\nforce [N]")
+    panel_axes[4].set_xlabel("time [s]")
+    panel_axes[4].set_xlim(times_with_gaps[0], times_with_gaps[-1])
+    for axes in panel_axes[[1, 2, 4]]:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.align_ylabels(panels)
+    figure.align_ylabels(panel_axes)
     return figure
 
 
@@ -175,9 +191,9 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.sticks(gait, interval=0.1)
     """
-    _require_walk("gait", gait)
+    _require_nonempty_walk("gait", gait)
     check_positive("interval", interval)
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.8))
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
     axes = figure.subplots()
     draw_sticks = draw_contact_sticks if reports_contact_modes(gait) else _draw_phase_sticks
     draw_sticks(axes, gait, interval)
@@ -202,23 +218,23 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
 
 def _draw_phase_sticks(axes: Axes, gait: xr.Dataset, interval: float) -> None:
     """Draw Legs 1 and 2 of a walk, in the colors of its phases."""
-    phase_colors = ("#A0A0A0", SKY, "#000000")
-    time = gait.time.values
-    for i in np.searchsorted(time, np.arange(0.0, time[-1], interval)):
-        sample = gait.isel(time=int(i))
-        for foot, line in ((1, "-"), (2, ":")):
+    phase_colors = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
+    sample_times = gait.time.values
+    for i in np.searchsorted(sample_times, np.arange(0.0, sample_times[-1], interval)):
+        walk_sample = gait.isel(time=int(i))
+        for foot_number, line_style in ((1, "-"), (2, ":")):
             axes.plot(
-                [float(sample[f"foot_{foot}_x"]), float(sample.hub_x)],
-                [float(sample[f"foot_{foot}_z"]), float(sample.hub_z)],
-                color=phase_colors[int(sample.phase)],
-                linestyle=line,
+                [float(walk_sample[f"foot_{foot_number}_x"]), float(walk_sample.hub_x)],
+                [float(walk_sample[f"foot_{foot_number}_z"]), float(walk_sample.hub_z)],
+                color=phase_colors[int(walk_sample.phase)],
+                linestyle=line_style,
                 linewidth=0.8,
             )
-    for line, name in (("-", "Leg 1"), (":", "Leg 2")):
-        axes.plot([], [], color="black", linestyle=line, linewidth=0.8, label=name)
+    for line_style, leg_name in (("-", "Leg 1"), (":", "Leg 2")):
+        axes.plot([], [], color="black", linestyle=line_style, linewidth=0.8, label=leg_name)
     axes.plot([], [], color=LEG_2_COLOR, label="hub")
-    for phase, phase_color in zip(PHASE_NAMES, phase_colors, strict=True):
-        axes.plot([], [], color=phase_color, linewidth=3.0, label=phase)
+    for phase_name, phase_color in zip(PHASE_NAMES, phase_colors, strict=True):
+        axes.plot([], [], color=phase_color, linewidth=3.0, label=phase_name)
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
@@ -247,28 +263,30 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.foot_height([gait])
     """
-    require_variables_of_all("gaits", gaits, ("phase", "foot_2_z"), PAPER_WALK_REMEDY)
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.6))
+    require_variables_of_datasets("gaits", gaits, ("phase", "foot_2_z"), NO_PAPER_WALK_REMEDY)
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.6))
     step_axes, takeoff_axes = figure.subplots(1, 2)
-    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
-        name, min_clearance = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
+    for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
+        gait_label, min_clearance = _format_gait_label(gait, vary), 1e3 * float(gait.foot_2_z.min())
         clearance_text = f"lowest −{-min_clearance:.1f} mm" if min_clearance < -1e-6 else "clear"
-        step_axes.plot(gait.time, gait.foot_2_z, linestyle=line, label=name)
-        takeoff_axes.plot(gait.time, 1e3 * gait.foot_2_z, linestyle=line, label=clearance_text)
+        step_axes.plot(gait.time, gait.foot_2_z, linestyle=line_style, label=gait_label)
+        takeoff_axes.plot(
+            gait.time, 1e3 * gait.foot_2_z, linestyle=line_style, label=clearance_text
+        )
     for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
-        label_panel(axes, panel_letter)
-        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY, linewidth=0.0, zorder=0)
+        draw_panel_letter(axes, panel_letter)
+        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
     min_clearance = min(float(gait.foot_2_z.min()) for gait in gaits)
-    takeoff_time = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
+    takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
     max_height = max(float(gait.foot_2_z.max()) for gait in gaits)
     step_axes.set_ylim(2.0 * min_clearance - 0.004, 1.05 * max_height)
     step_axes.set_xlim(0.0, max(float(gait.time.max()) for gait in gaits))
     step_axes.set_ylabel("height of foot 2, $z_2$ [m]")
     takeoff_axes.set_ylim(1.3e3 * min_clearance - 0.5, -1.8e3 * min_clearance + 0.5)
-    takeoff_axes.set_xlim(min(takeoff_time) - 0.03, max(takeoff_time) + 0.1)
+    takeoff_axes.set_xlim(min(takeoff_times) - 0.03, max(takeoff_times) + 0.1)
     takeoff_axes.set_ylabel("$z_2$ [mm]")
     takeoff_axes.text(
         0.98,
@@ -276,7 +294,7 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         "below the ground",
         transform=takeoff_axes.transAxes,
         ha="right",
-        color=DARK_GRAY,
+        color=DARK_GRAY_COLOR,
     )
     return figure
 
@@ -296,15 +314,15 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.rear_force([gait])
     """
-    require_variables_of_all("gaits", gaits, ("phase", "lambda_4"), PAPER_WALK_REMEDY)
-    figure = Figure(figsize=(COLUMN_WIDTH_INCHES, 2.5))
+    require_variables_of_datasets("gaits", gaits, ("phase", "lambda_4"), NO_PAPER_WALK_REMEDY)
+    figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 2.5))
     axes = figure.subplots()
-    for gait, line in zip(gaits, GAIT_LINE_STYLES, strict=False):
+    for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
         double_support = gait.isel(time=gait.phase.values == 0)
         (force_line,) = axes.plot(
             double_support.time,
             double_support.lambda_4,
-            linestyle=line,
+            linestyle=line_style,
             label=_format_gait_label(gait, vary),
         )
         axes.plot(
@@ -347,47 +365,74 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
         >>> figure = vrw.plot.indicators(gaits)
     """
-    require_variables(
+    require_dataset_variables(
         "gaits",
         gaits,
         ("settled", "lambda_I4"),
         "give gaits over one parameter, as in the example of vrw.plot.indicators",
     )
-    vary = str(gaits.settled.dims[0])
+    varied_parameter = str(gaits.settled.dims[0])
     valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
     is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
-    values = valid_gaits[vary].values
-    has_marker = (values % every == 0) | (values == values.min()) | (values == values.max())
-    rows = (
+    parameter_values = valid_gaits[varied_parameter].values
+    has_marker = (
+        (parameter_values % every == 0)
+        | (parameter_values == parameter_values.min())
+        | (parameter_values == parameter_values.max())
+    )
+    panel_rows = (
         ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
         ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
     )
-    figure = Figure(figsize=(PAGE_WIDTH_INCHES, 2.7))
-    panels = figure.subplots(1, 2)
-    for axes, panel_letter, (series, axis_text) in zip(panels, "ab", rows, strict=True):
-        label_panel(axes, panel_letter)
-        for name, color, marker in series:
-            data, symbol = valid_gaits[name].values, f"${MEASURES[name].mathtext}$"
-            axes.plot(values, data, color=color, linewidth=0.7)
-            for is_scuffing_drawn, fill_color in ((False, color), (True, "white")):
-                is_selected = has_marker & (is_scuffing == is_scuffing_drawn)
-                text = symbol + (", scuffing" if is_scuffing_drawn else "")
-                x, y = values[is_selected], data[is_selected]
-                draw_marks(axes, x, y, marker, color, fill_color, label=text, clip_on=False)
-        axes.set_xlim(0.0, values.max() + 1.0)
-        axes.set_ylim(0.0, 1.18 * max(float(valid_gaits[name].max()) for name, *_ in series))
-        axes.set_xlabel(format_axis_label(vary, "{symbol}"))
-        axes.set_ylabel(axis_text)
-        axes.legend(loc="lower right" if panel_letter == "a" else "upper right", ncols=len(series))
-    slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
-    panels[0].text(0.02, 0.05, format_value_label("slope", slope), transform=panels[0].transAxes)
+    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.7))
+    panel_axes = figure.subplots(1, 2)
+    for axes, panel_letter, (panel_series, axis_label) in zip(
+        panel_axes, "ab", panel_rows, strict=True
+    ):
+        draw_panel_letter(axes, panel_letter)
+        for indicator_name, line_color, marker_symbol in panel_series:
+            indicator_values, indicator_symbol = (
+                valid_gaits[indicator_name].values,
+                f"${MEASURES[indicator_name].mathtext}$",
+            )
+            axes.plot(parameter_values, indicator_values, color=line_color, linewidth=0.7)
+            for is_scuffing_drawn, fill_color in ((False, line_color), (True, "white")):
+                is_marker_drawn = has_marker & (is_scuffing == is_scuffing_drawn)
+                legend_text = indicator_symbol + (", scuffing" if is_scuffing_drawn else "")
+                x, y = parameter_values[is_marker_drawn], indicator_values[is_marker_drawn]
+                draw_markers(
+                    axes,
+                    x,
+                    y,
+                    marker_symbol,
+                    line_color,
+                    fill_color,
+                    label=legend_text,
+                    clip_on=False,
+                )
+        axes.set_xlim(0.0, parameter_values.max() + 1.0)
+        axes.set_ylim(
+            0.0,
+            1.18
+            * max(float(valid_gaits[indicator_name].max()) for indicator_name, *_ in panel_series),
+        )
+        axes.set_xlabel(format_axis_label(varied_parameter, "{symbol}"))
+        axes.set_ylabel(axis_label)
+        axes.legend(
+            loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_series)
+        )
+    ground_slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
+    panel_axes[0].text(
+        0.02, 0.05, format_value_label("slope", ground_slope), transform=panel_axes[0].transAxes
+    )
     return figure
 
 
-def _rotate_to_vertical(
-    x: Coordinate, z: Coordinate, slope: float
-) -> tuple[Coordinate, Coordinate]:
-    """Return coordinates in a frame with vertical gravity from those in the slope's frame, m."""
+def _rotate_to_gravity_frame(
+    x: PointCoordinates, z: PointCoordinates, slope: float
+) -> tuple[PointCoordinates, PointCoordinates]:
+    """Return coordinates in a frame with vertical gravity, m, from coordinates in the slope's
+    frame."""
     return (
         x * np.cos(slope) + z * np.sin(slope),
         z * np.cos(slope) - x * np.sin(slope),
@@ -417,79 +462,92 @@ def walk_frames(
         >>> len(frames)
         2
     """
-    _require_walk("step", step)
+    _require_nonempty_walk("step", step)
     n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
-    slope, motion = step.attrs["parameter_slope"], compute_foot_motion(step)
-    duration = motion.time[-1]
-    distance = float(motion.hub[-1, 0] - motion.hub[0, 0])
-    stride = distance / max(int(motion.step[-1] - motion.step[0]) + 1, 1)
-    frames = []
-    for t in np.linspace(0.0, duration, n_frames, endpoint=False):
+    ground_slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
+    walk_duration = foot_motion.time[-1]
+    hub_distance = float(foot_motion.hub_positions[-1, 0] - foot_motion.hub_positions[0, 0])
+    hub_distance_per_step = hub_distance / max(
+        int(foot_motion.step[-1] - foot_motion.step[0]) + 1, 1
+    )
+    frame_images = []
+    for t in np.linspace(0.0, walk_duration, n_frames, endpoint=False):
         figure = Figure(figsize=(3.6, 3.3), dpi=100)
         figure.set_layout_engine("none")
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_axis_off()
-        center = float(motion.hub[0, 0]) + distance * t / duration
-        _draw_ground(axes, slope, center, stride)
-        sample = _draw_wheel(axes, motion, t, slope)
-        view_center = [float(v) for v in _rotate_to_vertical(center, 0.75, slope)]
-        axes.set_xlim(view_center[0] - 1.35, view_center[0] + 1.35)
-        axes.set_ylim(view_center[1] - 1.25, view_center[1] + 1.225)
+        camera_position = float(foot_motion.hub_positions[0, 0]) + hub_distance * t / walk_duration
+        _draw_ground_with_marks(axes, ground_slope, camera_position, hub_distance_per_step)
+        sample_index = _draw_wheel_at_time(axes, foot_motion, t, ground_slope)
+        camera_center = [
+            float(v) for v in _rotate_to_gravity_frame(camera_position, 0.75, ground_slope)
+        ]
+        axes.set_xlim(camera_center[0] - 1.35, camera_center[0] + 1.35)
+        axes.set_ylim(camera_center[1] - 1.25, camera_center[1] + 1.225)
         if reports_contact_modes(step):
-            handles = make_mode_handles(motion.contact)
-            axes.legend(handles=handles, loc="lower left", fontsize=8)
+            legend_handles = make_contact_mode_handles(foot_motion.contact_modes)
+            axes.legend(handles=legend_handles, loc="lower left", fontsize=8)
         else:
-            phase_name = PHASE_NAMES[int(step.phase[sample])]
+            phase_name = PHASE_NAMES[int(step.phase[sample_index])]
             axes.text(0.02, 0.03, phase_name, transform=axes.transAxes, fontsize=14)
         canvas.draw()
-        picture = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
-        frames.append(picture.convert("RGB"))
-    return frames, round(1e3 * slow * duration / n_frames)
+        frame_image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
+        frame_images.append(frame_image.convert("RGB"))
+    return frame_images, round(1e3 * slow * walk_duration / n_frames)
 
 
-def _draw_wheel(axes: Axes, motion: FootMotion, time: float, slope: float) -> int:
-    """Draw hub, legs, feet and forces at a time in s, and return the index of the sample of
-    contact modes.
-    """
-    hub, feet, sample = motion.interpolate(time)
-    rotate_to_view = lambda points: np.array(
-        _rotate_to_vertical(points[..., 0], points[..., 1], slope)
+def _draw_wheel_at_time(
+    axes: Axes, foot_motion: HubAndFootMotion, time: float, slope: float
+) -> int:
+    """Draw hub, legs, feet and forces at a time in s, and return the index of the sample of the
+    contact modes."""
+    hub_position, foot_positions, sample_index = foot_motion.interpolate_at_time(time)
+    rotate_to_view = lambda slope_points: np.array(
+        _rotate_to_gravity_frame(slope_points[..., 0], slope_points[..., 1], slope)
     )
-    for leg, foot in enumerate(feet, 1):
+    for leg_number, foot_position in enumerate(foot_positions, 1):
         axes.plot(
-            *rotate_to_view(np.stack([hub, foot])),
-            color=select_leg_color(leg),
-            linewidth=3.0 if leg < 3 else 1.5,
+            *rotate_to_view(np.stack([hub_position, foot_position])),
+            color=select_leg_color(leg_number),
+            linewidth=3.0 if leg_number < 3 else 1.5,
             solid_capstyle="round",
-            zorder=5 if leg < 3 else 3,
+            zorder=5 if leg_number < 3 else 3,
         )
-    axes.plot(*rotate_to_view(hub), "o", color="black", markersize=9, zorder=6)
-    draw_feet(axes, rotate_to_view(feet), motion.contact[sample], 6.0)
-    for foot, force in zip(feet, motion.forces[sample], strict=True):
-        if force[1] != 0.0:
+    axes.plot(*rotate_to_view(hub_position), "o", color="black", markersize=9, zorder=6)
+    draw_feet(axes, rotate_to_view(foot_positions), foot_motion.contact_modes[sample_index], 6.0)
+    for foot_position, foot_force in zip(
+        foot_positions, foot_motion.foot_forces[sample_index], strict=True
+    ):
+        if foot_force[1] != 0.0:
             axes.annotate(
                 "",
-                tuple(rotate_to_view(foot + force / 300.0)),
-                tuple(rotate_to_view(foot)),
+                tuple(rotate_to_view(foot_position + foot_force / 300.0)),
+                tuple(rotate_to_view(foot_position)),
                 zorder=7,
                 arrowprops={"arrowstyle": "-|>", "linewidth": 1.2, "color": "black"},
             )
-    return sample
+    return sample_index
 
 
-def _draw_ground(axes: Axes, slope: float, center: float, stride: float) -> None:
-    """Draw the slope with marks that repeat every half stride, so that the animation loops."""
-    ground_ends = np.array([center - 3.0, center + 3.0])
+def _draw_ground_with_marks(
+    axes: Axes, slope: float, camera_position: float, stride: float
+) -> None:
+    """Draw the slope with marks that repeat twice per step, so that the animation loops."""
+    ground_ends = np.array([camera_position - 3.0, camera_position + 3.0])
     axes.plot(
-        *_rotate_to_vertical(ground_ends, 0.0 * ground_ends, slope), color="black", linewidth=1.2
+        *_rotate_to_gravity_frame(ground_ends, 0.0 * ground_ends, slope),
+        color="black",
+        linewidth=1.2,
     )
-    spacing = 0.5 * stride
-    first_mark = np.ceil((center - 2.0) / spacing)
-    for mark_number in range(int(4.0 / spacing)):
-        x = np.array([0.0, -0.06]) + (first_mark + mark_number) * spacing
+    mark_spacing = 0.5 * stride
+    first_mark = np.ceil((camera_position - 2.0) / mark_spacing)
+    for mark_number in range(int(4.0 / mark_spacing)):
+        x = np.array([0.0, -0.06]) + (first_mark + mark_number) * mark_spacing
         axes.plot(
-            *_rotate_to_vertical(x, np.array([0.0, -0.06]), slope), color="black", linewidth=0.7
+            *_rotate_to_gravity_frame(x, np.array([0.0, -0.06]), slope),
+            color="black",
+            linewidth=0.7,
         )
 
 

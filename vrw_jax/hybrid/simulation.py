@@ -22,7 +22,7 @@ from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_ph
 from vrw_jax.hybrid.program_cache import call_compiled
 from vrw_jax.numerics import Scalar, StatusCode, StepOptions, forbid_reverse_mode, opaque_condition
 from vrw_jax.printing import describe_ending
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -105,7 +105,7 @@ class HybridSolution(NamedTuple):
         return describe_ending(self.termination, Termination)
 
 
-@with_default_settings
+@with_default_jax_settings
 def simulate_hybrid(
     modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,

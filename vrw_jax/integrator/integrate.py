@@ -44,8 +44,8 @@ from vrw_jax.integrator.tangents import (
     stack_directions,
 )
 from vrw_jax.numerics import StepOptions, Vector, tree_where, zero_tangent
-from vrw_jax.runtime import with_default_settings
-from vrw_jax.simd import noinline
+from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.simd import mark_noinline
 
 
 class BatchPhase(NamedTuple):
@@ -147,7 +147,7 @@ def integrate_batch_phase(
     )
 
     @integrate_with_rule.defjvp
-    @with_default_settings
+    @with_default_jax_settings
     def integrate_jvp(primals: tuple, tangents: tuple) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
         def make_implicit_dynamics(*constants: Any) -> ImplicitDynamics:
             implicit_dynamics = make_phase(*constants).implicit_dynamics
@@ -293,7 +293,7 @@ def _integrate_to_event(
 ) -> _PhaseRun:
     """Integrate a phase, locate its event and the minima of its margins, and return all results."""
     phase = make_phase(constants, held_constants)
-    phase = _wrap_each_phase_function(phase, noinline if phase.is_noinline else jax.jit)
+    phase = _wrap_each_phase_function(phase, mark_noinline if phase.is_noinline else jax.jit)
     step_function = _make_step_function(phase, tableau)
     start_state = StageState(q, v, phase.evaluate(q, v))
     guard_values, guard_rates = evaluate_with_rates(phase.guards, phase.evaluate, start_state)
@@ -322,7 +322,7 @@ def _integrate_to_event(
     has_crossed = integrator_state.status == IntegrationStatus.CROSSED
     if phase.margins is not None or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
-        phase = _wrap_each_phase_function(phase, noinline)
+        phase = _wrap_each_phase_function(phase, mark_noinline)
         step_function = _make_step_function(phase, tableau)
     crossing_step = CrossingStep(
         *integrator_state[:2],

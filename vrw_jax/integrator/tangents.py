@@ -30,7 +30,7 @@ from vrw_jax.integrator.tableaus import (
     evaluate_stage,
 )
 from vrw_jax.numerics import Vector, run_if_any, zero_tangent
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 
 class ImplicitDynamics(NamedTuple):
@@ -108,7 +108,7 @@ def _count_vmapped_directions(_: Any) -> Array:
 
 
 @_count_vmapped_directions.def_vmap
-@with_default_settings
+@with_default_jax_settings
 def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) -> tuple[Array, bool]:
     return jnp.zeros(n_directions), False
 
@@ -335,7 +335,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
         differentiable_function = jax.custom_jvp(evaluate_combined)
 
         @differentiable_function.defjvp
-        @with_default_settings
+        @with_default_jax_settings
         def batched_jvp(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_combined(*primals),

@@ -1,8 +1,8 @@
 """The paper's step in batches: one source for machine code and GPUs, values and derivatives.
 
-The phases are those of the diffrax engine. Arrays hold one quantity of all wheels instead of the
-quantities of one wheel. `build_step_function` returns a function of one wheel that `jax.vmap` maps
-onto lanes, for use in JAX programs.
+The phases are those of the diffrax engine. Each array holds one quantity of all wheels.
+`build_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes, for use in
+JAX programs.
 """
 
 import dataclasses
@@ -33,11 +33,11 @@ from vrw_jax.models.phase_sequence import (
     PhaseRunner,
     PhaseSequenceResult,
     finish_step,
+    get_next_section_state,
     make_advance_result,
     make_step_result,
     make_trajectory,
-    next_section_state,
-    run_phases,
+    run_step_phases,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -55,7 +55,7 @@ from vrw_jax.numerics import (
     sine_cosine,
     unbatch,
 )
-from vrw_jax.runtime import cached_lane_function
+from vrw_jax.runtime import compile_cached_lane_function
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     AbstractPhase,
@@ -73,19 +73,19 @@ class StiffStartOptions:
     """Upper bounds of the first solver step of SLS-I.
 
     The loss of the rear foot's force excites the fast mode of the airborne leg, which decays within
-    0.05 s. A longer first step would be rejected and repeated.
+    0.05 s. A first step above these bounds would be rejected and repeated.
     """
 
-    max_step_ratio: float = 0.3
+    max_first_step_ratio: float = 0.3
     """Upper bound as a fraction of the solver step that DLS proposes next."""
-    max_transient_step: float = 7.0
+    max_first_step_in_transient_times: float = 7.0
     """Upper bound in units of m/c times the tolerance's root of the solver's order.
 
     The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for
     solvers of orders 5 to 8 and tolerances of 1e-4 to 1e-10."""
 
 
-STIFF_START_OPTIONS = StiffStartOptions()
+DEFAULT_STIFF_START_OPTIONS = StiffStartOptions()
 
 
 class BatchAdvanceResult(NamedTuple):
@@ -102,14 +102,14 @@ class _PhaseCarry(NamedTuple):
     """Data that a phase passes to the next phase."""
 
     next_dt: Array  # step size that the controller proposes next, s
-    has_run: Bool[Array, " lanes"]  # whether the phase took place
+    has_phase_run: Bool[Array, " lanes"]  # whether the phase took place
     is_unfinished: Bool[Array, " lanes"]
 
 
 def make_batch_phase(
-    phase: AbstractPhase, records_margins: bool, is_noinline: bool = False
+    phase: AbstractPhase, records_margins: bool, is_compiled_separately: bool = False
 ) -> BatchPhase:
-    """Return a phase in the form of the batched integrator.
+    """Return a phase in the form that the batched integrator takes.
 
     - `records_margins`: whether margins are evaluated in addition to guards.
     """
@@ -120,35 +120,35 @@ def make_batch_phase(
             sin, cos, phase.acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
         )
 
-    def motion_at_stage(stage: StageState) -> Motion:
+    def complete_stage_motion(stage: StageState) -> Motion:
         return phase.complete_motion(
             stage.acceleration.sin, stage.acceleration.cos, stage.q, stage.v
         )
 
-    def make_instant(stage: StageState) -> PhaseInstant:
-        return PhaseInstant(phase, motion_at_stage(stage), stage.acceleration.acceleration)
+    def make_phase_instant(stage: StageState) -> PhaseInstant:
+        return PhaseInstant(phase, complete_stage_motion(stage), stage.acceleration.acceleration)
 
     implicit_dynamics = ImplicitDynamics(
         lambda stage: phase.dynamics_residual(
-            motion_at_stage(stage), stage.acceleration.acceleration
+            complete_stage_motion(stage), stage.acceleration.acceleration
         ),
         lambda stage, right_hand_side: phase.solve_dynamics(
-            motion_at_stage(stage), right_hand_side
+            complete_stage_motion(stage), right_hand_side
         ),
     )
-    margin_functions = lambda stage: phase.margins(make_instant(stage))
-    monitored_margins = (
-        MarginFunctions(margin_functions, phase.margins_counted_at_start)
+    evaluate_margins = lambda stage: phase.margins(make_phase_instant(stage))
+    recorded_margins = (
+        MarginFunctions(evaluate_margins, phase.margins_counted_at_start)
         if records_margins
         else None
     )
-    guards = lambda stage: phase.guards(make_instant(stage))
+    evaluate_guards = lambda stage: phase.guards(make_phase_instant(stage))
     return BatchPhase(
         evaluate_acceleration,
-        guards,
-        monitored_margins,
+        evaluate_guards,
+        recorded_margins,
         implicit_dynamics,
-        is_noinline,
+        is_compiled_separately,
         phase.coordinate_units,
     )
 
@@ -175,9 +175,11 @@ def take_gait_step(
         straggler_count=straggler_count,
     )
     phase_ends, has_stepped = phase_sequence.phase_ends, phase_sequence.outcome == Outcome.STEPPED
-    next_section = next_section_state(phase_sequence)
+    next_state = get_next_section_state(phase_sequence)
     return BatchAdvanceResult(
-        section_state=tuple(jnp.where(has_stepped, value, 0.0) for value in next_section),
+        section_state=tuple(
+            jnp.where(has_stepped, state_component, 0.0) for state_component in next_state
+        ),
         durations=tuple(phase_end.duration for phase_end in phase_ends),
         outcome=phase_sequence.outcome,
         solver_steps=phase_ends[0].n_solver_steps
@@ -197,19 +199,24 @@ def run_batch_phases(
     stop_at_lift_off: bool,
     records_margins: bool,
     straggler_count: Array | None = None,
-    is_noinline: bool = False,
-    stiff_start: StiffStartOptions = STIFF_START_OPTIONS,
+    is_compiled_separately: bool = False,
+    stiff_start_options: StiffStartOptions = DEFAULT_STIFF_START_OPTIONS,
 ) -> PhaseSequenceResult:
     """Return the result of all phases of every lane's step.
 
     - `straggler_count`: see `integrate_batch_phase`;
-    - `is_noinline`: see `BatchPhase`.
+    - `is_compiled_separately`: see `BatchPhase`.
     """
     run_phase = _make_phase_runner(
-        options, tableau, records_margins, straggler_count, is_noinline, stiff_start
+        options,
+        tableau,
+        records_margins,
+        straggler_count,
+        is_compiled_separately,
+        stiff_start_options,
     )
     land = with_batched_jvp(transitions.land)
-    return run_phases(run_phase, params, x, options, stop_at_lift_off, land)
+    return run_step_phases(run_phase, params, x, options, stop_at_lift_off, land)
 
 
 def _make_phase_runner(
@@ -217,8 +224,8 @@ def _make_phase_runner(
     tableau: ButcherTableau,
     records_margins: bool,
     straggler_count: Array | None,
-    is_noinline: bool,
-    stiff_start: StiffStartOptions,
+    is_compiled_separately: bool,
+    stiff_start_options: StiffStartOptions,
 ) -> PhaseRunner:
     """Return a function that integrates one phase of every lane to its end."""
 
@@ -226,7 +233,7 @@ def _make_phase_runner(
         phase: AbstractPhase,
         q: Vector,
         v: Vector,
-        is_active: Array,
+        is_active_lane: Array,
         previous_end: PhaseResult | None,
     ) -> PhaseResult:
         scaled_options = compute_wheel_units(phase.s).scale_times(options)
@@ -235,11 +242,16 @@ def _make_phase_runner(
             engine_carry: _PhaseCarry = previous_end.engine_carry
             dt0 = engine_carry.next_dt
             if phase.has_stiff_start:
-                tolerance_root = jnp.exp(jnp.log(options.rtol.astype(jnp.float32)) / tableau.order)
-                transient_dt = stiff_start.max_transient_step * tolerance_root.astype(dt0.dtype)
-                max_transient_dt = transient_dt * phase.s.m / phase.s.c
-                dt0 = jnp.minimum(stiff_start.max_step_ratio * dt0, max_transient_dt)
-                dt0 = jnp.where(engine_carry.has_run, dt0, engine_carry.next_dt)
+                rooted_tolerance = jnp.exp(
+                    jnp.log(options.rtol.astype(jnp.float32)) / tableau.order
+                )
+                transient_dt_in_transient_times = (
+                    stiff_start_options.max_first_step_in_transient_times
+                    * rooted_tolerance.astype(dt0.dtype)
+                )
+                max_transient_dt = transient_dt_in_transient_times * phase.s.m / phase.s.c
+                dt0 = jnp.minimum(stiff_start_options.max_first_step_ratio * dt0, max_transient_dt)
+                dt0 = jnp.where(engine_carry.has_phase_run, dt0, engine_carry.next_dt)
         float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sin_cos), eqx.is_array)
 
         def make_phase(float_leaves: Any, constants: Vector) -> BatchPhase:
@@ -247,7 +259,7 @@ def _make_phase_runner(
             rebuilt_phase = dataclasses.replace(
                 phase, s=s, constants=constants, tilt_sin_cos=tilt_sin_cos
             )
-            return make_batch_phase(rebuilt_phase, records_margins, is_noinline)
+            return make_batch_phase(rebuilt_phase, records_margins, is_compiled_separately)
 
         phase_end = integrate_batch_phase(
             make_phase,
@@ -256,7 +268,7 @@ def _make_phase_runner(
             tableau,
             q,
             v,
-            is_active,
+            is_active_lane,
             dt0,
             scaled_options,
             straggler_count,
@@ -268,28 +280,29 @@ def _make_phase_runner(
             is_timed_out=phase_end.timed_out,
             n_solver_steps=phase_end.n_tried_steps,
             margin_minima=phase_end.minima,
-            engine_carry=_PhaseCarry(phase_end.next_dt, is_active, phase_end.is_unfinished),
+            engine_carry=_PhaseCarry(phase_end.next_dt, is_active_lane, phase_end.is_unfinished),
         )
 
     return run_phase
 
 
-def can_use_lanes(options: StepOptions) -> bool:
-    """Return whether the batch kernel can take the step: machine code and an explicit solver.
+def can_use_batch_kernel(options: StepOptions) -> bool:
+    """Return whether the batch kernel can take the step, which needs machine code and an explicit
+    solver.
 
-    Raises `ValueError` if the options require the batch kernel and it is not available.
+    Raise a `ValueError` if the options require the batch kernel and it is not available.
     """
     is_explicit = load_explicit_tableau(options.solver) is not None
-    if options.engine == "lanes" and not (is_explicit and simd.is_available()):
+    if options.engine == "lanes" and not (is_explicit and simd.is_machine_code_available()):
         raise ValueError(
             "engine is 'lanes', which needs a CPU, llvmlite and an explicit solver, but the solver "
             f"is {options.solver} on a {jax.default_backend()}: take engine='diffrax'."
         )
-    return is_explicit and simd.is_available() and options.engine != "diffrax"
+    return is_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
 
 
-class _StaticConfig(NamedTuple):
-    """Static configuration of a batched step: its dependencies besides arrays."""
+class _StepTraceConfig(NamedTuple):
+    """Settings on which the trace of a batched step depends, besides its arrays."""
 
     argument_structure: Any  # tree structure of (params, x, options)
     stop_at_lift_off: bool
@@ -300,21 +313,23 @@ class _StaticConfig(NamedTuple):
         """Return the key of the trace in caches, compared by `repr`."""
         return str(self.argument_structure), self.stop_at_lift_off, self.friction
 
-    def run_lanes(self, *leaves: Array) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
-        """Return the phases of the lanes, the tableau and the options.
+    def run_phases_of_lanes(
+        self, *argument_leaves: Array
+    ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
+        """Return the results of all phases of the lanes, the tableau and the options.
 
         The leaves have the lanes on their last axis.
         """
-        params, x, options = jax.tree.unflatten(self.argument_structure, leaves)
+        params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
         tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # `can_use_lanes` has checked the solver.
+        assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
         records_margins = self.friction is not None
         phase_arguments = params, tuple(x), options, tableau, self.stop_at_lift_off, records_margins
-        return run_batch_phases(*phase_arguments, is_noinline=True), tableau, options
+        return run_batch_phases(*phase_arguments, is_compiled_separately=True), tableau, options
 
-    def compute_outputs(self, *leaves: Array) -> tuple:
+    def compute_step_outputs(self, *argument_leaves: Array) -> tuple:
         """Return the results of a step over lanes, split into floats and other arrays."""
-        phase_sequence, friction = self.run_lanes(*leaves)[0], self.friction
+        phase_sequence, friction = self.run_phases_of_lanes(*argument_leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
         phase_ends = tuple(
@@ -323,35 +338,39 @@ class _StaticConfig(NamedTuple):
         float_sequence = phase_sequence._replace(
             phases=(), phase_starts=(), phase_ends=phase_ends
         )  # only floats
-        result = with_batched_jvp(
+        step_result = with_batched_jvp(
             lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
         )(float_sequence)
-        return eqx.partition(result, eqx.is_inexact_array)
+        return eqx.partition(step_result, eqx.is_inexact_array)
 
-    def make_template(self, *leaves: Array) -> tuple:
-        """Return arrays in the structure of `compute_outputs` for one wheel."""
-        x = leaves[0]
+    def make_output_template(self, *argument_leaves: Array) -> tuple:
+        """Return arrays with the structure of the results of `compute_step_outputs` for one
+        wheel.
+        """
+        x = argument_leaves[0]
         int_zeros = jnp.zeros_like(x, jnp.int32)
         two_rows, three_rows = (jnp.broadcast_to(x, (n, *x.shape)) for n in (2, 3))
-        result: Any = AdvanceResult(three_rows, three_rows, int_zeros, int_zeros, engine="lanes")
+        template_result: Any = AdvanceResult(
+            three_rows, three_rows, int_zeros, int_zeros, engine="lanes"
+        )
         if self.friction is not None:
-            result = StepResult(
+            template_result = StepResult(
                 section_state=three_rows,
                 post_impact=two_rows,
                 durations=three_rows,
                 step_length=x,
-                indicators=_fill_fields(DoubleSupportIndicators, x),
-                margins=_fill_fields(Margins, x),
-                energy=_fill_fields(EnergyLoss, x),
+                indicators=_fill_all_fields(DoubleSupportIndicators, x),
+                margins=_fill_all_fields(Margins, x),
+                energy=_fill_all_fields(EnergyLoss, x),
                 outcome=int_zeros,
                 solver_steps=int_zeros,
                 engine="lanes",
             )
-        return eqx.partition(result, eqx.is_inexact_array)
+        return eqx.partition(template_result, eqx.is_inexact_array)
 
 
-def _fill_fields(record_type: Any, x: Array) -> Any:
-    """Return a record of this type with `x` in all fields."""
+def _fill_all_fields(record_type: Any, x: Array) -> Any:
+    """Return a record of the class `record_type` with `x` in all fields."""
     return record_type(*(x for _ in dataclasses.fields(record_type)))
 
 
@@ -363,43 +382,58 @@ def build_step_function(
     The results are split into floats and other arrays. The function is a forward rule from which
     all AD modes are built.
     """
-    config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
-    cache_key = ("gait step", *config.cache_key)
-    return unbatch(cached_lane_function(config.compute_outputs, config.make_template, cache_key))
+    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
+    cache_key = ("gait step", *trace_config.cache_key)
+    return unbatch(
+        compile_cached_lane_function(
+            trace_config.compute_step_outputs, trace_config.make_output_template, cache_key
+        )
+    )
 
 
 def build_step_finisher(
     argument_structure: Any, phase_index: int, stop_at_lift_off: bool
 ) -> BatchFunction:
-    """Return a function from the leaves of (params, distance, state, options) to the floats and
-    others of `finish_step`.
+    """Return a function from the leaves of (params, distance, state, options) to the results of
+    `finish_step`.
+
+    The results are split into floats and other arrays.
     """
 
-    def compute_outputs(*leaves: Array) -> tuple:
-        params, distance, state, options = jax.tree.unflatten(argument_structure, leaves)
+    def compute_finish_outputs(*argument_leaves: Array) -> tuple:
+        params, foot_distance, phase_state, options = jax.tree.unflatten(
+            argument_structure, argument_leaves
+        )
         tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # checked by `can_use_lanes`
-        run_phase = _make_phase_runner(options, tableau, False, None, True, STIFF_START_OPTIONS)
-        settings = options, stop_at_lift_off, "lanes"
-        result = finish_step(run_phase, params, phase_index, distance, tuple(state), *settings)
-        return eqx.partition(result, eqx.is_inexact_array)
+        assert tableau is not None  # checked by `can_use_batch_kernel`
+        run_phase = _make_phase_runner(
+            options, tableau, False, None, True, DEFAULT_STIFF_START_OPTIONS
+        )
+        step_settings = options, stop_at_lift_off, "lanes"
+        finish_result = finish_step(
+            run_phase, params, phase_index, foot_distance, tuple(phase_state), *step_settings
+        )
+        return eqx.partition(finish_result, eqx.is_inexact_array)
 
-    config = _StaticConfig(argument_structure, stop_at_lift_off, None)
-    cache_key = ("end of a step", phase_index, *config.cache_key)
-    return unbatch(cached_lane_function(compute_outputs, config.make_template, cache_key))
+    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
+    cache_key = ("end of a step", phase_index, *trace_config.cache_key)
+    return unbatch(
+        compile_cached_lane_function(
+            compute_finish_outputs, trace_config.make_output_template, cache_key
+        )
+    )
 
 
 def build_step_sampler(
     argument_structure: Any, stop_at_lift_off: bool, n_samples: int
 ) -> BatchFunction:
     """Return a function from the leaves of (params, x, options) to samples at equal times of each
-    phase.
-    """
-    config = _StaticConfig(argument_structure, stop_at_lift_off, None)
+    phase."""
+    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
-    def sample_lanes(*leaves: Array) -> Trajectory:
-        phase_sequence, tableau, options = config.run_lanes(*leaves)
-        samples = [
+    def sample_step_of_lanes(*argument_leaves: Array) -> Trajectory:
+        phase_sequence, tableau, options = trace_config.run_phases_of_lanes(*argument_leaves)
+        phase_samples = [
             sample_batch_phase(
                 make_batch_phase(phase, False),
                 tableau,
@@ -415,16 +449,27 @@ def build_step_sampler(
                 strict=True,
             )
         ]
-        return make_trajectory(phase_sequence, samples)
+        return make_trajectory(phase_sequence, phase_samples)
 
-    def make_template(x: Array, *_: Array) -> Trajectory:
-        make_rows = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
+    def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
+        make_sample_array = lambda *n: jnp.broadcast_to(x, (3, *n, *x.shape))
         n = n_samples
-        sample_arrays = make_rows(n), make_rows(n, 6), make_rows(n, 4), make_rows(n, 3)
-        return Trajectory(*sample_arrays, make_rows(), make_rows(), jnp.zeros_like(x, jnp.int32))
+        sample_arrays = (
+            make_sample_array(n),
+            make_sample_array(n, 6),
+            make_sample_array(n, 4),
+            make_sample_array(n, 3),
+        )
+        return Trajectory(
+            *sample_arrays, make_sample_array(), make_sample_array(), jnp.zeros_like(x, jnp.int32)
+        )
 
     return unbatch(
-        cached_lane_function(sample_lanes, make_template, ("samples", *config.cache_key, n_samples))
+        compile_cached_lane_function(
+            sample_step_of_lanes,
+            make_trajectory_template,
+            ("samples", *trace_config.cache_key, n_samples),
+        )
     )
 
 
@@ -436,108 +481,123 @@ def build_step_jacobian(
 ) -> ForwardFunction:
     """Return a function that computes the Jacobian of the step of `build_step_function`.
 
-    The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
-    the other results.
+    That function returns the Jacobian with respect to the leaves at `input_indices`, the float
+    results, and the other results.
     """
-    config = _StaticConfig(argument_structure, stop_at_lift_off, friction)
+    trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, friction)
 
-    def tighten_tolerances(*leaves: Array) -> list[Array]:
-        params, x, options = jax.tree.unflatten(argument_structure, leaves)
+    def tighten_tolerances(*argument_leaves: Array) -> list[Array]:
+        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         return jax.tree.leaves((params, x, options.with_derivative_tolerances()))
 
-    def make_template(*leaves: Array) -> tuple:
-        float_outputs, other_outputs = config.make_template(*leaves)
+    def make_jacobian_template(*argument_leaves: Array) -> tuple:
+        float_outputs, other_outputs = trace_config.make_output_template(*argument_leaves)
         return float_outputs, float_outputs, other_outputs
 
-    evaluate_lanes = lambda *leaves: compute_jacobian_columns(
-        config.compute_outputs, leaves, input_indices
+    evaluate_jacobian_of_lanes = lambda *leaves: compute_jacobian_columns(
+        trace_config.compute_step_outputs, leaves, input_indices
     )
-    cache_key = ("gait step with derivatives", *config.cache_key, input_indices)
-    compiled_by_size = {
+    cache_key = ("gait step with derivatives", *trace_config.cache_key, input_indices)
+    jacobian_functions_by_size = {
         n: unbatch(
-            cached_lane_function(evaluate_lanes, make_template, cache_key, simd.RegisterLimits(n))
+            compile_cached_lane_function(
+                evaluate_jacobian_of_lanes,
+                make_jacobian_template,
+                cache_key,
+                simd.RegisterLimits(n),
+            )
         )
         for n in (N_STEP_INPUTS, N_STEP_INPUTS + 1)
     }
 
-    def evaluate_jacobian(*leaves: Array) -> tuple:
-        n_directions = sum(int(np.prod(jnp.shape(leaves[i]))) for i in input_indices)
-        evaluate_columns = compiled_by_size[N_STEP_INPUTS + (n_directions > N_STEP_INPUTS)]
-        jacobian_columns, float_outputs, other_outputs = evaluate_columns(
-            *tighten_tolerances(*leaves)
+    def evaluate_jacobian(*argument_leaves: Array) -> tuple:
+        n_jacobian_columns = sum(int(np.prod(jnp.shape(argument_leaves[i]))) for i in input_indices)
+        evaluate_jacobian_columns = jacobian_functions_by_size[
+            N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
+        ]
+        jacobian_columns, float_outputs, other_outputs = evaluate_jacobian_columns(
+            *tighten_tolerances(*argument_leaves)
         )
         return (
-            split_jacobian(jacobian_columns, leaves, input_indices),
+            split_jacobian_by_leaf(jacobian_columns, argument_leaves, input_indices),
             float_outputs,
         ), other_outputs
 
     return evaluate_jacobian
 
 
-def split_jacobian(
-    jacobian_columns: Any, leaves: Sequence[Array], input_indices: Sequence[int]
+def split_jacobian_by_leaf(
+    jacobian_columns: Any, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
     """Return a Jacobian as one tree for each selected leaf.
 
     The leading axis of `jacobian_columns` runs over all entries of the selected leaves.
     """
-    jacobians, column_offset = [], 0
+    jacobian_by_leaf, column_offset = [], 0
     for i in input_indices:
-        leaf_shape = jnp.shape(leaves[i])
+        leaf_shape = jnp.shape(argument_leaves[i])
         column_range = slice(column_offset, column_offset + int(np.prod(leaf_shape)))
         select_columns = lambda x, column_range=column_range, leaf_shape=leaf_shape: jnp.moveaxis(
             x[column_range], 0, -1
         ).reshape(*x.shape[1:], *leaf_shape)
-        jacobians.append(jax.tree.map(select_columns, jacobian_columns))
+        jacobian_by_leaf.append(jax.tree.map(select_columns, jacobian_columns))
         column_offset = column_range.stop
-    return tuple(jacobians)
+    return tuple(jacobian_by_leaf)
 
 
 N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
-"""Number of inputs of a step on flat ground: parameters and section state. Uneven ground adds the
-slope of the next line. Machine code keeps one number per derivative in registers."""
+"""Number of inputs of a step on flat ground, which are parameters and section state.
+
+Uneven ground adds the slope of the next line. Machine code keeps one number per derivative in
+registers.
+"""
 
 
 def compute_jacobian_columns(
-    batch_function: BatchFunction, leaves: Sequence[Array], input_indices: Sequence[int]
+    batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
 ) -> tuple:
-    """Return the Jacobian columns of `batch_function(*leaves)`, its floats and its other outputs.
+    """Return the Jacobian columns of `batch_function(*argument_leaves)`, its float results and its
+    other results.
 
     The columns are those of the leaves at `input_indices`, on the leading axis. The function
     returns floats over lanes and auxiliary outputs.
     """
 
-    def evaluate_at(*selected_leaves: Array) -> tuple:
-        all_leaves = list(leaves)
-        for i, leaf in zip(input_indices, selected_leaves, strict=True):
-            all_leaves[i] = leaf
+    def evaluate_at_selected_leaves(*varied_leaves: Array) -> tuple:
+        all_leaves = list(argument_leaves)
+        for i, varied_leaf in zip(input_indices, varied_leaves, strict=True):
+            all_leaves[i] = varied_leaf
         return batch_function(*all_leaves)
 
-    primals = [leaves[i] for i in input_indices]
-    compute_jvp = lambda tangents: jax.jvp(evaluate_at, primals, tangents, has_aux=True)
+    selected_leaves = [argument_leaves[i] for i in input_indices]
+    compute_directional_derivative = lambda tangents: jax.jvp(
+        evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
+    )
     float_outputs, jacobian_columns, other_outputs = jax.vmap(
-        compute_jvp, out_axes=(None, 0, None)
-    )(_unit_tangents(primals))
+        compute_directional_derivative, out_axes=(None, 0, None)
+    )(_make_unit_tangents(selected_leaves))
     return jacobian_columns, float_outputs, other_outputs
 
 
-def _unit_tangents(leaves: Sequence[Array]) -> list[Array]:
-    """Return for each leaf its part of the unit vectors of all leaves, on the leading axis.
+def _make_unit_tangents(selected_leaves: Sequence[Array]) -> list[Array]:
+    """Return the unit vectors of all entries of the leaves, split by leaf, on the leading axis.
 
     The ones and zeros of each number are separate constants, so that machine code omits products
     with zeros.
     """
-    sizes = [int(np.prod(leaf.shape[:-1])) for leaf in leaves]
-    unit_vectors, tangents, entry_offset = np.eye(sum(sizes)), [], 0
-    for leaf, n_entries in zip(leaves, sizes, strict=True):
+    entries_per_leaf = [int(np.prod(selected_leaf.shape[:-1])) for selected_leaf in selected_leaves]
+    unit_vectors, leaf_tangents, entry_offset = np.eye(sum(entries_per_leaf)), [], 0
+    for selected_leaf, n_entries in zip(selected_leaves, entries_per_leaf, strict=True):
         entry_tangents = [
-            jnp.asarray(unit_vectors[:, i], leaf.dtype)[:, None]
+            jnp.asarray(unit_vectors[:, i], selected_leaf.dtype)[:, None]
             for i in range(entry_offset, entry_offset + n_entries)
         ]
         lane_tangents = [
-            jnp.broadcast_to(entry_tangent, (len(unit_vectors), leaf.shape[-1]))
+            jnp.broadcast_to(entry_tangent, (len(unit_vectors), selected_leaf.shape[-1]))
             for entry_tangent in entry_tangents
         ]
-        tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
+        leaf_tangents.append(
+            lane_tangents[0] if selected_leaf.ndim == 1 else jnp.stack(lane_tangents, 1)
+        )
         entry_offset += n_entries
-    return tangents
+    return leaf_tangents

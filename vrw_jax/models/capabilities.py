@@ -1,4 +1,6 @@
-"""Features of the library for each model: each model declares them, and packages read them."""
+"""Features of the library for each model. Each model declares its features, and packages read
+them.
+"""
 
 import enum
 from dataclasses import dataclass
@@ -22,14 +24,14 @@ class PassageMethod(enum.StrEnum):
     """Methods that compute mean first-passage times of a model on uneven ground."""
 
     QUADRATURE = enum.auto()
-    """Quadrature of the closed-form kernel of the model's `vertical_map`."""
+    """Quadrature of the closed-form kernel of the model's `make_vertical_rate_map`."""
     SAMPLING = enum.auto()
     """Importance sampling of many walks."""
 
 
 @dataclass(frozen=True)
 class ModelCapabilities:
-    """Features of the library for one model."""
+    """Features of the library that one model supports."""
 
     config_name: str
     """Name of the model in a configuration and on the command line."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.step_inputs import SectionState, complete_slopes
+from vrw_jax.models.step_inputs import SectionState, complete_line_slopes
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
@@ -22,8 +22,8 @@ from vrw_jax.wheel import (
     wheel_from_parameters,
 )
 
-StepGround = tuple[Array, ...]
-"""Ground of one step, or of all steps: the arguments of `with_ground`."""
+StepGroundValues = tuple[Array, ...]
+"""Ground of one step or of all steps, in the form of the arguments of `with_ground`."""
 
 
 class AbstractWheel(eqx.Module):
@@ -53,25 +53,33 @@ class AbstractWheel(eqx.Module):
         if is_traced(self):
             return eqx.tree_pformat(self)
         format_number = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
-        format_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
-        fields = ", ".join(f"{name}={format_value(value)}" for name, value in vars(self).items())
-        return f"{type(self).__name__}({fields})"
+        format_field_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
+        field_texts = ", ".join(
+            f"{field_name}={format_field_value(field_value)}"
+            for field_name, field_value in vars(self).items()
+        )
+        return f"{type(self).__name__}({field_texts})"
 
     @property
     def fallback_model(self) -> "AbstractWheel":
         """Return the model that is valid for any start.
 
-        This is the model itself, or the most general model of a ladder.
+        For a ladder this is its most general model, and for any other model the model itself.
         """
         return self
 
     def parameter_values(self, params: WheelParams) -> Float[Array, " n_values"]:
-        """Return the values of `parameter_names`, for one wheel on this ground."""
-        parameters = [
-            getattr(self if name == FRICTION_NAME else params, name)
-            for name in self.parameter_names
+        """Return the values of `parameter_names` for one wheel on the ground of this model."""
+        parameter_values_list = [
+            getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
+            for parameter_name in self.parameter_names
         ]
-        return jnp.stack([jnp.asarray(value, params.damping.dtype) for value in parameters])
+        return jnp.stack(
+            [
+                jnp.asarray(parameter_value, params.damping.dtype)
+                for parameter_value in parameter_values_list
+            ]
+        )
 
     def parameter_rows(self, params: WheelParams) -> Float[np.ndarray, "wheels n_values"]:
         """Return `parameter_values` of each wheel of a batch, by numpy.
@@ -85,28 +93,32 @@ class AbstractWheel(eqx.Module):
         return np.stack(np.broadcast_arrays(*columns), -1)
 
     def from_values(
-        self, values: Array | tuple[Array, ...], n_legs: int
+        self, parameter_values: Array | tuple[Array, ...], n_legs: int
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel with these values of `parameter_names`.
+        """Return model and wheel with the given values of `parameter_names`.
 
         This is the inverse of `parameter_values`, also for tracers.
         """
         n = len(PARAMETER_NAMES)
-        model = self
+        model_with_friction = self
         if FRICTION_NAME in self.parameter_names:
-            model = eqx.tree_at(lambda ground: ground.friction, self, values[n])
-        return model, wheel_from_parameters(values[:n], n_legs)
+            model_with_friction = eqx.tree_at(
+                lambda ground: ground.friction, self, parameter_values[n]
+            )
+        return model_with_friction, wheel_from_parameters(parameter_values[:n], n_legs)
 
     def with_parameter(
-        self, params: WheelParams, name: str, value: Elementwise
+        self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return model and wheel with another value of one of `parameter_names`.
 
         The value may be a tracer.
         """
-        if name == FRICTION_NAME:
-            return eqx.tree_at(lambda ground: ground.friction, self, value), params
-        return self, eqx.tree_at(lambda wheel: getattr(wheel, name), params, value)
+        if parameter_name == FRICTION_NAME:
+            return eqx.tree_at(lambda ground: ground.friction, self, parameter_value), params
+        return self, eqx.tree_at(
+            lambda wheel: getattr(wheel, parameter_name), params, parameter_value
+        )
 
     @abc.abstractmethod
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
@@ -154,20 +166,20 @@ class AbstractWheel(eqx.Module):
     def default_start(self, params: WheelParams) -> SectionState:
         """Return a section state from which a walk can start."""
 
-    def split_ground(self, params: WheelParams, n_steps: int) -> StepGround | None:
-        """Return the ground of each step if slope or friction are arrays over steps, else None."""
+    def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
+        """Return the ground of each step if slope or friction are arrays over steps, otherwise
+        None."""
         if jnp.ndim(params.slope) == 0:
             return None
-        slopes = complete_slopes(params.slope, n_steps)
-        return (jnp.stack([slopes[:-1], slopes[1:]], axis=-1),)
+        line_slopes = complete_line_slopes(params.slope, n_steps)
+        return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
 
     def with_ground(
-        self, params: WheelParams, ground: StepGround
+        self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return model and wheel on the ground of one step: the slopes of two lines, see
-        `split_slopes`.
-        """
-        return self, eqx.tree_at(lambda wheel: wheel.slope, params, ground[0])
+        """Return model and wheel on the ground of one step, which is the slopes of two lines, see
+        `split_slopes`."""
+        return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
     def section_size(self, params: WheelParams) -> int:
         """Return the number of entries of a section state."""
@@ -181,9 +193,11 @@ class AbstractWheel(eqx.Module):
         return self.section_size(params)
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
-        """Return the wheel's unit of each entry of a section state, as a list."""
+        """Return the wheel's unit of each entry of a section state."""
         return [units.length / units.length, units.rate, units.speed]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
-        """Return the model's section state of `x`, which may be the paper's three numbers."""
+        """Return the section state of this model for `x`, which may be the paper's three
+        numbers.
+        """
         return x

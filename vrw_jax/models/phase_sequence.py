@@ -13,7 +13,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.models.step_inputs import PAPER_START, StateValues, replace_invalid, select_stance_line
+from vrw_jax.models.step_inputs import (
+    PAPER_START_STATE,
+    SectionStateEntries,
+    replace_invalid_inputs,
+    select_stance_line_and_tilt,
+)
 from vrw_jax.models.step_results import (
     AdvanceResult,
     DoubleSupportIndicators,
@@ -40,12 +45,12 @@ from vrw_jax.wheel import (
 )
 
 SAFE_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
-"""Regular posture (theta, L1, L2 and rates) in place of the state of a wheel whose step has failed.
-This state is never integrated."""
+"""Regular posture (theta, L1, L2 and rates), which replaces the state of a wheel whose step has
+failed. This state is never integrated."""
 
 
 class PhaseResult(NamedTuple):
-    """End of a phase; equal to its start if the phase was not active."""
+    """End of a phase. It equals the start if the phase was not active."""
 
     q: Vector
     v: Vector
@@ -58,8 +63,8 @@ class PhaseResult(NamedTuple):
 
 
 PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]
-"""Function to the end of a phase from its start (q, v), its active mask and the end of the previous
-phase."""
+"""Function that returns the end of a phase from its start (q, v), its active mask and the end of
+the previous phase."""
 
 
 class PhaseSequenceResult(NamedTuple):
@@ -70,105 +75,123 @@ class PhaseSequenceResult(NamedTuple):
     phases: tuple[AbstractPhase, ...]
     phase_starts: tuple[tuple[Vector, Vector], ...]
     phase_ends: tuple[PhaseResult, ...]
-    phases_happened: tuple[Bool[Array, "..."], ...]
+    phase_occurrences: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
     tilt: Elementwise | None = None  # of the next line, rad; None on flat ground
 
 
-def run_phases(
-    run_phase: PhaseRunner,
+def run_step_phases(
+    integrate_phase: PhaseRunner,
     params: WheelParams,
-    x: StateValues,
+    x: SectionStateEntries,
     options: StepOptions,
     stop_at_lift_off: bool,
-    land: Callable[..., Landing] = transitions.land,
+    evaluate_landing: Callable[..., Landing] = transitions.land,
 ) -> PhaseSequenceResult:
     """Return the result of all phases of one step from the section state `x`, given entry by entry.
 
     The motion is in the frame of the line under both feet in double support. On uneven ground (see
     `split_slopes`), the touchdown and the section state at the end refer to the next line.
 
-    - `run_phase`: engine;
-    - `land`: function of the landing that opens the step.
+    - `integrate_phase`: engine that integrates a phase;
+    - `evaluate_landing`: function of the landing with which the step begins.
     """
-    params, is_valid, tilt = select_stance_line(params, x)
-    params, x = replace_invalid(is_valid, params, x, PAPER_START)
+    params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
+    params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
     s = params.symbols()
-    landing = land(s, *x)
-    tilt_sin_cos = () if tilt is None else sine_cosine(tilt)
-    phases = make_phases(s, landing.distance, stop_at_lift_off, tilt_sin_cos)
+    landing_result = evaluate_landing(s, *x)
+    tilt_sin_cos = () if next_line_tilt is None else sine_cosine(next_line_tilt)
+    step_phases = make_phases(s, landing_result.distance, stop_at_lift_off, tilt_sin_cos)
     # A landing that releases the rear foot continues in SLS-I.
-    is_active = is_valid & landing.keeps_rear_foot
-    last_phases = _run_last_phases(
-        run_phase, phases, landing.theta, landing.motion, is_valid, is_active, options
+    is_double_support_active = is_valid_step & landing_result.keeps_rear_foot
+    remaining_phases = _run_remaining_phases(
+        integrate_phase,
+        step_phases,
+        landing_result.theta,
+        landing_result.motion,
+        is_valid_step,
+        is_double_support_active,
+        options,
     )
-    return PhaseSequenceResult(s, landing, phases, *last_phases, tilt)
+    return PhaseSequenceResult(s, landing_result, step_phases, *remaining_phases, next_line_tilt)
 
 
-class _LastPhases(NamedTuple):
-    """Starts and ends of the last phases of a step; see `PhaseSequenceResult`."""
+class _RemainingPhases(NamedTuple):
+    """Starts and ends of the remaining phases of a step; see `PhaseSequenceResult`."""
 
     phase_starts: tuple[tuple[Vector, Vector], ...]
     phase_ends: tuple[PhaseResult, ...]
-    phases_happened: tuple[Bool[Array, "..."], ...]
+    phase_occurrences: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]
 
 
-def _run_last_phases(
-    run_phase: PhaseRunner,
-    phases: tuple[AbstractPhase, ...],
-    theta: Elementwise,
-    motion: Motion,
-    is_valid: Array,
-    is_active: Array,
+def _run_remaining_phases(
+    integrate_phase: PhaseRunner,
+    remaining_phases: tuple[AbstractPhase, ...],
+    wheel_angle: Elementwise,
+    wheel_motion: Motion,
+    is_valid_step: Array,
+    is_phase_active: Array,
     options: StepOptions,
-) -> _LastPhases:
-    """Return the results of the last phases of a step, from a motion in the first of them.
+) -> _RemainingPhases:
+    """Return the results of the remaining phases of a step, from a motion in the first of these
+    phases.
 
-    - `is_valid`: whether a step takes place;
-    - `is_active`: whether the first of the phases takes place.
+    - `is_valid_step`: whether a step takes place;
+    - `is_phase_active`: whether the first of the phases takes place.
     """
-    outcome = jnp.where(is_valid, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT))
-    phase_starts, phases_happened = [], []
+    step_outcome = jnp.where(
+        is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
+    )
+    phase_starts, phase_occurrences = [], []
     phase_ends: list[PhaseResult] = []
-    for previous_phase, phase in zip((None, *phases), phases, strict=False):
+    for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
         if previous_phase is not None:
             end_state = (
                 phase_ends[-1].q[0],
                 previous_phase.motion_at(phase_ends[-1].q, phase_ends[-1].v),
             )
-            theta, motion = tree_where(is_active, end_state, (theta, motion))
-            is_active = outcome == Outcome.STEPPED
+            wheel_angle, wheel_motion = tree_where(
+                is_phase_active, end_state, (wheel_angle, wheel_motion)
+            )
+            is_phase_active = step_outcome == Outcome.STEPPED
             safe_theta, *safe_lengths_and_rates = (
-                jnp.asarray(value, jnp.result_type(theta)) for value in SAFE_SINGLE_SUPPORT_STATE
+                jnp.asarray(state_component, jnp.result_type(wheel_angle))
+                for state_component in SAFE_SINGLE_SUPPORT_STATE
             )
             safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_lengths_and_rates)
-            theta, motion = tree_where(is_active, (theta, motion), safe_state)
-            motion = previous_phase.reset_map(motion)
-        start_state = phase.select_coordinates(theta, motion)
-        phase_end = run_phase(
-            phase, *start_state, is_active, phase_ends[-1] if phase_ends else None
+            wheel_angle, wheel_motion = tree_where(
+                is_phase_active, (wheel_angle, wheel_motion), safe_state
+            )
+            wheel_motion = previous_phase.reset_map(wheel_motion)
+        start_state = phase.select_coordinates(wheel_angle, wheel_motion)
+        phase_end = integrate_phase(
+            phase, *start_state, is_phase_active, phase_ends[-1] if phase_ends else None
         )
         phase_outcome = phase.outcome_of_guard(phase_end.guard, phase_end.is_timed_out)
         if phase.can_come_to_rest:
             is_at_rest = phase.is_at_rest(phase_end.q, phase_end.v, options.atol)
             phase_outcome = replace_rest_outcome(phase_outcome, is_at_rest)
-        outcome = jnp.where(is_active, phase_outcome, outcome)
+        step_outcome = jnp.where(is_phase_active, phase_outcome, step_outcome)
         phase_starts.append(start_state)
         phase_ends.append(phase_end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.
-        phases_happened.append(
-            is_active if phase is phases[-1] else is_active & (phase_end.duration > 0.0)
+        phase_occurrences.append(
+            is_phase_active
+            if phase is remaining_phases[-1]
+            else is_phase_active & (phase_end.duration > 0.0)
         )
-    return _LastPhases(tuple(phase_starts), tuple(phase_ends), tuple(phases_happened), outcome)
+    return _RemainingPhases(
+        tuple(phase_starts), tuple(phase_ends), tuple(phase_occurrences), step_outcome
+    )
 
 
 def finish_step(
-    run_phase: PhaseRunner,
+    integrate_phase: PhaseRunner,
     params: WheelParams,
     phase_index: int,
-    distance: Elementwise,
-    state: Vector,
+    foot_distance: Elementwise,
+    phase_state: Vector,
     options: StepOptions,
     stop_at_lift_off: bool,
     engine: str,
@@ -176,44 +199,65 @@ def finish_step(
     """Return the end of a step on flat ground, from a state within one of its phases.
 
     - `phase_index`: index of the phase in the step;
-    - `distance`: distance between both feet in the double support of the step, m;
-    - `state`: (theta, L1, L2) and their rates; those that follow from others in the phase are
-      ignored.
+    - `foot_distance`: distance between both feet in the double support of the step, m;
+    - `phase_state`: (theta, L1, L2) and their rates; entries that follow from others in the phase
+      are ignored.
     """
-    is_bounded = [jnp.abs(value) < MAX_SI_VALUE for value in (*state, distance)]
-    is_valid = params.is_in_domain() & functools.reduce(operator.and_, is_bounded)
-    is_valid = is_valid & (jnp.abs(state[0]) < 0.5 * jnp.pi)
-    params, (theta, *lengths_and_rates) = replace_invalid(
-        is_valid, params, state, SAFE_SINGLE_SUPPORT_STATE
+    bounded_inputs = [
+        jnp.abs(input_value) < MAX_SI_VALUE for input_value in (*phase_state, foot_distance)
+    ]
+    is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, bounded_inputs)
+    is_valid_state = is_valid_state & (jnp.abs(phase_state[0]) < 0.5 * jnp.pi)
+    params, (wheel_angle, *lengths_and_rates) = replace_invalid_inputs(
+        is_valid_state, params, phase_state, SAFE_SINGLE_SUPPORT_STATE
     )
-    phases = make_phases(params.symbols(), distance, stop_at_lift_off)[phase_index:]
-    motion = Motion.from_angle(theta, *lengths_and_rates)
-    last_phases = _run_last_phases(run_phase, phases, theta, motion, is_valid, is_valid, options)
-    phase_ends, has_stepped = last_phases.phase_ends, last_phases.outcome == Outcome.STEPPED
+    remaining_phases = make_phases(params.symbols(), foot_distance, stop_at_lift_off)[phase_index:]
+    wheel_motion = Motion.from_angle(wheel_angle, *lengths_and_rates)
+    remaining_results = _run_remaining_phases(
+        integrate_phase,
+        remaining_phases,
+        wheel_angle,
+        wheel_motion,
+        is_valid_state,
+        is_valid_state,
+        options,
+    )
+    phase_ends, has_stepped = (
+        remaining_results.phase_ends,
+        remaining_results.outcome == Outcome.STEPPED,
+    )
     section_state = phase_ends[-1].q[0], *phase_ends[-1].v
-    durations = [jnp.zeros_like(theta)] * phase_index + [end.duration for end in phase_ends]
+    phase_durations = [jnp.zeros_like(wheel_angle)] * phase_index + [
+        phase_end.duration for phase_end in phase_ends
+    ]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
-        durations=jnp.stack(durations),
-        outcome=last_phases.outcome,
-        solver_steps=functools.reduce(operator.add, [end.n_solver_steps for end in phase_ends]),
+        durations=jnp.stack(phase_durations),
+        outcome=remaining_results.outcome,
+        solver_steps=functools.reduce(
+            operator.add, [phase_end.n_solver_steps for phase_end in phase_ends]
+        ),
         engine=engine,
     )
 
 
-def next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
-    """Return (theta-, dtheta-, dL1-) at the end of the step, in the frame of the line of the next
-    landing.
+def get_next_section_state(phase_sequence: PhaseSequenceResult) -> Vector:
+    """Return (theta-, dtheta-, dL1-) at the end of the step in rad, rad/s and m/s.
 
-    The units are rad, rad/s and m/s.
+    The angle is in the frame of the line of the next landing.
     """
-    theta, rates = phase_sequence.phase_ends[2].q[0], phase_sequence.phase_ends[2].v
-    return (theta if phase_sequence.tilt is None else theta - phase_sequence.tilt), *rates
+    touchdown_angle, touchdown_rates = (
+        phase_sequence.phase_ends[2].q[0],
+        phase_sequence.phase_ends[2].v,
+    )
+    return (
+        touchdown_angle if phase_sequence.tilt is None else touchdown_angle - phase_sequence.tilt
+    ), *touchdown_rates
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
     """Return the minimal results of a step; the section state is zero if the step failed."""
-    theta, dtheta, dL1 = next_section_state(phase_sequence)
+    theta, dtheta, dL1 = get_next_section_state(phase_sequence)
     has_stepped = phase_sequence.outcome == Outcome.STEPPED
     solver_steps = [phase_end.n_solver_steps for phase_end in phase_sequence.phase_ends]
     return AdvanceResult(
@@ -230,16 +274,22 @@ def make_step_result(
 ) -> StepResult:
     """Return all results of a step, for one wheel or a batch.
 
-    The margins must have been recorded.
+    The phase results must contain the minima of the margins.
     """
-    s, landing, phase_ends = phase_sequence.s, phase_sequence.landing, phase_sequence.phase_ends
+    s, landing_result, phase_ends = (
+        phase_sequence.s,
+        phase_sequence.landing,
+        phase_sequence.phase_ends,
+    )
     has_begun = phase_sequence.outcome != Outcome.BAD_INPUT
     hits_stopper, has_stepped = (
-        phase_sequence.phases_happened[2],
+        phase_sequence.phase_occurrences[2],
         phase_sequence.outcome == Outcome.STEPPED,
     )
-    dls, sls1, sls2 = make_phases(s, landing.distance, stop_at_lift_off=True)
-    liftoff_motion = dls.motion_at(phase_ends[0].q, phase_ends[0].v)
+    double_support, single_support_1, single_support_2 = make_phases(
+        s, landing_result.distance, stop_at_lift_off=True
+    )
+    liftoff_motion = double_support.motion_at(phase_ends[0].q, phase_ends[0].v)
     stopper_state = [
         jnp.where(hits_stopper, x, jnp.asarray(safe_value, x.dtype))
         for x, safe_value in zip(
@@ -247,29 +297,34 @@ def make_step_result(
         )
     ]
     stopper_hit = transitions.hit_stopper(
-        s, sls1.motion_at(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
+        s, single_support_1.motion_at(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
     )
-    last_motion = sls2.motion_at(phase_ends[2].q, phase_ends[2].v)
+    last_motion = single_support_2.motion_at(phase_ends[2].q, phase_ends[2].v)
     initial_energy, final_energy = (
-        dynamics.mechanical_energy(s, m).total for m in (landing.motion, last_motion)
+        dynamics.mechanical_energy(s, m).total for m in (landing_result.motion, last_motion)
     )
-    fore_force, rear_force = transitions.landing_forces(s, landing)
+    fore_force, rear_force = transitions.landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)
     return StepResult(
         section_state=advance_result.section_state,
         post_impact=jnp.stack(
-            [jnp.where(has_begun, x, 0.0) for x in (landing.theta, landing.motion.dtheta)]
+            [
+                jnp.where(has_begun, x, 0.0)
+                for x in (landing_result.theta, landing_result.motion.dtheta)
+            ]
         ),
         durations=advance_result.durations,
-        step_length=jnp.where(has_begun, landing.distance, 0.0),
+        step_length=jnp.where(has_begun, landing_result.distance, 0.0),
         indicators=DoubleSupportIndicators(
-            lambda_I4=jnp.where(has_begun, landing.rear_impulse.normal, 0.0),
+            lambda_I4=jnp.where(has_begun, landing_result.rear_impulse.normal, 0.0),
             lambda_2=jnp.where(has_begun, fore_force.normal, 0.0),
             lambda_4=jnp.where(has_begun, rear_force.normal, 0.0),
         ),
-        margins=_make_margins(phase_sequence, rear_force, liftoff_motion, stopper_hit, friction),
+        margins=_make_step_margins(
+            phase_sequence, rear_force, liftoff_motion, stopper_hit, friction
+        ),
         energy=EnergyLoss(
-            landing=jnp.where(has_begun, landing.energy_lost, 0.0),
+            landing=jnp.where(has_begun, landing_result.energy_lost, 0.0),
             stopper=jnp.where(hits_stopper, stopper_hit.energy_lost, 0.0),
             damping=jnp.where(
                 has_stepped, initial_energy - final_energy - stopper_hit.energy_lost, 0.0
@@ -281,49 +336,62 @@ def make_step_result(
     )
 
 
-def make_trajectory(phase_sequence: PhaseSequenceResult, samples: Sequence[Array]) -> Trajectory:
+def make_trajectory(
+    phase_sequence: PhaseSequenceResult, phase_samples: Sequence[Array]
+) -> Trajectory:
     """Return the trajectory of a step from samples at equal times of each phase.
 
-    - `samples`: of each phase, with axes (sample, coordinates and rates, ...).
+    - `phase_samples`: samples of each phase, with axes (sample, coordinates and rates, ...).
     """
     advance_result = make_advance_result(phase_sequence, "")
-    durations, n_samples = advance_result.durations, len(samples[0])
-    start_times = jnp.stack([0.0 * durations[0], durations[0], durations[0] + durations[1]])
+    phase_durations, n_samples = advance_result.durations, len(phase_samples[0])
+    start_times = jnp.stack(
+        [0.0 * phase_durations[0], phase_durations[0], phase_durations[0] + phase_durations[1]]
+    )
     time_fractions = jnp.linspace(0.0, 1.0, n_samples).reshape(
-        -1, *(1 for _ in durations.shape[1:])
+        -1, *(1 for _ in phase_durations.shape[1:])
     )
     phase_arrays = [
-        evaluate_states(phase, jnp.moveaxis(states, 1, 0))
-        for phase, states in zip(phase_sequence.phases, samples, strict=True)
+        evaluate_phase_states(phase, jnp.moveaxis(phase_states, 1, 0))
+        for phase, phase_states in zip(phase_sequence.phases, phase_samples, strict=True)
     ]
-    states, forces, energies = (
-        jnp.stack([jnp.moveaxis(phase_rows, 0, 1) for phase_rows in arrays])
-        for arrays in zip(*phase_arrays, strict=True)
+    phase_states, foot_forces, phase_energies = (
+        jnp.stack([jnp.moveaxis(phase_array, 0, 1) for phase_array in arrays_by_phase])
+        for arrays_by_phase in zip(*phase_arrays, strict=True)
     )
-    times = start_times[:, None] + time_fractions * durations[:, None]
-    end_state = advance_result.section_state, durations, advance_result.outcome
-    return Trajectory(times, states, forces, energies, *end_state)
+    sample_times = start_times[:, None] + time_fractions * phase_durations[:, None]
+    end_state = advance_result.section_state, phase_durations, advance_result.outcome
+    return Trajectory(sample_times, phase_states, foot_forces, phase_energies, *end_state)
 
 
-def evaluate_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
+def evaluate_phase_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array, Array]:
     """Return coordinates with rates, ground forces (N) and energies (J) at states of a phase.
 
-    - `y`: the phase's coordinates, then their rates, on the first axis. Results have the same other
-      axes.
+    - `y`: the phase's coordinates, then their rates, on the first axis. All results have the other
+      axes of `y`.
     """
     coordinates = tuple(y)
-    motion = phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
-    instant = PhaseInstant(phase, motion, None)
-    zero = 0.0 * motion.L1
-    rear_force = instant.rear_force or dynamics.FootForce(zero, zero)
+    wheel_motion = phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
+    phase_instant = PhaseInstant(phase, wheel_motion, None)
+    zero = 0.0 * wheel_motion.L1
+    rear_force = phase_instant.rear_force or dynamics.FootForce(zero, zero)
     return (
-        jnp.stack([y[0], motion.L1, motion.L2, motion.dtheta, motion.dL1, motion.dL2]),
-        jnp.stack([*instant.fore_force, *rear_force]),
-        jnp.stack(dynamics.mechanical_energy(phase.s, motion)),
+        jnp.stack(
+            [
+                y[0],
+                wheel_motion.L1,
+                wheel_motion.L2,
+                wheel_motion.dtheta,
+                wheel_motion.dL1,
+                wheel_motion.dL2,
+            ]
+        ),
+        jnp.stack([*phase_instant.fore_force, *rear_force]),
+        jnp.stack(dynamics.mechanical_energy(phase.s, wheel_motion)),
     )
 
 
-def _make_margins(
+def _make_step_margins(
     phase_sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
@@ -336,60 +404,65 @@ def _make_margins(
     - `liftoff_motion`: motion at the end of double support;
     - `stopper_hit`: collision of Leg 2 with its stopper.
     """
-    s, landing, phases_happened = (
+    s, landing_result, phase_occurrences = (
         phase_sequence.s,
         phase_sequence.landing,
-        phase_sequence.phases_happened,
+        phase_sequence.phase_occurrences,
     )
-    has_begun, hits_stopper = phase_sequence.outcome != Outcome.BAD_INPUT, phases_happened[2]
-    margin_rows = [
+    has_begun, hits_stopper = phase_sequence.outcome != Outcome.BAD_INPUT, phase_occurrences[2]
+    recorded_minima = [
         phase_end.margin_minima
         for phase_end in phase_sequence.phase_ends
         if phase_end.margin_minima is not None
     ]
     phase_minima = [
-        PhaseMargins.from_values(tuple(phase_margins), s.n) for phase_margins in margin_rows
+        PhaseMargins.from_values(tuple(phase_margins), s.n) for phase_margins in recorded_minima
     ]
 
-    def lowest_margin(margin_name: str, *phase_indices: int) -> Array:
-        """Return the minimum of a margin over those phases that happened; 0 if none did."""
-        value: Any = jnp.inf
+    def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:
+        """Return the minimum of a margin over those of the phases that happened, or 0 if none
+        happened."""
+        lowest_value: Any = jnp.inf
         for phase_index in phase_indices:
             phase_minimum = jnp.asarray(getattr(phase_minima[phase_index], margin_name))
-            value = jnp.minimum(
-                value, jnp.where(phases_happened[phase_index], phase_minimum, jnp.inf)
+            lowest_value = jnp.minimum(
+                lowest_value, jnp.where(phase_occurrences[phase_index], phase_minimum, jnp.inf)
             )
-        return jnp.where(jnp.isfinite(value), value, 0.0)
+        return jnp.where(jnp.isfinite(lowest_value), lowest_value, 0.0)
 
-    def friction_margin(force: dynamics.FootForce, is_loaded: Array) -> Array:
-        required = jnp.where(is_loaded, dynamics.required_friction(force), 0.0)
-        return jnp.where(has_begun, friction - required, 0.0)
+    def compute_friction_margin(foot_force: dynamics.FootForce, is_loaded: Array) -> Array:
+        required_friction = jnp.where(is_loaded, dynamics.required_friction(foot_force), 0.0)
+        return jnp.where(has_begun, friction - required_friction, 0.0)
 
-    def stopper_impulses(motion: Motion, hub_jump: tuple, has_collision: Array) -> Array:
-        impulses = transitions.locked_leg_impulses(s, motion, hub_jump, range(3, s.n + 1))
-        return jnp.where(has_collision, impulses, 0.0)
+    def compute_stopper_impulses(
+        motion_after: Motion, hub_jump: tuple, has_collision: Array
+    ) -> Array:
+        leg_impulses = transitions.locked_leg_impulses(s, motion_after, hub_jump, range(3, s.n + 1))
+        return jnp.where(has_collision, leg_impulses, 0.0)
 
     return Margins(
-        fore_foot_force=lowest_margin("fore_foot_force", 0, 1, 2),
+        fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
-            phases_happened[1] & landing.keeps_rear_foot,
+            phase_occurrences[1] & landing_result.keeps_rear_foot,
             dynamics.takeoff_acceleration(s, liftoff_motion),
             0.0,
         ),
-        clearance_sls1=lowest_margin("rear_clearance", 1),
-        clearance_sls2=lowest_margin("rear_clearance", 2),
-        locked_stopper_force=lowest_margin("locked_stopper_force", 0, 1, 2),
-        rear_stopper_force=lowest_margin("rear_stopper_force", 2),
-        contraction=lowest_margin("contraction", 0, 1, 2),
-        friction_fore=jnp.where(has_begun, friction + lowest_margin("friction", 0, 1, 2), 0.0),
-        friction_rear=friction_margin(rear_force, phases_happened[0]),
-        landing_stopper_impulse=stopper_impulses(landing.motion, landing.hub_jump, has_begun),
-        hit_stopper_impulse=stopper_impulses(
+        clearance_sls1=find_lowest_margin("rear_clearance", 1),
+        clearance_sls2=find_lowest_margin("rear_clearance", 2),
+        locked_stopper_force=find_lowest_margin("locked_stopper_force", 0, 1, 2),
+        rear_stopper_force=find_lowest_margin("rear_stopper_force", 2),
+        contraction=find_lowest_margin("contraction", 0, 1, 2),
+        friction_fore=jnp.where(has_begun, friction + find_lowest_margin("friction", 0, 1, 2), 0.0),
+        friction_rear=compute_friction_margin(rear_force, phase_occurrences[0]),
+        landing_stopper_impulse=compute_stopper_impulses(
+            landing_result.motion, landing_result.hub_jump, has_begun
+        ),
+        hit_stopper_impulse=compute_stopper_impulses(
             stopper_hit.motion, stopper_hit.hub_jump, hits_stopper
         ),
         hit_planted_impulse=jnp.where(hits_stopper, stopper_hit.foot_impulse.normal, 0.0),
-        landing_friction_fore=friction_margin(landing.fore_impulse, has_begun),
-        landing_friction_rear=friction_margin(
-            landing.rear_impulse, has_begun & landing.keeps_rear_foot
+        landing_friction_fore=compute_friction_margin(landing_result.fore_impulse, has_begun),
+        landing_friction_rear=compute_friction_margin(
+            landing_result.rear_impulse, has_begun & landing_result.keeps_rear_foot
         ),
     )

@@ -1,4 +1,4 @@
-"""Rigid model: all legs are rigid. A step has a closed form; nothing is integrated."""
+"""Rigid model: all legs are rigid, so a step has a closed form and nothing is integrated."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -13,9 +13,9 @@ from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMe
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.step_inputs import (
     SectionState,
-    StateValues,
-    replace_invalid,
-    select_stance_line,
+    SectionStateEntries,
+    replace_invalid_inputs,
+    select_stance_line_and_tilt,
     split_slopes,
 )
 from vrw_jax.models.step_results import (
@@ -42,10 +42,10 @@ from vrw_jax.wheel import (
 
 
 @dataclass(frozen=True)
-class MinimumSearchOptions:
+class MarginMinimumSearchOptions:
     """Options of the search for the minimum of each margin over the angle, by repeated zooming."""
 
-    n_angles: int = 33
+    n_angles_per_round: int = 33
     """Number of angles in each round.
 
     The value is chosen because forces are smooth over the 45 degrees of a step."""
@@ -56,7 +56,7 @@ class MinimumSearchOptions:
     is the square of that."""
 
 
-MINIMUM_SEARCH_OPTIONS = MinimumSearchOptions()
+MARGIN_MINIMUM_SEARCH_OPTIONS = MarginMinimumSearchOptions()
 
 
 class RigidWheel(AbstractWheel):
@@ -105,88 +105,102 @@ class RigidWheel(AbstractWheel):
         exists.
         """
         s = params.symbols()
-        rate_ratio = self._rate_ratio(s)
-        rate_squared_gain = 4.0 * _gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
+        landing_rate_ratio = self._compute_landing_rate_ratio(s)
+        rate_squared_gain = 4.0 * _compute_gravity_stiffness(s) * jnp.sin(0.5 * s.alpha) * s.sin_phi
         rolling_rate = jnp.sqrt(
-            jnp.maximum(rate_squared_gain, 0.1) / (1.0 - rate_ratio * rate_ratio)
+            jnp.maximum(rate_squared_gain, 0.1) / (1.0 - landing_rate_ratio * landing_rate_ratio)
         )
         return jnp.stack([0.5 * s.alpha + 0.0 * rolling_rate, rolling_rate, 0.0 * rolling_rate])
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        result = self.take_step(params, x, options)
+        step_result = self.take_step(params, x, options)
         return AdvanceResult(
-            result.section_state, result.durations, result.outcome, result.solver_steps
+            step_result.section_state,
+            step_result.durations,
+            step_result.outcome,
+            step_result.solver_steps,
         )
 
-    def _rate_ratio(self, s: Symbols) -> Elementwise:
+    def _compute_landing_rate_ratio(self, s: Symbols) -> Elementwise:
         """Return the ratio of the angular rates after and before the landing."""
-        foot_inertia = _foot_inertia(s)
+        foot_inertia = _compute_foot_inertia(s)
         if not self.held_landing:
-            return (s.Mt * s.L0**2 * s.cos_alpha + _hub_inertia(s)) / foot_inertia
+            return (s.Mt * s.L0**2 * s.cos_alpha + _compute_hub_inertia(s)) / foot_inertia
         half_angle = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
-        motion = transitions.land(
+        motion_after_landing = transitions.land(
             s, half_angle, jnp.ones_like(half_angle), jnp.zeros_like(half_angle)
         ).motion
-        M = dynamics.mass_matrix(s, motion.L1, motion.L2)
-        return M.multiply((motion.dtheta, motion.dL1, motion.dL2))[0] / foot_inertia
+        M = dynamics.mass_matrix(s, motion_after_landing.L1, motion_after_landing.L2)
+        return (
+            M.multiply(
+                (motion_after_landing.dtheta, motion_after_landing.dL1, motion_after_landing.dL2)
+            )[0]
+            / foot_inertia
+        )
 
-    def vertical_map(self, params: WheelParams) -> "VerticalMap":
-        """Return the map of the squared rate at the vertical of one stance leg to that of the
-        next."""
+    def make_vertical_rate_map(self, params: WheelParams) -> "VerticalRateMap":
+        """Return the map from the squared rate at the vertical of one stance leg to that at the
+        vertical of the next."""
         s = params.symbols()
-        half_angle, gravity = 0.5 * s.alpha, 2.0 * _gravity_stiffness(s)
-        return VerticalMap(self._rate_ratio(s) ** 2, gravity, half_angle)
+        half_angle, doubled_gravity_stiffness = 0.5 * s.alpha, 2.0 * _compute_gravity_stiffness(s)
+        return VerticalRateMap(
+            self._compute_landing_rate_ratio(s) ** 2, doubled_gravity_stiffness, half_angle
+        )
 
     @eqx.filter_jit
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
         return self.compute_step_elementwise(params, tuple(x), jnp.asarray(self.friction, x.dtype))
 
     def compute_step_elementwise(
-        self, params: WheelParams, x: StateValues, friction: Elementwise
+        self, params: WheelParams, x: SectionStateEntries, friction: Elementwise
     ) -> StepResult:
         """Return the results of a step elementwise, for one wheel or a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
-        params, is_valid, tilt = select_stance_line(params, x)
-        end_angle = half_angle if tilt is None else half_angle + tilt
-        params, x = replace_invalid(is_valid, params, x, (half_angle, 1.0, 0.0))
+        params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
+        end_angle = half_angle if next_line_tilt is None else half_angle + next_line_tilt
+        params, x = replace_invalid_inputs(is_valid_step, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
-        rate_before, rate_after = x[1], self._rate_ratio(s) * x[1]
+        rate_before, rate_after = x[1], self._compute_landing_rate_ratio(s) * x[1]
         rolling_motion = RollingMotion(
-            s, params.slope, rate_after, None if tilt is None else end_angle
+            s, params.slope, rate_after, None if next_line_tilt is None else end_angle
         )
 
         apex_angle = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
-        passes_apex = rolling_motion.rate_squared_at_angle(apex_angle) > 0.0
+        passes_apex = rolling_motion.compute_squared_rate(apex_angle) > 0.0
         margin_minima = rolling_motion.find_margin_minima()
         has_lifted_off = (margin_minima[0] <= 0.0) & passes_apex & self.stop_at_lift_off
-        outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
-        outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
-        outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
-        has_stepped = outcome == Outcome.STEPPED
+        step_outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        step_outcome = jnp.where(is_valid_step, step_outcome, jnp.int32(Outcome.BAD_INPUT))
+        has_stepped = step_outcome == Outcome.STEPPED
         safe_rolling_motion = RollingMotion(
             s, params.slope, jnp.where(passes_apex, rate_after, 10.0)
         )
-        end_rate, duration = (
-            jnp.sqrt(safe_rolling_motion.rate_squared_at_angle(end_angle)),
-            safe_rolling_motion.time_at_angle(end_angle),
+        end_rate, rolling_duration = (
+            jnp.sqrt(safe_rolling_motion.compute_squared_rate(end_angle)),
+            safe_rolling_motion.compute_time_to_angle(end_angle),
         )
 
         zero = jnp.zeros_like(rate_before)
-        zero_if_invalid = lambda value: jnp.where(is_valid, value, jnp.zeros_like(value))
-        zero_unless_stepped = lambda value: jnp.where(has_stepped, value, jnp.zeros_like(value))
-        rear_impulse, friction_margins, stopper_impulse = self._landing_impulses(
+        zero_if_invalid = lambda step_quantity: jnp.where(
+            is_valid_step, step_quantity, jnp.zeros_like(step_quantity)
+        )
+        zero_unless_stepped = lambda step_quantity: jnp.where(
+            has_stepped, step_quantity, jnp.zeros_like(step_quantity)
+        )
+        rear_impulse, friction_margins, stopper_impulse = self._compute_landing_impulses(
             s, x, rolling_motion, friction
         )
         return StepResult(
             section_state=zero_unless_stepped(jnp.stack([half_angle + zero, end_rate, zero])),
             post_impact=zero_if_invalid(jnp.stack([-half_angle + zero, rate_after])),
-            durations=zero_unless_stepped(jnp.stack([zero, zero, duration])),
+            durations=zero_unless_stepped(jnp.stack([zero, zero, rolling_duration])),
             step_length=zero_if_invalid(2.0 * s.L0 * jnp.sin(half_angle)),
             indicators=DoubleSupportIndicators(
                 lambda_I4=zero_if_invalid(rear_impulse.normal),
                 lambda_2=zero_if_invalid(
-                    rolling_motion.foot_force_at_angle(-half_angle + zero).normal
+                    rolling_motion.compute_foot_force_at_angle(-half_angle + zero).normal
                 ),
                 lambda_4=zero,
             ),
@@ -195,7 +209,7 @@ class RigidWheel(AbstractWheel):
                 takeoff_acceleration=zero,
                 clearance_sls1=zero,
                 clearance_sls2=zero_unless_stepped(
-                    rear_foot_height(s, rolling_motion.motion_at_angle(end_angle + zero))
+                    rear_foot_height(s, rolling_motion.compute_motion_at_angle(end_angle + zero))
                 ),
                 locked_stopper_force=zero_unless_stepped(margin_minima[3:]),
                 rear_stopper_force=zero_unless_stepped(margin_minima[2]),
@@ -210,13 +224,15 @@ class RigidWheel(AbstractWheel):
             ),
             energy=EnergyLoss(
                 landing=zero_if_invalid(
-                    0.5 * _foot_inertia(s) * (rate_before * rate_before - rate_after * rate_after)
+                    0.5
+                    * _compute_foot_inertia(s)
+                    * (rate_before * rate_before - rate_after * rate_after)
                 ),
                 stopper=zero,
                 damping=zero,
             ),
-            outcome=outcome,
-            solver_steps=jnp.zeros_like(outcome),
+            outcome=step_outcome,
+            solver_steps=jnp.zeros_like(step_outcome),
         )
 
     def finish_step(
@@ -228,41 +244,52 @@ class RigidWheel(AbstractWheel):
         options: StepOptions,
     ) -> AdvanceResult:
         """Return the end of the step from theta and its rate; other arguments have no effect."""
-        theta, rate = state[0], state[3]
-        s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, theta.dtype)
-        rolling_motion = RollingMotion(s, params.slope, rate, given_first_angle=theta)
-        apex_angle = jnp.maximum(theta, -params.slope)
-        passes_apex = (rate > 0.0) & (rolling_motion.rate_squared_at_angle(apex_angle) > 0.0)
-        angles = theta + (half_angle - theta) * jnp.linspace(
-            0.0, 1.0, MINIMUM_SEARCH_OPTIONS.n_angles
+        wheel_angle, angular_rate = state[0], state[3]
+        s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
+        rolling_motion = RollingMotion(s, params.slope, angular_rate, given_first_angle=wheel_angle)
+        apex_angle = jnp.maximum(wheel_angle, -params.slope)
+        passes_apex = (angular_rate > 0.0) & (rolling_motion.compute_squared_rate(apex_angle) > 0.0)
+        sampled_angles = wheel_angle + (half_angle - wheel_angle) * jnp.linspace(
+            0.0, 1.0, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_round
         )
-        lowest_force = jnp.min(rolling_motion.foot_force_at_angle(angles).normal)
-        has_lifted_off = passes_apex & (lowest_force <= 0.0) & self.stop_at_lift_off
-        outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
-        outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
-        has_stepped, zero = outcome == Outcome.STEPPED, jnp.zeros_like(rate)
-        safe_rate = jnp.where(has_stepped, rate, 10.0)
-        safe_motion = RollingMotion(s, params.slope, safe_rate, given_first_angle=theta)
-        end_rate = jnp.sqrt(safe_motion.rate_squared_at_angle(half_angle))
+        lowest_normal_force = jnp.min(
+            rolling_motion.compute_foot_force_at_angle(sampled_angles).normal
+        )
+        has_lifted_off = passes_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
+        step_outcome = jnp.where(passes_apex, Outcome.STEPPED, Outcome.FELL_BACK).astype(jnp.int32)
+        step_outcome = jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        has_stepped, zero = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
+        safe_rate = jnp.where(has_stepped, angular_rate, 10.0)
+        safe_rolling_motion = RollingMotion(
+            s, params.slope, safe_rate, given_first_angle=wheel_angle
+        )
+        end_rate = jnp.sqrt(safe_rolling_motion.compute_squared_rate(half_angle))
         section_state = jnp.stack([half_angle + zero, end_rate, zero])
-        durations = jnp.stack([zero, zero, safe_motion.time_at_angle(half_angle)])
+        phase_durations = jnp.stack(
+            [zero, zero, safe_rolling_motion.compute_time_to_angle(half_angle)]
+        )
         return AdvanceResult(
             section_state=jnp.where(has_stepped, section_state, 0.0),
-            durations=jnp.where(has_stepped, durations, 0.0),
-            outcome=outcome,
-            solver_steps=jnp.zeros_like(outcome),
+            durations=jnp.where(has_stepped, phase_durations, 0.0),
+            outcome=step_outcome,
+            solver_steps=jnp.zeros_like(step_outcome),
         )
 
-    def _landing_impulses(
-        self, s: Symbols, x: StateValues, rolling_motion: "RollingMotion", friction: Elementwise
+    def _compute_landing_impulses(
+        self,
+        s: Symbols,
+        x: SectionStateEntries,
+        rolling_motion: "RollingMotion",
+        friction: Elementwise,
     ) -> tuple:
-        """Return the impulses (N s) and friction margins of the landing.
+        """Return the impulse at the rear foot (N s), the friction margins of both feet, and the
+        stopper impulses (N s).
 
-        The results are the impulse at the rear foot, the friction margins of fore and rear foot,
-        and the stopper impulses of legs 3..n.
+        The friction margins are those of fore and rear foot, and the stopper impulses those of legs
+        3..n.
         """
         zero = jnp.zeros_like(x[1])
-        motion_after = rolling_motion.motion_at_angle(
+        motion_after = rolling_motion.compute_motion_at_angle(
             -jnp.asarray(0.5 * s.alpha, zero.dtype) + zero
         )
         hub_jump = transitions.hub_velocity_jump(
@@ -292,28 +319,34 @@ class RigidWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
         """Return the motion of a step at equal angles instead of equal times."""
-        result = self.take_step(params, x, options)
+        step_result = self.take_step(params, x, options)
         params, next_slope = split_slopes(params)
         s, half_angle = params.symbols(), 0.5 * params.leg_angle
         end_angle = half_angle if next_slope is None else half_angle + next_slope - params.slope
-        rolling_motion = RollingMotion(s, params.slope, result.post_impact[1])
+        rolling_motion = RollingMotion(s, params.slope, step_result.post_impact[1])
         start_angles = jnp.full((n_samples,), -0.5 * s.alpha)
         rolling_angles = jnp.where(
-            result.outcome == Outcome.STEPPED,
+            step_result.outcome == Outcome.STEPPED,
             jnp.linspace(-0.5 * s.alpha, end_angle, n_samples),
             start_angles,
         )
-        angles = jnp.stack([start_angles, start_angles, rolling_angles])
+        sampled_angles = jnp.stack([start_angles, start_angles, rolling_angles])
 
-        state, forces, energy = (
+        sampled_states, foot_forces, sampled_energies = (
             jnp.moveaxis(sample_rows, 0, -1)
-            for sample_rows in rolling_motion.evaluate_states(angles)
+            for sample_rows in rolling_motion.evaluate_states_at_angles(sampled_angles)
         )
-        end_state = result.section_state, result.durations, result.outcome
-        return Trajectory(rolling_motion.time_at_angle(angles), state, forces, energy, *end_state)
+        end_state = step_result.section_state, step_result.durations, step_result.outcome
+        return Trajectory(
+            rolling_motion.compute_time_to_angle(sampled_angles),
+            sampled_states,
+            foot_forces,
+            sampled_energies,
+            *end_state,
+        )
 
 
-class VerticalMap(NamedTuple):
+class VerticalRateMap(NamedTuple):
     """Map x' = r (x + G (1 - cos(h + slope))) - G (1 - cos(h - slope)) at the slope of the next
     line.
 
@@ -323,12 +356,12 @@ class VerticalMap(NamedTuple):
     """
 
     retained_fraction: Elementwise  # r, retained fraction of the squared rate in a landing
-    gravity: Elementwise  # G, twice the gravity stiffness, 1/s^2
+    doubled_gravity_stiffness: Elementwise  # G, twice the gravity stiffness, 1/s^2
     half_angle: float  # h, half of the angle between two legs, rad
 
     @property
-    def _components(self) -> tuple[Elementwise, Elementwise]:
-        """Return the coefficients of x' for the cosine and the sine of the slope, divided by G."""
+    def _cosine_and_sine_coefficients(self) -> tuple[Elementwise, Elementwise]:
+        """Return the coefficients of cosine and sine of the slope in x', divided by G."""
         r, h = self.retained_fraction, self.half_angle
         return (1.0 - r) * jnp.cos(h), (1.0 + r) * jnp.sin(h)
 
@@ -337,23 +370,27 @@ class VerticalMap(NamedTuple):
         """Return the slope at which x' is largest, rad. At smaller slopes, x' grows with the
         slope.
         """
-        cosine, sine = self._components
-        return jnp.arctan2(sine, cosine)
+        cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
+        return jnp.arctan2(sine_coefficient, cosine_coefficient)
 
     @property
-    def amplitude(self) -> Elementwise:
+    def slope_amplitude(self) -> Elementwise:
         """Return the amplitude of x' over the slope, 1/s^2."""
-        cosine, sine = self._components
-        return self.gravity * jnp.sqrt(cosine**2 + sine**2)
+        cosine_coefficient, sine_coefficient = self._cosine_and_sine_coefficients
+        return self.doubled_gravity_stiffness * jnp.sqrt(
+            cosine_coefficient**2 + sine_coefficient**2
+        )
 
-    def offset(self, x: Elementwise) -> Elementwise:
+    def compute_slope_independent_part(self, x: Elementwise) -> Elementwise:
         """Return the part of x' that does not depend on the slope, 1/s^2."""
-        return self.retained_fraction * x - self.gravity * (1.0 - self.retained_fraction)
+        return self.retained_fraction * x - self.doubled_gravity_stiffness * (
+            1.0 - self.retained_fraction
+        )
 
-    def fixed_point(self, slope: Elementwise) -> Elementwise:
+    def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
         """Return the x that repeats on lines of this slope (rad), 1/s^2."""
-        periodic_part = self.amplitude * jnp.cos(slope - self.slope_of_maximum)
-        return periodic_part / (1.0 - self.retained_fraction) - self.gravity
+        periodic_part = self.slope_amplitude * jnp.cos(slope - self.slope_of_maximum)
+        return periodic_part / (1.0 - self.retained_fraction) - self.doubled_gravity_stiffness
 
 
 class RollingMotion(eqx.Module):
@@ -374,22 +411,23 @@ class RollingMotion(eqx.Module):
             return -0.5 * self.s.alpha
         return self.given_first_angle
 
-    def rate_squared_at_angle(self, theta: Elementwise) -> Elementwise:
-        """Return the square of dtheta at theta, rad^2/s^2; negative if the wheel does not
-        arrive.
-        """
+    def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
+        """Return the square of dtheta at theta, rad^2/s^2. It is negative if the wheel does not
+        reach theta."""
         s = self.s
-        height_drop = _cos_from_vertical(s, self.first_angle) - _cos_from_vertical(s, theta)
-        return self.initial_rate**2 + 2.0 * _gravity_stiffness(s) * height_drop
+        height_drop = _compute_cosine_from_vertical(
+            s, self.first_angle
+        ) - _compute_cosine_from_vertical(s, theta)
+        return self.initial_rate**2 + 2.0 * _compute_gravity_stiffness(s) * height_drop
 
-    def time_at_angle(self, theta: Elementwise) -> Elementwise:
+    def compute_time_to_angle(self, theta: Elementwise) -> Elementwise:
         """Return the time from the first angle to theta, s, by Carlson's R_F.
 
         Let t be sin^2 of half the angle from the vertical. The rate is the square root of a linear
-        function of t. So time is the complete cubic form of the elliptic integral.
+        function of t. So the time is the complete cubic form of the elliptic integral.
         """
         s = self.s
-        kappa = 2.0 * _gravity_stiffness(s)
+        kappa = 2.0 * _compute_gravity_stiffness(s)
         begin_half_angle, end_half_angle = (
             0.5 * (self.phi + self.first_angle),
             0.5 * (self.phi + theta),
@@ -398,7 +436,7 @@ class RollingMotion(eqx.Module):
         min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * begin_half_angle) - 1.0)
         is_across_vertical = begin_half_angle * end_half_angle < 0.0
         zero_squared = jnp.zeros_like(end_half_angle)
-        time_to_end = _rolling_time(
+        time_to_end = _compute_rolling_time(
             jnp.where(
                 is_across_vertical,
                 zero_squared,
@@ -412,7 +450,7 @@ class RollingMotion(eqx.Module):
             min_rate_squared,
             kappa,
         )
-        time_to_vertical = _rolling_time(
+        time_to_vertical = _compute_rolling_time(
             zero_squared,
             jnp.where(is_across_vertical, begin_half_angle**2, 0.0),
             min_rate_squared,
@@ -420,63 +458,82 @@ class RollingMotion(eqx.Module):
         )
         return time_to_end + time_to_vertical
 
-    def motion_at_angle(self, theta: Elementwise) -> Motion:
-        """Return the motion at theta; its rate is zero if the wheel does not arrive."""
+    def compute_motion_at_angle(self, theta: Elementwise) -> Motion:
+        """Return the motion at theta. Its rate is zero if the wheel does not reach theta."""
         zero = 0.0 * theta
-        speed_squared = self.rate_squared_at_angle(theta)
-        is_moving = speed_squared > 0.0
-        angular_rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, speed_squared, 1.0)), 0.0)
+        squared_rate = self.compute_squared_rate(theta)
+        is_moving = squared_rate > 0.0
+        angular_rate = jnp.where(is_moving, jnp.sqrt(jnp.where(is_moving, squared_rate, 1.0)), 0.0)
         leg_length = self.s.L0 + zero
         return Motion.from_angle(theta, leg_length, leg_length, angular_rate, zero, zero)
 
-    def acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
-        """Return the angular acceleration under gravity, rad/s^2; the legs do not move."""
+    def compute_acceleration_at_angle(self, theta: Elementwise) -> dynamics.Acceleration:
+        """Return the angular acceleration under gravity, rad/s^2, with legs of constant length."""
         zero = 0.0 * theta
         sin_p = jnp.sin(theta) * self.s.cos_phi + jnp.cos(theta) * self.s.sin_phi
-        return dynamics.Acceleration(_gravity_stiffness(self.s) * sin_p, zero, zero)
+        return dynamics.Acceleration(_compute_gravity_stiffness(self.s) * sin_p, zero, zero)
 
-    def foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
-        """Return the force of the ground on the stance foot, N."""
+    def compute_foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
+        """Return the force of the ground on the stance foot at theta, N."""
         return dynamics.fore_foot_force(
-            self.s, self.motion_at_angle(theta), self.acceleration_at_angle(theta)
+            self.s, self.compute_motion_at_angle(theta), self.compute_acceleration_at_angle(theta)
         )
 
-    def stopper_force_at_angle(self, theta: Elementwise, legs: range) -> Float[Array, "n ..."]:
-        """Return the forces of the stoppers of `legs`, N."""
+    def compute_stopper_force_at_angle(
+        self, theta: Elementwise, legs: range
+    ) -> Float[Array, "n ..."]:
+        """Return the forces of the stoppers of `legs` at theta, N."""
         return dynamics.stopper_force(
-            self.s, self.motion_at_angle(theta), self.acceleration_at_angle(theta), legs
+            self.s,
+            self.compute_motion_at_angle(theta),
+            self.compute_acceleration_at_angle(theta),
+            legs,
         )
 
-    def evaluate_states(self, theta: Elementwise) -> tuple[Array, Array, Array]:
+    def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
         """Return coordinates with rates, forces of both feet (N) and energies (J) at theta, on the
-        first axis.
-        """
-        motion, foot_force, zero = (
-            self.motion_at_angle(theta),
-            self.foot_force_at_angle(theta),
+        first axis."""
+        wheel_motion, foot_force, zero = (
+            self.compute_motion_at_angle(theta),
+            self.compute_foot_force_at_angle(theta),
             0.0 * theta,
         )
-        state = jnp.stack([theta, motion.L1, motion.L2, motion.dtheta, motion.dL1, motion.dL2])
-        forces = jnp.stack([foot_force.tangential, foot_force.normal, zero, zero])
-        return state, forces, jnp.stack(dynamics.mechanical_energy(self.s, motion))
+        coordinates_and_rates = jnp.stack(
+            [
+                theta,
+                wheel_motion.L1,
+                wheel_motion.L2,
+                wheel_motion.dtheta,
+                wheel_motion.dL1,
+                wheel_motion.dL2,
+            ]
+        )
+        foot_forces = jnp.stack([foot_force.tangential, foot_force.normal, zero, zero])
+        return (
+            coordinates_and_rates,
+            foot_forces,
+            jnp.stack(dynamics.mechanical_energy(self.s, wheel_motion)),
+        )
 
-    def margins_at_angles(self, theta: Array) -> Array:
-        """Return each margin at the angle `theta[i]` of the same index.
+    def evaluate_margins_at_angles(self, theta: Array) -> Array:
+        """Return each margin at its angle, margin i at `theta[i]`.
 
         The margins are the normal force (N), minus the required friction, and the stopper forces of
         legs 2..n (N).
         """
         stopper_forces = [
-            self.stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
+            self.compute_stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
             for leg in range(2, self.s.n + 1)
         ]
-        required_friction = dynamics.required_friction(self.foot_force_at_angle(theta[1]))
+        required_friction = dynamics.required_friction(self.compute_foot_force_at_angle(theta[1]))
         return jnp.stack(
-            [self.foot_force_at_angle(theta[0]).normal, -required_friction, *stopper_forces]
+            [self.compute_foot_force_at_angle(theta[0]).normal, -required_friction, *stopper_forces]
         )
 
-    def find_margin_minima(self, options: MinimumSearchOptions = MINIMUM_SEARCH_OPTIONS) -> Array:
-        """Return the minima of `margins_at_angles` from landing to landing, to round-off.
+    def find_margin_minima(
+        self, search_options: MarginMinimumSearchOptions = MARGIN_MINIMUM_SEARCH_OPTIONS
+    ) -> Array:
+        """Return the minima of `evaluate_margins_at_angles` from landing to landing, to round-off.
 
         Each minimum is found by repeated zooming. The error of a minimum is the square of the
         remaining error of its angle.
@@ -487,55 +544,65 @@ class RollingMotion(eqx.Module):
             0.0 * self.initial_rate if self.end_angle is None else 0.5 * (end_angle - half_angle)
         )
 
-        def zoom_in(_round: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-            center, half_width = bracket
+        def zoom_to_minima(
+            _round: Array, centers_and_half_width: tuple[Array, Array]
+        ) -> tuple[Array, Array]:
+            bracket_centers, half_bracket_width = centers_and_half_width
 
             def compare_with_lowest(
-                i: Array, lowest_so_far: tuple[Array, Array]
+                i: Array, lowest_angles_and_margins: tuple[Array, Array]
             ) -> tuple[Array, Array]:
-                angle_offset = half_width * (i * (2.0 / (options.n_angles - 1)) - 1.0)
-                theta = jnp.clip(center + angle_offset, -half_angle, end_angle)
-                value = self.margins_at_angles(theta)
-                return tree_where(value < lowest_so_far[1], (theta, value), lowest_so_far)
+                angle_offset = half_bracket_width * (
+                    i * (2.0 / (search_options.n_angles_per_round - 1)) - 1.0
+                )
+                candidate_angles = jnp.clip(bracket_centers + angle_offset, -half_angle, end_angle)
+                candidate_margins = self.evaluate_margins_at_angles(candidate_angles)
+                return tree_where(
+                    candidate_margins < lowest_angles_and_margins[1],
+                    (candidate_angles, candidate_margins),
+                    lowest_angles_and_margins,
+                )
 
-            initial_minimum = center, jnp.full_like(center, jnp.inf)
-            lowest_theta, _ = lax.fori_loop(
-                0, options.n_angles, compare_with_lowest, initial_minimum
+            initial_minimum = bracket_centers, jnp.full_like(bracket_centers, jnp.inf)
+            minimum_angles, _ = lax.fori_loop(
+                0, search_options.n_angles_per_round, compare_with_lowest, initial_minimum
             )
-            return lowest_theta, half_width * (2.5 / options.n_angles)
+            return minimum_angles, half_bracket_width * (2.5 / search_options.n_angles_per_round)
 
-        start_angles = jnp.stack([middle_angle] * (1 + self.s.n))
-        half_width = half_angle if self.end_angle is None else 0.5 * (half_angle + end_angle)
-        minimum_angles, _ = lax.fori_loop(
-            0, options.n_zoom_rounds, zoom_in, (start_angles, half_width)
+        bracket_centers = jnp.stack([middle_angle] * (1 + self.s.n))
+        half_bracket_width = (
+            half_angle if self.end_angle is None else 0.5 * (half_angle + end_angle)
         )
-        return self.margins_at_angles(lax.stop_gradient(minimum_angles))
+        minimum_angles, _ = lax.fori_loop(
+            0, search_options.n_zoom_rounds, zoom_to_minima, (bracket_centers, half_bracket_width)
+        )
+        return self.evaluate_margins_at_angles(lax.stop_gradient(minimum_angles))
 
 
-def _hub_inertia(s: Symbols) -> Elementwise:
+def _compute_hub_inertia(s: Symbols) -> Elementwise:
     """Return the moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
     return s.n * s.m * s.c0**2
 
 
-def _foot_inertia(s: Symbols) -> Elementwise:
+def _compute_foot_inertia(s: Symbols) -> Elementwise:
     """Return the moment of inertia of the wheel about a foot, kg m^2."""
-    return s.Mt * s.L0**2 + _hub_inertia(s)
+    return s.Mt * s.L0**2 + _compute_hub_inertia(s)
 
 
-def _gravity_stiffness(s: Symbols) -> Elementwise:
+def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
     """Return Mt g L0 over the inertia about the foot, 1/s^2.
 
     The value is g/l for a rimless wheel without leg masses.
     """
-    return s.Mt * s.g * s.L0 / _foot_inertia(s)
+    return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
 
-def _cos_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
+def _compute_cosine_from_vertical(s: Symbols, theta: Elementwise | float) -> Elementwise:
     """Return the cosine of the angle from the vertical, theta + phi."""
     return jnp.cos(theta) * s.cos_phi - jnp.sin(theta) * s.sin_phi
 
 
-def _rolling_time(
+def _compute_rolling_time(
     begin_angle_squared: Elementwise,
     end_angle_squared: Elementwise,
     min_rate_squared: Elementwise,
@@ -551,29 +618,32 @@ def _rolling_time(
     lower_squared = jnp.where(is_nonempty, begin_angle_squared, 0.0)
     upper_squared = jnp.where(is_nonempty, end_angle_squared, 1.0)
     is_off_vertical = lower_squared > 0.0  # The square root has no derivative at 0.
-    angle_low = jnp.where(
+    smaller_half_angle = jnp.where(
         is_off_vertical, jnp.sqrt(jnp.where(is_off_vertical, lower_squared, 1.0)), 0.0
     )
-    angle_high = jnp.sqrt(upper_squared)
-    y1, y2 = jnp.sin(angle_low), jnp.cos(angle_low)
-    x1, x2 = jnp.sin(angle_high), jnp.cos(angle_high)
+    larger_half_angle = jnp.sqrt(upper_squared)
+    y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
+    x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
     y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))
     x3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * x1**2, 1e-300))
-    difference = x1**2 - y1**2
-    u12 = (x1 * x2 * y3 + y1 * y2 * x3) / difference
-    u13 = (x1 * x3 * y2 + y1 * y3 * x2) / difference
-    u23 = (x2 * x3 * y1 + y2 * y3 * x1) / difference
-    return jnp.where(is_nonempty, 2.0 * carlson_rf(u12**2, u13**2, u23**2), 0.0)
+    squared_sine_difference = x1**2 - y1**2
+    u12 = (x1 * x2 * y3 + y1 * y2 * x3) / squared_sine_difference
+    u13 = (x1 * x3 * y2 + y1 * y3 * x2) / squared_sine_difference
+    u23 = (x2 * x3 * y1 + y2 * y3 * x1) / squared_sine_difference
+    return jnp.where(is_nonempty, 2.0 * evaluate_carlson_rf(u12**2, u13**2, u23**2), 0.0)
 
 
-def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
+def evaluate_carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
     """Return Carlson's symmetric elliptic integral R_F to round-off, by duplication (DLMF 19.36.1).
 
-    Each duplication brings the arguments four times closer together. After 12 duplications, the
-    fifth-order series is exact in float64 for arguments within ten decades of each other.
+    Each duplication reduces the differences between the arguments to a quarter. After 12
+    duplications, the fifth-order series is exact in float64 for arguments within ten decades of
+    each other.
     """
 
-    def duplicate(_: object, xyz: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def duplicate_arguments(
+        _: object, xyz: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Array]:
         x, y, z = xyz
         sqrt_x, sqrt_y, sqrt_z = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
         duplication_shift = sqrt_x * sqrt_y + sqrt_y * sqrt_z + sqrt_z * sqrt_x
@@ -583,7 +653,7 @@ def carlson_rf(x: Elementwise, y: Elementwise, z: Elementwise) -> Elementwise:
             0.25 * (z + duplication_shift),
         )
 
-    x, y, z = lax.fori_loop(0, 12, duplicate, (x, y, z))
+    x, y, z = lax.fori_loop(0, 12, duplicate_arguments, (x, y, z))
     mean_argument = (x + y + z) / 3.0
     dx, dy = 1.0 - x / mean_argument, 1.0 - y / mean_argument
     dz = -dx - dy

@@ -21,69 +21,70 @@ rad/s, m/s. The length of Leg 1 follows from the touchdown condition. Leg 2 is o
 AnySectionState = Float[Array, "section ..."]
 """Section state of any model: a `SectionState` or a longer vector. In a batch, elements are on the
 last axis."""
-PAPER_START = (0.1, 1.6, -0.1)
+PAPER_START_STATE = (0.1, 1.6, -0.1)
 """Start near the gait of Table 1, inside its basin of attraction: rad, rad/s, m/s."""
 
 
-StateValues = Float[Array, "section ..."] | tuple[Array, ...]
+SectionStateEntries = Float[Array, "section ..."] | tuple[Array, ...]
 """Section state as one array or as separate entries, each of which may be an array over a batch."""
 
 
-def is_valid_start(params: WheelParams, x: StateValues) -> Array:
-    """Return whether parameters and start are finite, in their domains and rolling forward.
-
-    The result is False for NaN.
-    """
-    theta, dtheta = x[0], x[1]
-    is_upright = (jnp.abs(theta) < 0.5 * jnp.pi) & (
-        jnp.abs(theta - params.leg_angle) < 0.5 * jnp.pi
+def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
+    """Return whether parameters and start are finite, in their domains and rolling forward. NaN
+    gives False."""
+    wheel_angle, angular_rate = x[0], x[1]
+    is_upright = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
+        jnp.abs(wheel_angle - params.leg_angle) < 0.5 * jnp.pi
     )
-    is_bounded = functools.reduce(operator.and_, [jnp.abs(value) < MAX_SI_VALUE for value in x])
-    return params.is_in_domain() & is_bounded & is_upright & (dtheta > 0.0)
+    is_bounded = functools.reduce(
+        operator.and_, [jnp.abs(state_entry) < MAX_SI_VALUE for state_entry in x]
+    )
+    return params.is_in_domain() & is_bounded & is_upright & (angular_rate > 0.0)
 
 
-def replace_invalid(
-    is_valid: Array,
+def replace_invalid_inputs(
+    is_valid_start: Array,
     params: WheelParams,
-    x: StateValues,
-    fallback_x: Any,
+    x: SectionStateEntries,
+    fallback_state: Any,
 ) -> tuple[WheelParams, Any]:
-    """Return parameters and start, with Table 1 and `fallback_x` in place of invalid input.
+    """Return parameters and start, with Table 1 and `fallback_state` in place of invalid input.
 
-    The replacement prevents that a NaN is computed.
+    The replacement prevents NaN in the step and its derivatives.
     """
     return jax.tree.map(
         lambda given_value, safe_value: jnp.where(
-            is_valid, given_value, jnp.asarray(safe_value, given_value.dtype)
+            is_valid_start, given_value, jnp.asarray(safe_value, given_value.dtype)
         ),
         (params, x),
-        (type(params)(n_legs=params.n_legs), fallback_x),
+        (type(params)(n_legs=params.n_legs), fallback_state),
     )
 
 
-def complete_slopes(slope: Array, n_steps: int) -> Array:
+def complete_line_slopes(slope: Array, n_steps: int) -> Array:
     """Return the slopes of the n + 1 lines of n steps, rad.
 
-    If `slope` has n entries, the last one is repeated.
+    If `slope` has n entries, the last slope is repeated.
     """
-    check_step_values("slope", slope, n_steps)
+    check_stepwise_shape("slope", slope, n_steps)
     return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
 
 
-def check_step_values(quantity_name: str, values: Array, n_steps: int) -> None:
-    """Raise `ValueError` for an array with neither one value per step nor one more."""
-    if jnp.shape(values) not in ((n_steps,), (n_steps + 1,)):
+def check_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
+    """Raise a `ValueError` unless an array has n or n + 1 values for n steps."""
+    if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
         steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
         raise ValueError(
-            f"{quantity_name} has shape {jnp.shape(values)}, but {steps_text} of one wheel "
+            f"{quantity_name} has shape {jnp.shape(stepwise_values)}, but {steps_text} of one "
+            "wheel "
             f"takes one number, or an array of {n_steps} or {n_steps + 1} over its steps: map "
             "over batches of wheels with jax.vmap."
         )
 
 
 def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
-    """Return the wheel on the line under both feet in double support, and the next line's slope,
-    rad.
+    """Return the wheel on the line under both feet in double support, and the slope of the next
+    line, rad.
 
     On uneven ground `params.slope` has both slopes on a leading axis, which no other parameter has.
     On flat ground, `params.slope` has no such axis and the second result is None.
@@ -95,20 +96,21 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
 
 
 def is_valid_slope(slope: Elementwise) -> Array:
-    """Return whether a slope (rad) lies in its domain; False for NaN."""
+    """Return whether a slope (rad) lies in the domain of slopes. NaN gives False."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains(slope))
 
 
-def select_stance_line(
-    params: WheelParams, x: StateValues
+def select_stance_line_and_tilt(
+    params: WheelParams, x: SectionStateEntries
 ) -> tuple[WheelParams, Array, Elementwise | None]:
     """Return the wheel on the line under both feet, whether a step may start, and the tilt of the
     next line.
 
-    The tilt is the angle by which the next line is steeper, rad; None on flat ground.
+    The tilt is the angle by which the next line is steeper than the present line, rad. On flat
+    ground it is None.
     """
     params, next_slope = split_slopes(params)
-    is_valid = is_valid_start(params, x)
+    is_valid = is_valid_start_state(params, x)
     if next_slope is None:
         return params, is_valid, None
     is_valid = is_valid & is_valid_slope(next_slope)

@@ -13,7 +13,7 @@ from vrw_jax.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.step_inputs import AnySectionState
 from vrw_jax.printing import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_ending,
     format_outcome_counts,
     format_quantity,
@@ -24,26 +24,32 @@ MeasureValue = Float[Array, "..."]
 """Value of a measure of a step; in a batch, one value per element."""
 
 
-class AbstractMeasures(AbstractPrintable):
-    """Group of measures; each field is one of `measures.MEASURES`."""
+class AbstractMeasureGroup(AbstractPrintable):
+    """Group of measures, in which each field is one of `measures.MEASURES`."""
 
     measure_names: eqx.AbstractClassVar[Mapping[str, str]]
     """Names in `measures.MEASURES` of the fields that have another name there."""
 
     def measures(self) -> dict[str, Array]:
         """Return the fields by their names in `measures.MEASURES`."""
-        return {self.measure_names.get(name, name): value for name, value in vars(self).items()}
+        return {
+            self.measure_names.get(field_name, field_name): field_value
+            for field_name, field_value in vars(self).items()
+        }
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return label and printed value of each measure."""
-        measures = self.measures().items()
+        measure_items = self.measures().items()
         return [
-            (MEASURES[name].label, format_quantity(value, MEASURES[name].unit))
-            for name, value in measures
+            (
+                MEASURES[measure_name].label,
+                format_quantity(measure_value, MEASURES[measure_name].unit),
+            )
+            for measure_name, measure_value in measure_items
         ]
 
 
-class DoubleSupportIndicators(AbstractMeasures):
+class DoubleSupportIndicators(AbstractMeasureGroup):
     """Indicators of double-limb support of Section 5.1, for the landing that opens the step.
 
     - `lambda_I4`: normal impulse of the rear foot in the landing, both feet held, N s;
@@ -63,7 +69,7 @@ class DoubleSupportIndicators(AbstractMeasures):
     lambda_4: MeasureValue
 
 
-class EnergyLoss(AbstractMeasures):
+class EnergyLoss(AbstractMeasureGroup):
     """Mechanical energy lost in the step, J; each part is positive for a loss.
 
     - `landing`, `stopper`: in the two collisions;
@@ -84,7 +90,7 @@ class EnergyLoss(AbstractMeasures):
     damping: MeasureValue
 
 
-class Margins(AbstractMeasures):
+class Margins(AbstractMeasureGroup):
     """Margins of the viscoelastic model's assumptions over one step: negative if violated.
 
     Margins do not affect the motion. Forces and lengths are minima over the step, accurate to the
@@ -138,7 +144,8 @@ class Margins(AbstractMeasures):
 
 
 class AbstractStep(AbstractPrintable):
-    """Results of one step that every model reports. Batched under vmap."""
+    """Results of one step that every model reports. Under `vmap` each field gains the axis of the
+    batch."""
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -189,36 +196,41 @@ class AbstractStep(AbstractPrintable):
         }
         return shared_measures | self.model_measures()
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts: measures, then margins with whether their assumptions hold."""
-        outcome, measure_values = np.asarray(self.outcome), self.measures()
-        if outcome.ndim:
-            return [("steps", format_outcome_counts(outcome, Outcome))]
-        outcome_code = Outcome(int(outcome))
+        step_outcome, measure_values = np.asarray(self.outcome), self.measures()
+        if step_outcome.ndim:
+            return [("steps", format_outcome_counts(step_outcome, Outcome))]
+        outcome_code = Outcome(int(step_outcome))
         text_rows = [("outcome", f"{outcome_code.name}: {outcome_code.meaning}")]
-        for name, value in measure_values.items():
-            if name == "outcome":
+        for measure_name, measure_value in measure_values.items():
+            if measure_name == "outcome":
                 continue
-            measure, lowest_value = MEASURES[name], float(np.min(np.asarray(value)))
+            measure_description, lowest_value = (
+                MEASURES[measure_name],
+                float(np.min(np.asarray(measure_value))),
+            )
             verdict_text = ", holds" if lowest_value >= 0.0 else ", broken"
-            value_text = measure.format_with_unit(lowest_value)
-            if name in MARGIN_MEASURES:
-                text_rows.append((f"margin: {measure.label}", value_text + verdict_text))
+            value_text = measure_description.format_with_unit(lowest_value)
+            if measure_name in MARGIN_MEASURES:
+                text_rows.append(
+                    (f"margin: {measure_description.label}", value_text + verdict_text)
+                )
             else:
-                text_rows.append((measure.label, value_text))
+                text_rows.append((measure_description.label, value_text))
         return text_rows
 
     def model_selection(self) -> dict[str, Array]:
-        """Return the code of the model that took the step and that of the reason, by names of
-        `SELECTION_ATTRS`.
+        """Return the code of the model that took the step and the code of the reason, by the names
+        of the dataset variables.
 
-        The result is empty for a model that does not select another one.
+        The result is empty for a model that does not select another model.
         """
         return {}
 
     @abc.abstractmethod
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures that not every model has, by name."""
+        """Return the measures that only some models have, by name."""
 
 
 class AbstractContactStep(AbstractStep):
@@ -275,7 +287,7 @@ class StepResult(AbstractStep):
     engine: str = eqx.field(static=True, default="")
 
     def model_measures(self) -> dict[str, Array]:
-        """Return the measures of the paper's steps by name."""
+        """Return the measures that only steps of the paper's phases have, by name."""
         """Return the measures of contact steps by name."""
         return {
             "duration_sls1": self.durations[..., 1],

@@ -23,7 +23,7 @@ from vrw_jax.models.batch_step import (
     build_step_function,
     build_step_jacobian,
     build_step_sampler,
-    can_use_lanes,
+    can_use_batch_kernel,
 )
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
@@ -35,9 +35,9 @@ from vrw_jax.models.phase_sequence import (
     make_advance_result,
     make_step_result,
     make_trajectory,
-    run_phases,
+    run_step_phases,
 )
-from vrw_jax.models.step_inputs import PAPER_START, SectionState
+from vrw_jax.models.step_inputs import PAPER_START_STATE, SectionState
 from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
 from vrw_jax.numerics import Elementwise, ForwardFunction, StepOptions, Vector, enable_all_ad_modes
 from vrw_jax.validation import check_bool
@@ -52,7 +52,7 @@ from vrw_jax.wheel import (
 )
 
 
-class DiffraxPhase(NamedTuple):
+class DiffraxPhaseFunctions(NamedTuple):
     """Functions of a phase for the diffrax integrator, of the state y = (q, v) as one vector."""
 
     unpack_motion: Callable[[StateArray], Motion]
@@ -60,8 +60,8 @@ class DiffraxPhase(NamedTuple):
     guards: MonitoredFunctions
 
 
-def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhase:
-    """Return the functions of a phase for the diffrax integrator.
+def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
+    """Return the functions of a phase that the diffrax integrator calls.
 
     - `records_margins`: whether margins are evaluated in addition to guards.
     """
@@ -70,10 +70,10 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
         coordinates = tuple(y)
         return phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
 
-    def vector_field(y: StateArray) -> StateArray:
+    def evaluate_vector_field(y: StateArray) -> StateArray:
         return jnp.stack([*y[phase.n_dof :], *phase.acceleration(unpack_motion(y))[: phase.n_dof]])
 
-    def monitored_values(y: StateArray) -> Array:
+    def evaluate_guards_and_margins(y: StateArray) -> Array:
         phase_instant = PhaseInstant(phase, unpack_motion(y), None)
         return jnp.stack(
             [
@@ -83,10 +83,12 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
         )
 
     counted_margins = phase.margins_counted_at_start if records_margins else ()
-    return DiffraxPhase(
+    return DiffraxPhaseFunctions(
         unpack_motion,
-        vector_field,
-        MonitoredFunctions(monitored_values, len(phase.all_guard_outcomes), counted_margins),
+        evaluate_vector_field,
+        MonitoredFunctions(
+            evaluate_guards_and_margins, len(phase.all_guard_outcomes), counted_margins
+        ),
     )
 
 
@@ -124,7 +126,7 @@ class ViscoelasticWheel(AbstractWheel):
 
     def default_start(self, params: WheelParams) -> SectionState:
         """Return a section state close to the gait of Table 1, inside its basin of attraction."""
-        return jnp.asarray(PAPER_START, params.damping.dtype)
+        return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
         return self._compute_step(params, x, options, is_detailed=False)
@@ -135,26 +137,35 @@ class ViscoelasticWheel(AbstractWheel):
     def _compute_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, is_detailed: bool
     ) -> Any:
-        """Return the results of a step by the compiled function."""
-        leaves, argument_structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(*_compile_step(self, argument_structure, is_detailed)(*leaves))
+        """Return the results of a step, computed by the compiled function."""
+        argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
+        return eqx.combine(
+            *_compile_step_function(self, argument_structure, is_detailed)(*argument_leaves)
+        )
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        leaves, argument_structure = jax.tree.flatten((params, x, options))
-        if can_use_lanes(options):
-            sampler = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
+        argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
+        if can_use_batch_kernel(options):
+            sample_step_from_leaves = build_step_sampler(
+                argument_structure, self.stop_at_lift_off, n_samples
+            )
         else:
-            sampler = functools.partial(self._sample_with_diffrax, argument_structure, n_samples)
-        return sampler(*leaves)
+            sample_step_from_leaves = functools.partial(
+                self._sample_with_diffrax, argument_structure, n_samples
+            )
+        return sample_step_from_leaves(*argument_leaves)
 
     def _sample_with_diffrax(
-        self, argument_structure: Any, n_samples: int, *leaves: Array
+        self, argument_structure: Any, n_samples: int, *argument_leaves: Array
     ) -> Trajectory:
         """Return the samples of a step, integrated by diffrax."""
-        params, x, options = jax.tree.unflatten(argument_structure, leaves)
-        phase_sequence, samples = self._run_phases(params, x, options, records_margins=False), []
+        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
+        phase_sequence, phase_samples = (
+            self._run_phases(params, x, options, records_margins=False),
+            [],
+        )
         for phase, phase_start, phase_end in zip(
             phase_sequence.phases,
             phase_sequence.phase_starts,
@@ -162,19 +173,29 @@ class ViscoelasticWheel(AbstractWheel):
             strict=True,
         ):
             vector_field = make_diffrax_phase(phase, records_margins=False).vector_field
-            y = jnp.stack([*phase_start[0], *phase_start[1]])
-            units = jnp.stack(phase.coordinate_units), compute_wheel_units(phase.s).time
-            samples.append(
-                sample_in_units(vector_field, y, phase_end.duration, n_samples, options, *units)
+            start_vector = jnp.stack([*phase_start[0], *phase_start[1]])
+            state_and_time_units = (
+                jnp.stack(phase.coordinate_units),
+                compute_wheel_units(phase.s).time,
             )
-        return make_trajectory(phase_sequence, samples)
+            phase_samples.append(
+                sample_in_units(
+                    vector_field,
+                    start_vector,
+                    phase_end.duration,
+                    n_samples,
+                    options,
+                    *state_and_time_units,
+                )
+            )
+        return make_trajectory(phase_sequence, phase_samples)
 
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
         """Return the result of all phases of a step, integrated by diffrax."""
-        run_phase = _make_diffrax_runner(options, records_margins)
-        return run_phases(run_phase, params, tuple(x), options, self.stop_at_lift_off)
+        integrate_phase = _make_diffrax_phase_runner(options, records_margins)
+        return run_step_phases(integrate_phase, params, tuple(x), options, self.stop_at_lift_off)
 
     def finish_step(
         self,
@@ -184,16 +205,22 @@ class ViscoelasticWheel(AbstractWheel):
         state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        leaves, structure = jax.tree.flatten((params, jnp.asarray(distance), state, options))
-        if can_use_lanes(options):
-            finish = build_step_finisher(structure, phase_index, self.stop_at_lift_off)
-            return eqx.combine(*finish(*leaves))
-        run_phase = _make_diffrax_runner(options, records_margins=False)
-        settings = options, self.stop_at_lift_off, "diffrax"
-        return finish_step(run_phase, params, phase_index, distance, tuple(state), *settings)
+        argument_leaves, argument_structure = jax.tree.flatten(
+            (params, jnp.asarray(distance), state, options)
+        )
+        if can_use_batch_kernel(options):
+            finish_step_from_leaves = build_step_finisher(
+                argument_structure, phase_index, self.stop_at_lift_off
+            )
+            return eqx.combine(*finish_step_from_leaves(*argument_leaves))
+        integrate_phase = _make_diffrax_phase_runner(options, records_margins=False)
+        step_settings = options, self.stop_at_lift_off, "diffrax"
+        return finish_step(
+            integrate_phase, params, phase_index, distance, tuple(state), *step_settings
+        )
 
 
-def _make_diffrax_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
+def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
     """Return a function that integrates one phase to its end by diffrax."""
 
     def run_phase(
@@ -224,45 +251,46 @@ def _make_diffrax_runner(options: StepOptions, records_margins: bool) -> PhaseRu
 
 
 @functools.cache
-def _compile_step(
+def _compile_step_function(
     model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
 ) -> ForwardFunction:
-    """Return the step over the leaves of (params, x, options), differentiable in any mode."""
+    """Return the function of a step over the leaves of (params, x, options), differentiable in any
+    mode."""
 
     static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
         2
     ]
-    engine = "lanes" if can_use_lanes(static_options) else "diffrax"
+    engine_name = "lanes" if can_use_batch_kernel(static_options) else "diffrax"
 
-    def compute_with_diffrax(tightens_tolerances: bool, *leaves: Array) -> tuple:
+    def compute_with_diffrax(tightens_tolerances: bool, *argument_leaves: Array) -> tuple:
         """Return the results of a step by diffrax, split into floats and other arrays.
 
         If the batch kernel is the engine, this function computes only derivatives of derivatives,
         under the name of that engine.
         """
-        params, x, options = jax.tree.unflatten(argument_structure, leaves)
+        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         options = options.with_derivative_tolerances() if tightens_tolerances else options
         phase_sequence = model._run_phases(params, x, options, records_margins=is_detailed)
         step_result: AdvanceResult | StepResult = (
-            make_step_result(phase_sequence, model.friction, engine)
+            make_step_result(phase_sequence, model.friction, engine_name)
             if is_detailed
-            else make_advance_result(phase_sequence, engine)
+            else make_advance_result(phase_sequence, engine_name)
         )
         return eqx.partition(step_result, eqx.is_inexact_array)
 
-    step_fn, tight_step_fn = (
+    diffrax_step, tight_diffrax_step = (
         functools.partial(compute_with_diffrax, tightens_tolerances)
         for tightens_tolerances in (False, True)
     )
-    if engine == "diffrax":
-        return enable_all_ad_modes(step_fn, tight_step_fn)
-    static_config = (
+    if engine_name == "diffrax":
+        return enable_all_ad_modes(diffrax_step, tight_diffrax_step)
+    trace_config = (
         argument_structure,
         model.stop_at_lift_off,
         model.friction if is_detailed else None,
     )
     return enable_all_ad_modes(
-        build_step_function(*static_config),
-        tight_step_fn,
-        functools.partial(build_step_jacobian, *static_config),
+        build_step_function(*trace_config),
+        tight_diffrax_step,
+        functools.partial(build_step_jacobian, *trace_config),
     )

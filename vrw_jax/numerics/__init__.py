@@ -47,4 +47,4 @@ from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
 from vrw_jax.numerics.trigonometry import sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
-from vrw_jax.validation import raise_for_renamed_numerics as __getattr__
+from vrw_jax.validation import raise_for_missing_numerics_name as __getattr__

@@ -20,7 +20,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
 from vrw_jax.numerics.batching import BatchFunction, unbatch
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Function of float arrays that returns (float outputs, other outputs without derivatives)."""
@@ -55,7 +55,7 @@ def enable_all_ad_modes(
             else enable_all_ad_modes(make_jacobian(argnums), forward_jacobian)
         )
 
-    @with_default_settings
+    @with_default_jax_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
         argnums = tuple(
             i
@@ -152,7 +152,7 @@ def with_implicit_derivative(
     wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
 
     @wrapped_function.defjvp
-    @with_default_settings
+    @with_default_jax_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
         jacobian = implicit_jacobian(function, compute_tangents, wrap_execution, order + 1)(
             *primals

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax import simd
 from vrw_jax.numerics.types import Vector
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 LaneArray = Float[Array, "... lanes"]
 
@@ -146,7 +146,7 @@ def solve_node_equations(
 
 
 @solve_node_equations.defjvp
-@with_default_settings
+@with_default_jax_settings
 def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Return the solution and its tangent, by a second solve.
 

@@ -15,7 +15,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
 """Function of arrays that all have the batch on their last axis."""
@@ -29,7 +29,7 @@ def unbatch(function: BatchFunction) -> BatchFunction:
     batched_function = custom_vmap(function)
 
     @batched_function.def_vmap
-    @with_default_settings
+    @with_default_jax_settings
     def merge_axis(axis_size: int, is_batched_by_argument: PyTree, *arrays: PyTree) -> tuple:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics.types import RealInput, Scalar
-from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.validation import (
     check_choice,
     check_int,
@@ -124,7 +124,7 @@ class StepOptions(AbstractPrintable):
                 for number_dtype in np.ravel(np.asarray(value)):
                     check_positive(name, number_dtype)
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         units = {"max_phase_time": "s", "dt0": "s"}
         return [
             (name, value if isinstance(value, str) else format_quantity(value, units.get(name, "")))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.numerics.types import Elementwise
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 
 MAX_EXACT_ANGLE = 1.6
 """Largest angle for which the polynomials are accurate to round-off, rad. It is chosen because
@@ -90,7 +90,7 @@ _differentiable_sine_cosine = jax.custom_jvp(
 
 
 @_differentiable_sine_cosine.defjvp
-@with_default_settings
+@with_default_jax_settings
 def _sine_cosine_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Return sine and cosine and their tangents."""
     sin, cos = _differentiable_sine_cosine(*primals)

@@ -2,8 +2,8 @@
 
 No equation is solved for a fixed point. Every gait here is the limit of a walk, so the gait is
 stable and tests the Newton search independently. The model continues formally if the ground would
-have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the c at which
-λ2⁺ vanishes. Other gaits are unaffected.
+have to pull on Leg 1, and if a foot scuffs. Gaits can therefore be continued past the damping at
+which λ2⁺ vanishes. All other gaits are the same as without this continuation.
 """
 
 from __future__ import annotations
@@ -36,120 +36,130 @@ class SettlingOptions:
     """Conditions under which a walk counts as settled in a gait.
 
     - `n_steps`: number of steps of a walk, chosen because the slowest gait, c = 70, converges to
-      round-off in as many;
-    - `max_change`: largest change of the section state per step in a settled gait, chosen as ten
-      times the error of a step at the default options;
-    - `n_settled_steps`: number of last steps that must change less, chosen because a longer period
-      may repeat once by chance.
+      round-off in 30 steps;
+    - `max_state_change`: largest change of the section state per step in a settled gait, chosen as
+      ten times the error of a step at the default options;
+    - `n_settled_steps`: number of last steps that must change less than this, chosen because a gait
+      of longer period may repeat once by chance.
     """
 
     n_steps: int = 30
-    max_change: float = 1e-8
+    max_state_change: float = 1e-8
     n_settled_steps: int = 5
 
 
-SETTLING_OPTIONS = SettlingOptions()
+DEFAULT_SETTLING_OPTIONS = SettlingOptions()
 """Options of all walks of the reproduction."""
 
 
-def make_paper_model() -> ViscoelasticWheel:
-    """Return the paper's model, which continues after Leg 1 lifts off."""
+def make_formally_continued_model() -> ViscoelasticWheel:
+    """Return the paper's model, which continues formally after Leg 1 lifts off."""
     return ViscoelasticWheel(stop_at_lift_off=False)
 
 
-def replace_parameter(params: WheelParams, parameter_name: str, value: float) -> WheelParams:
+def replace_wheel_parameter(
+    params: WheelParams, parameter_name: str, parameter_value: float
+) -> WheelParams:
     """Return the wheel with another value of one parameter."""
-    replaced_fields: dict[str, Any] = {parameter_name: value}
+    replaced_fields: dict[str, Any] = {parameter_name: parameter_value}
     return dataclasses.replace(params, **replaced_fields)
 
 
 def walk_into_gait(
-    params: WheelParams, x: SectionState, options: SettlingOptions = SETTLING_OPTIONS
+    params: WheelParams,
+    x: SectionState,
+    settling_options: SettlingOptions = DEFAULT_SETTLING_OPTIONS,
 ) -> xr.Dataset:
     """Return a dataset of the section states of a walk and their change per step.
 
     `change` is the Euclidean distance to the previous section state in (rad, rad/s, m/s). `settled`
-    is whether the walk reached a period-1 gait: each of the last changes is small enough.
+    is whether the walk reached a period-1 gait, that is, whether each of the last changes is small
+    enough.
     """
-    gait_walk = walk(params, x, options.n_steps, model=make_paper_model())
+    gait_walk = walk(params, x, settling_options.n_steps, model=make_formally_continued_model())
     n_stepped = int(gait_walk.n_stepped)
-    states = np.concatenate([gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]])
-    state_change = np.full(n_stepped + 1, np.nan)
-    state_change[1:] = np.linalg.norm(np.diff(states, axis=0), axis=1)
-    outcome = Outcome(int(gait_walk.outcome))
-    n_settled_steps = options.n_settled_steps
-    last_change = (
-        float(state_change[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
+    section_states = np.concatenate(
+        [gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]]
     )
-    is_settled = outcome == Outcome.STEPPED and last_change < options.max_change
+    state_changes = np.full(n_stepped + 1, np.nan)
+    state_changes[1:] = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
+    walk_outcome = Outcome(int(gait_walk.outcome))
+    n_settled_steps = settling_options.n_settled_steps
+    last_change = (
+        float(state_changes[-n_settled_steps:].max()) if n_stepped >= n_settled_steps else math.inf
+    )
+    is_settled = walk_outcome == Outcome.STEPPED and last_change < settling_options.max_state_change
     return xr.Dataset(
         {
-            "section_state": (("step", "component"), states),
+            "section_state": (("step", "component"), section_states),
             "change": (
                 "step",
-                state_change,
+                state_changes,
                 {"units": "1", "long_name": "change since the step before"},
             ),
         },
         {"component": ["theta", "dtheta", "dL1"]},
         {
-            "outcome": outcome.name,
-            "outcome_meaning": outcome.meaning,
+            "outcome": walk_outcome.name,
+            "outcome_meaning": walk_outcome.meaning,
             "last_change": last_change,
             "settled": int(is_settled),
         }
-        | provenance(params, make_paper_model(), StepOptions()),
+        | provenance(params, make_formally_continued_model(), StepOptions()),
     )
 
 
 def walk_along_parameter(
-    params: WheelParams, parameter_name: str, values: Sequence[float], x: SectionState
+    params: WheelParams, parameter_name: str, parameter_values: Sequence[float], x: SectionState
 ) -> Iterator[xr.Dataset]:
-    """Yield a dataset of the walk at each of `values` of the parameter `name`, see
-    `walk_into_gait`.
+    """Yield a dataset of the walk at each value of a parameter, see `walk_into_gait`.
 
-    The start is extrapolated from the last two settled gaits. Walks that fail or do not settle are
-    not used for this.
+    The start of each walk is extrapolated from the last two settled gaits. Walks that fail or do
+    not settle are not used for the extrapolation.
     """
     settled_values: list[float] = []
     settled_states: list[np.ndarray] = []
-    for value in values:
-        start_state = _extrapolate_start(settled_values, settled_states, value, x)
-        gait_walk = walk_into_gait(replace_parameter(params, parameter_name, value), start_state)
+    for parameter_value in parameter_values:
+        start_state = _extrapolate_start_state(settled_values, settled_states, parameter_value, x)
+        gait_walk = walk_into_gait(
+            replace_wheel_parameter(params, parameter_name, parameter_value), start_state
+        )
         if gait_walk.settled:
-            settled_values.append(value)
+            settled_values.append(parameter_value)
             settled_states.append(gait_walk.section_state.values[-1])
         yield gait_walk
 
 
-def measure_gaits_along(
+def measure_gaits_along_parameter(
     params: WheelParams,
     parameter_name: str,
-    values: Sequence[float],
+    parameter_values: Sequence[float],
     x: SectionState,
     on_progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Return a dataset of the gaits of `walk_along_parameter` with all measures, over the parameter
-    `name`.
+    """Return a dataset of the gaits of `walk_along_parameter` with all measures, over the
+    parameter.
 
-    The measures are those of one more step. `settled` is whether the walk reached a period-1 gait,
-    and `change` is the largest change of its last steps.
+    The measures are those of one further step. `settled` is whether the walk reached a period-1
+    gait, and `change` is the largest change of its last steps.
 
-    - `on_progress`: function of the completed fraction.
+    - `on_progress`: function that is called with the completed fraction.
     """
     measures_by_value: list[dict[str, np.ndarray]] = []
-    for value, gait_walk in zip(
-        values, walk_along_parameter(params, parameter_name, values, x), strict=True
+    for parameter_value, gait_walk in zip(
+        parameter_values,
+        walk_along_parameter(params, parameter_name, parameter_values, x),
+        strict=True,
     ):
         last_state = gait_walk.section_state.values[-1]
         step_result = step(
-            replace_parameter(params, parameter_name, value),
+            replace_wheel_parameter(params, parameter_name, parameter_value),
             jnp.asarray(last_state),
-            model=make_paper_model(),
+            model=make_formally_continued_model(),
         )
         gait_measures = {
-            measure_name: np.asarray(values)
-            for measure_name, values in step_result.measures().items()
+            measure_name: np.asarray(parameter_values)
+            for measure_name, parameter_values in step_result.measures().items()
         }
         if gait_walk.outcome != Outcome.STEPPED.name:
             gait_measures["outcome"] = np.asarray(int(Outcome[gait_walk.outcome]))
@@ -158,11 +168,11 @@ def measure_gaits_along(
         gait_measures["settled"] = np.asarray(bool(gait_walk.settled))
         measures_by_value.append(gait_measures)
         if on_progress is not None:
-            on_progress(len(measures_by_value) / len(values))
-    return _make_dataset(
+            on_progress(len(measures_by_value) / len(parameter_values))
+    return _make_gait_dataset(
         params,
         parameter_name,
-        values,
+        parameter_values,
         {
             measure_name: np.stack([r[measure_name] for r in measures_by_value])
             for measure_name in measures_by_value[0]
@@ -170,49 +180,65 @@ def measure_gaits_along(
     )
 
 
-def _extrapolate_start(
-    values: list[float], states: list[np.ndarray], value: float, x: SectionState
+def _extrapolate_start_state(
+    settled_values: list[float],
+    settled_states: list[np.ndarray],
+    parameter_value: float,
+    x: SectionState,
 ) -> SectionState:
-    """Return a start at `value` on the line through the last two settled gaits."""
-    if not states:
+    """Return a start for a parameter value, on the line through the last two settled gaits."""
+    if not settled_states:
         return x
-    if len(states) == 1:
-        return jnp.asarray(states[0])
-    extrapolation_factor = (value - values[-1]) / (values[-1] - values[-2])
-    return jnp.asarray(states[-1] + extrapolation_factor * (states[-1] - states[-2]))
+    if len(settled_states) == 1:
+        return jnp.asarray(settled_states[0])
+    extrapolation_factor = (parameter_value - settled_values[-1]) / (
+        settled_values[-1] - settled_values[-2]
+    )
+    return jnp.asarray(
+        settled_states[-1] + extrapolation_factor * (settled_states[-1] - settled_states[-2])
+    )
 
 
-def _make_dataset(
+def _make_gait_dataset(
     params: WheelParams,
     parameter_name: str,
-    values: Sequence[float],
-    columns: dict[str, np.ndarray],
+    parameter_values: Sequence[float],
+    measure_columns: dict[str, np.ndarray],
 ) -> xr.Dataset:
-    """Return the labeled dataset of columns over the parameter `name`."""
-    variables = make_variables(
-        {measure_name: columns[measure_name] for measure_name in STEP_MEASURES | MARGIN_MEASURES},
+    """Return the labeled dataset of measures over a parameter."""
+    dataset_variables = make_variables(
+        {
+            measure_name: measure_columns[measure_name]
+            for measure_name in STEP_MEASURES | MARGIN_MEASURES
+        },
         parameter_name,
     )
-    change_attrs = {"units": "1", "long_name": "largest change of the last five steps"}
-    variables |= {
+    change_attributes = {"units": "1", "long_name": "largest change of the last five steps"}
+    dataset_variables |= {
         "section_state": xr.Variable(
-            (parameter_name, "component"), columns["section_state"], {"long_name": "section state"}
+            (parameter_name, "component"),
+            measure_columns["section_state"],
+            {"long_name": "section state"},
         ),
-        "change": xr.Variable(parameter_name, columns["change"], change_attrs),
+        "change": xr.Variable(parameter_name, measure_columns["change"], change_attributes),
         "settled": xr.Variable(
             parameter_name,
-            columns["settled"],
+            measure_columns["settled"],
             {"long_name": "whether the walk settled into a period-1 gait"},
         ),
     }
-    coordinates = {
+    dataset_coordinates = {
         parameter_name: xr.Variable(
-            parameter_name, np.asarray(values, float), measure_attrs(parameter_name)
+            parameter_name, np.asarray(parameter_values, float), measure_attrs(parameter_name)
         ),
         "component": ["theta", "dtheta", "dL1"],
         "leg": locked_leg_coordinate(params.n_legs),
     }
-    provenance_attrs = provenance(params, make_paper_model(), StepOptions())
-    provenance_attrs.pop(f"parameter_{parameter_name}")
-    attrs = {"title": f"Gaits walked to along {parameter_name}"} | provenance_attrs
-    return xr.Dataset(variables, coordinates, attrs).sortby(parameter_name)
+    provenance_attributes = provenance(params, make_formally_continued_model(), StepOptions())
+    provenance_attributes.pop(f"parameter_{parameter_name}")
+    dataset_attributes = {
+        "title": f"Gaits walked to along {parameter_name}"
+    } | provenance_attributes
+    return xr.Dataset(dataset_variables, dataset_coordinates, dataset_attributes).sortby(
+        parameter_name
+    )

@@ -13,26 +13,26 @@ import xarray as xr
 
 from vrw_jax import figures as plots
 from vrw_jax.paper import facts
-from vrw_jax.paper.facts.base import Evidence, Fact
+from vrw_jax.paper.facts.base import PaperEvidence, PaperFact
 from vrw_jax.paper.gaits import (
-    make_paper_model,
-    measure_gaits_along,
-    replace_parameter,
+    make_formally_continued_model,
+    measure_gaits_along_parameter,
+    replace_wheel_parameter,
     walk_along_parameter,
     walk_into_gait,
 )
 from vrw_jax.simulation import paper_start, simulate
 from vrw_jax.wheel import WheelParams
 
-ReproductionProgress = Callable[[float, str], None]
+ReportReproductionProgress = Callable[[float, str], None]
 """Function that is called with the completed fraction, 0 to 1, and the name of the present task."""
 
-FIGURE_DAMPINGS = (50.0, 100.0, 200.0)
+FIGURE_8_AND_9_DAMPINGS = (50.0, 100.0, 200.0)
 """Values of damping in figures 8 and 9, N s/m."""
 
 
-def ignore_progress(completed_fraction: float, task: str) -> None:
-    """Take a report of progress and do nothing."""
+def ignore_progress(completed_fraction: float, task_name: str) -> None:
+    """Accept a report of progress and do nothing."""
 
 
 def walk_into_table_1_gait() -> xr.Dataset:
@@ -43,7 +43,7 @@ def walk_into_table_1_gait() -> xr.Dataset:
 def simulate_table_1_gait(n_steps: int = 3) -> xr.Dataset:
     """Return the trajectory of the gait of Table 1 at slope 0.30 rad, for figures 6 and 7."""
     section_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    return simulate(WheelParams(), section_state, n_steps, model=make_paper_model())
+    return simulate(WheelParams(), section_state, n_steps, model=make_formally_continued_model())
 
 
 def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
@@ -52,7 +52,7 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     The damping is changed from that of Table 1 by at most 10 N s/m per walk.
     """
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    table_1_wheel, gaits = WheelParams(), []
+    table_1_wheel, gait_trajectories = WheelParams(), []
     for damping in dampings:
         start_damping = float(table_1_wheel.damping)
         n_dampings = 1 + math.ceil(abs(damping - start_damping) / 10.0)
@@ -61,31 +61,33 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
         if not gait_walk.settled:
             raise ValueError(f"No period-1 gait was met at damping {damping:g}: choose 1 to 219.")
         section_state = jnp.asarray(gait_walk.section_state.values[-1])
-        gaits.append(
+        gait_trajectories.append(
             simulate(
-                replace_parameter(table_1_wheel, "damping", damping),
+                replace_wheel_parameter(table_1_wheel, "damping", damping),
                 section_state,
                 1,
-                model=make_paper_model(),
+                model=make_formally_continued_model(),
             )
         )
-    return gaits
+    return gait_trajectories
 
 
 def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
     """Return the gaits at each integer c from 1 to 219, and the walks up to 224, for figure 10."""
     params = WheelParams()
     start_state = jnp.asarray(walk_into_table_1_gait().section_state.values[-1])
-    lower_gaits = measure_gaits_along(
+    lower_gaits = measure_gaits_along_parameter(
         params, "damping", range(200, 0, -1), start_state, on_progress
     )
-    upper_gaits = measure_gaits_along(params, "damping", range(201, 225), start_state)
+    upper_gaits = measure_gaits_along_parameter(params, "damping", range(201, 225), start_state)
     return xr.concat(
         [lower_gaits, upper_gaits], "damping", data_vars="minimal", combine_attrs="override"
     )
 
 
-def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evidence:
+def collect_paper_evidence(
+    on_progress: ReportReproductionProgress = ignore_progress,
+) -> PaperEvidence:
     """Return all walks that the facts and figures use."""
     table_1_wheel = WheelParams()
     on_progress(0.0, "walk from the start for Table 1")
@@ -102,25 +104,25 @@ def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evi
     start_state = jnp.asarray(damping_branch.section_state.sel(damping=100.0).values)
     slopes = [0.01 * i for i in range(30, 9, -1)]
     medium_damping_wheel, gentle_slope_wheel = (
-        replace_parameter(table_1_wheel, "damping", 100.0),
-        replace_parameter(table_1_wheel, "slope", 0.10),
+        replace_wheel_parameter(table_1_wheel, "damping", 100.0),
+        replace_wheel_parameter(table_1_wheel, "slope", 0.10),
     )
-    slope_branch = measure_gaits_along(medium_damping_wheel, "slope", slopes, start_state)
+    slope_branch = measure_gaits_along_parameter(medium_damping_wheel, "slope", slopes, start_state)
     start_state = jnp.asarray(slope_branch.section_state.sel(slope=0.10, method="nearest").values)
-    gentle_slope_branch = measure_gaits_along(
+    gentle_slope_branch = measure_gaits_along_parameter(
         gentle_slope_wheel, "damping", range(100, 221, 10), start_state
     )
     low_dampings = [*range(100, 0, -10), 5, 4]
-    gentle_slope_low_damping_branch = measure_gaits_along(
+    gentle_slope_low_damping_branch = measure_gaits_along_parameter(
         gentle_slope_wheel, "damping", low_dampings, start_state
     )
 
     on_progress(0.7, "trajectories")
-    return Evidence(
+    return PaperEvidence(
         params=table_1_wheel,
         settling_walk=settling_walk,
         table_1_trajectory=simulate_table_1_gait(),
-        gaits_by_damping=simulate_gaits_at_dampings(FIGURE_DAMPINGS),
+        gaits_by_damping=simulate_gaits_at_dampings(FIGURE_8_AND_9_DAMPINGS),
         damping_branch=damping_branch,
         slope_branch=slope_branch,
         gentle_slope_branch=gentle_slope_branch,
@@ -129,44 +131,44 @@ def collect_evidence(on_progress: ReproductionProgress = ignore_progress) -> Evi
     )
 
 
-def draw_figures(evidence: Evidence, folder: Path) -> list[Path]:
+def write_paper_figures(evidence: PaperEvidence, folder: Path) -> list[Path]:
     """Write figures 6 to 10 as SVG and PNG, and the walk as a GIF, and return the paths."""
     two_step_trajectory = evidence.table_1_trajectory.isel(
         time=evidence.table_1_trajectory.step.values < 2
     )
-    figures = {
+    figure_by_name = {
         "fig06_gait": plots.gait_panels(evidence.table_1_trajectory),
         "fig07_sticks": plots.sticks(two_step_trajectory),
         "fig08_scuffing": plots.foot_height(evidence.gaits_by_damping),
         "fig09_rear_force": plots.rear_force(evidence.gaits_by_damping),
         "fig10_indicators": plots.indicators(evidence.damping_branch),
     }
-    paths = [
+    figure_paths = [
         path
-        for figure_name, figure in figures.items()
+        for figure_name, figure in figure_by_name.items()
         for path in plots.save(figure, folder, figure_name)
     ]
-    frames, milliseconds = plots.walk_frames(evidence.gaits_by_damping[-1])
-    return [*paths, plots.save_animation(frames, milliseconds, folder / "walk.gif")]
+    frame_images, milliseconds = plots.walk_frames(evidence.gaits_by_damping[-1])
+    return [*figure_paths, plots.save_animation(frame_images, milliseconds, folder / "walk.gif")]
 
 
-def reproduce(
-    folder: str | Path, on_progress: ReproductionProgress = ignore_progress
-) -> list[Fact]:
+def reproduce_paper(
+    folder: str | Path, on_progress: ReportReproductionProgress = ignore_progress
+) -> list[PaperFact]:
     """Write all figures and the table of facts into `folder`, and return the facts.
 
     The table is in `facts.md` and `facts.csv`. The numbers of Figure 10 are in `indicators.csv`.
 
-    - `on_progress`: function of the completed fraction and the present task.
+    - `on_progress`: function that is called with the completed fraction and the present task.
     """
     folder = Path(folder)
-    evidence = collect_evidence(on_progress)
+    evidence = collect_paper_evidence(on_progress)
     on_progress(0.8, "figures")
-    draw_figures(evidence, folder)
+    write_paper_figures(evidence, folder)
     on_progress(0.98, "table of facts")
-    facts_table = facts.compute_facts(evidence)
-    facts.write_facts(facts_table, folder)
+    paper_facts = facts.compute_paper_facts(evidence)
+    facts.write_facts_files(paper_facts, folder)
     indicator_table = evidence.damping_branch.drop_dims(["leg", "component"]).to_dataframe()
     indicator_table.to_csv(folder / "indicators.csv", float_format="%.10g")
     on_progress(1.0, "done")
-    return facts_table
+    return paper_facts

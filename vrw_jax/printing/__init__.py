@@ -2,7 +2,7 @@
 
 from vrw_jax.printing.text import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_elements,
     describe_ending,
     format_html_table,

@@ -12,21 +12,24 @@ import equinox as eqx
 import jax
 import numpy as np
 
-TextRow = tuple[str, str]
+LabelAndText = tuple[str, str]
 
 
-def is_concrete(tree: Any) -> bool:
-    """Return whether all numbers of a module are set and concrete; False inside `jit`."""
-    is_known = lambda leaf: eqx.is_array_like(leaf) and not isinstance(leaf, int | jax.core.Tracer)
-    is_complete = not any(value is None for value in vars(tree).values())
-    return is_complete and all(map(is_known, jax.tree.leaves(tree)))
+def has_concrete_numbers(result_tree: Any) -> bool:
+    """Return whether all numbers of a result are set and concrete. The result is False inside
+    `jit`."""
+    is_concrete_leaf = lambda tree_leaf: (
+        eqx.is_array_like(tree_leaf) and not isinstance(tree_leaf, int | jax.core.Tracer)
+    )
+    has_all_fields = not any(field_value is None for field_value in vars(result_tree).values())
+    return has_all_fields and all(map(is_concrete_leaf, jax.tree.leaves(result_tree)))
 
 
 class AbstractPrintable(eqx.Module):
     """Base class of results that print as text, and as a table in a notebook."""
 
     @abc.abstractmethod
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return the pairs (name, text) to print, one per line."""
 
     @property
@@ -37,103 +40,134 @@ class AbstractPrintable(eqx.Module):
     def __repr__(self) -> str:
         return (
             format_text(self.title, self.summary_rows())
-            if is_concrete(self)
+            if has_concrete_numbers(self)
             else eqx.tree_pformat(self)
         )
 
     def _repr_html_(self) -> str:
         return (
             format_html_table(self.title, self.summary_rows())
-            if is_concrete(self)
+            if has_concrete_numbers(self)
             else f"<pre>{self!r}</pre>"
         )
 
 
-def format_quantity(value: object, unit: str) -> str:
-    """Return a number with its unit as text; of several numbers, their count and range."""
-    values, unit = np.asarray(value), "" if unit == "1" else unit
-    if values.ndim == 0:
-        return f"{float(values):.6g} {unit}".strip()
-    range_text = f" from {np.min(values):.6g} to {np.max(values):.6g} {unit}" if values.size else ""
-    return f"{values.size} values{range_text}".rstrip()
+def format_quantity(quantity_value: object, quantity_unit: str) -> str:
+    """Return a number with its unit as text. Several numbers are described by their count and
+    range."""
+    value_array, quantity_unit = (
+        np.asarray(quantity_value),
+        "" if quantity_unit == "1" else quantity_unit,
+    )
+    if value_array.ndim == 0:
+        return f"{float(value_array):.6g} {quantity_unit}".strip()
+    range_text = (
+        f" from {np.min(value_array):.6g} to {np.max(value_array):.6g} {quantity_unit}"
+        if value_array.size
+        else ""
+    )
+    return f"{value_array.size} values{range_text}".rstrip()
 
 
 def format_outcome_counts(outcomes: Any, status_class: type[enum.IntEnum]) -> str:
     """Return a text with the number of outcomes, their shape, and the count of each outcome."""
-    n_outcomes, shape = np.size(outcomes), np.shape(outcomes)
-    codes, counts = np.unique(np.asarray(outcomes), return_counts=True)
+    n_outcomes, outcome_shape = np.size(outcomes), np.shape(outcomes)
+    outcome_codes, outcome_counts = np.unique(np.asarray(outcomes), return_counts=True)
     count_texts = (
-        f"{count:,} {status_class(int(status_code)).name}"
-        for status_code, count in zip(codes, counts, strict=True)
+        f"{outcome_count:,} {status_class(int(status_code)).name}"
+        for status_code, outcome_count in zip(outcome_codes, outcome_counts, strict=True)
     )
-    return f"{n_outcomes:,} in shape {shape}: {', '.join(count_texts)}"
+    return f"{n_outcomes:,} in shape {outcome_shape}: {', '.join(count_texts)}"
 
 
-def describe_elements(describe: Callable[..., str], *values: Any) -> Any:
-    """Return the text of numbers; for a batch, an array with the text of each element."""
-    return np.vectorize(describe, otypes=[object])(*values)[()]
+def describe_elements(describe_element: Callable[..., str], *element_values: Any) -> Any:
+    """Return the text of numbers. For a batch, return an array with the text of each element."""
+    return np.vectorize(describe_element, otypes=[object])(*element_values)[()]
 
 
-def describe_ending(codes: Any, status_class: type[enum.IntEnum]) -> Any:
-    """Return the sentence of a status code; for a batch, an array of one sentence per element."""
-    return describe_elements(lambda code: status_class(int(code)).meaning, codes)  # type: ignore[attr-defined]
+def describe_ending(status_codes: Any, status_class: type[enum.IntEnum]) -> Any:
+    """Return the sentence of a status code. For a batch, return an array with one sentence per
+    element."""
+    describe_code = lambda code: status_class(int(code)).meaning  # type: ignore[attr-defined]
+    return describe_elements(describe_code, status_codes)
 
 
-def format_text(title: str, rows: Iterable[TextRow]) -> str:
+def format_text(text_title: str, text_rows: Iterable[LabelAndText]) -> str:
     """Return a title and indented rows as one text."""
-    return "\n".join([title, *(f"  {name}: {text}" for name, text in rows)])
+    return "\n".join(
+        [text_title, *(f"  {row_label}: {row_text}" for row_label, row_text in text_rows)]
+    )
 
 
-def format_html_table(title: str, rows: Iterable[Sequence[str]], header: Sequence[str] = ()) -> str:
-    """Return the rows as an HTML table; the first cell of each row is its header."""
-    format_cell = lambda kind, text: f"<{kind} style='text-align:left'>{escape(text)}</{kind}>"
-    lines = ["".join(format_cell("th", text) for text in header)] if header else []
-    lines += [
-        format_cell("th", name) + "".join(format_cell("td", text) for text in cells)
-        for name, *cells in rows
+def format_html_table(
+    table_title: str, text_rows: Iterable[Sequence[str]], header_cells: Sequence[str] = ()
+) -> str:
+    """Return the rows as an HTML table, in which the first cell of each row is a header."""
+    format_cell = lambda cell_tag, cell_text: (
+        f"<{cell_tag} style='text-align:left'>{escape(cell_text)}</{cell_tag}>"
+    )
+    row_lines = (
+        ["".join(format_cell("th", cell_text) for cell_text in header_cells)]
+        if header_cells
+        else []
+    )
+    row_lines += [
+        format_cell("th", row_label)
+        + "".join(format_cell("td", cell_text) for cell_text in row_cells)
+        for row_label, *row_cells in text_rows
     ]
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f"<table><caption>{escape(title)}</caption>{body}</table>"
+    table_body = "".join(f"<tr>{row_line}</tr>" for row_line in row_lines)
+    return f"<table><caption>{escape(table_title)}</caption>{table_body}</table>"
 
 
-def format_markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def format_markdown_table(
+    header_cells: Sequence[str], text_rows: Iterable[Sequence[str]]
+) -> list[str]:
     """Return the lines of a Markdown table."""
-    format_cell = lambda text: " " + text.replace("|", r"\|") + " " * bool(text)
-    format_line = lambda cells: "|" + "|".join(map(format_cell, cells)) + "|"
-    return [format_line(header), "|" + "---|" * len(header), *map(format_line, rows)]
+    format_cell = lambda cell_text: " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
+    format_line = lambda row_cells: "|" + "|".join(map(format_cell, row_cells)) + "|"
+    return [
+        format_line(header_cells),
+        "|" + "---|" * len(header_cells),
+        *map(format_line, text_rows),
+    ]
 
 
-_MATHTEXT_SYMBOLS = {
+_MATHTEXT_BY_SYMBOL = {
     "θ": r"\theta ", "κ": r"\kappa ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ",
     "Δ": r"\Delta ", "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
     "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
 }  # fmt: skip
-_SYMBOL_PATTERN = re.compile(
+_SYMBOL_TOKEN_PATTERN = re.compile(
     r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308"
     r"|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
     r"|(?P<index>(?<=[^\W\d_]|\u0307|\u0308)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
 )
 
 
-def format_mathtext(symbol: str) -> str:
+def format_mathtext(symbol_text: str) -> str:
     r"""Return a symbol as mathtext: "θ̇⁺" as \dot{\theta}^+, "L1" as L_1."""
-    return _SYMBOL_PATTERN.sub(_format_token, unicodedata.normalize("NFD", symbol))
+    return _SYMBOL_TOKEN_PATTERN.sub(
+        _format_symbol_token, unicodedata.normalize("NFD", symbol_text)
+    )
 
 
-def _format_token(match: re.Match[str]) -> str:
-    """Return the mathtext of one match of `_SYMBOL_PATTERN`."""
-    token_kind = match.lastgroup or ""
-    text = match[token_kind]
-    is_roman = token_kind == "word" or re.search("[A-Za-z]{3}", text)
-    body = _MATHTEXT_SYMBOLS.get(text, f"\\mathrm{{{text}}}" if is_roman else text)
+def _format_symbol_token(token_match: re.Match[str]) -> str:
+    """Return the mathtext of one match of `_SYMBOL_TOKEN_PATTERN`."""
+    token_kind = token_match.lastgroup or ""
+    token_text = token_match[token_kind]
+    is_roman_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
+    token_body = _MATHTEXT_BY_SYMBOL.get(
+        token_text, f"\\mathrm{{{token_text}}}" if is_roman_text else token_text
+    )
     return {
-        "below": f"_{{{body}}}",
-        "dotted": f"\\dot{{{body}}}",
-        "twice": f"\\ddot{{{body}}}",
-        "index": f"_{body}",
-    }.get(token_kind, body)
+        "below": f"_{{{token_body}}}",
+        "dotted": f"\\dot{{{token_body}}}",
+        "twice": f"\\ddot{{{token_body}}}",
+        "index": f"_{token_body}",
+    }.get(token_kind, token_body)
 
 
-def format_numbers(values: object) -> str:
+def format_numbers(number_values: object) -> str:
     """Return numbers as text, separated by commas."""
-    return ", ".join(f"{value:.5g}" for value in np.ravel(np.asarray(values)))
+    return ", ".join(f"{number:.5g}" for number in np.ravel(np.asarray(number_values)))

@@ -9,14 +9,14 @@ from jaxtyping import Float
 
 from vrw_jax.cycles import AbstractCycle
 from vrw_jax.numerics import StepOptions
-from vrw_jax.printing import AbstractPrintable, TextRow
+from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_to_gait
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import (
-    POST_LANDING_NAMES,
-    PRE_TOUCHDOWN_NAMES,
+    POST_LANDING_COMPONENT_NAMES,
+    PRE_TOUCHDOWN_COMPONENT_NAMES,
     ModelLike,
-    invert_landing,
+    invert_landing_map,
 )
 from vrw_jax.validation import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.wheel import Outcome, WheelParams
@@ -59,7 +59,7 @@ class BasinShare(AbstractPrintable):
     failure_shares: dict[str, float] = eqx.field(static=True)
     n_starts: int = eqx.field(static=True)
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return the label and the text of each share, with its standard error."""
         n = len(self.walking_share)
         final_walking_share, final_walking_share_error = (
@@ -77,7 +77,7 @@ class BasinShare(AbstractPrintable):
         return [*text_rows, ("starts", f"{self.n_starts:,}")]
 
 
-@with_default_settings
+@with_default_jax_settings
 def basin_share(
     params: WheelParams,
     box: StartBox,
@@ -163,8 +163,8 @@ def compute_basin_share(
     starts = (
         box_bounds.lower_bounds + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_points
     )
-    if box_bounds.component_names == POST_LANDING_NAMES:
-        starts = invert_landing(stable_gait.params, starts)
+    if box_bounds.component_names == POST_LANDING_COMPONENT_NAMES:
+        starts = invert_landing_map(stable_gait.params, starts)
     is_start_reachable = np.isfinite(starts).all(-1)
     is_on_gait, n_steps_walked = np.zeros(n_starts, bool), np.zeros(n_starts, int)
     walk_outcomes = np.full(n_starts, int(Outcome.BAD_INPUT))
@@ -211,13 +211,14 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
     components of one kind of start.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
-    for component_names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
+    for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
         if set(box) == set(component_names):
             break
     else:
         raise ValueError(
             f"the box contains {', '.join(map(str, box)) or 'nothing'}, but it must contain all of "
-            f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
+            f"{', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
+            f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
             "each a number or two bounds."
         )
     is_fixed_value = lambda value: np.ndim(value) == 0

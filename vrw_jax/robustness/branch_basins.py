@@ -13,9 +13,9 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_start_box
 from vrw_jax.robustness.gait_arrival import StableGait
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.simulation import ModelLike, check_model, check_options
+from vrw_jax.simulation import ModelLike, check_model, check_step_options
 from vrw_jax.validation import check_int, check_type
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
@@ -28,7 +28,7 @@ BASIN_VARIABLE_ATTRS = {
 """Unit and meaning of each variable of the dataset that `measure_basins` returns."""
 
 
-@with_default_settings
+@with_default_jax_settings
 def measure_basins(
     branch: Branch,
     box: StartBox | None = None,
@@ -68,7 +68,7 @@ def measure_basins(
         [0.126, 0.109]
     """
     check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
-    checked_model, checked_options = check_model(model), check_options(options)
+    checked_model, checked_options = check_model(model), check_step_options(options)
     n_points, n_starts = check_int("n_points", n_points), check_int("n_starts", n_starts)
     max_steps = check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box)

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.cycles import limit_cycle, resolve_model
 from vrw_jax.models import PassageMethod
 from vrw_jax.numerics import Scalar, StatusCode, StepOptions, zero_tangent
-from vrw_jax.printing import AbstractPrintable, TextRow, describe_ending
+from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_ending
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
-from vrw_jax.runtime import with_default_settings
-from vrw_jax.simulation import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
 from vrw_jax.validation import check_int, check_not_traced, check_positive, is_traced
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 
@@ -100,7 +100,7 @@ class FirstPassage(AbstractPrintable):
         """Return a sentence about whether the error is within the tolerance."""
         return describe_ending(self.status, PassageStatus)
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for means, probability, outcomes and status."""
         outcome_fractions = zip(self.end_names, np.asarray(self.end_fractions), strict=True)
         sampled_steps_text = f"{self.n_steps:,}" if self.n_steps else "none: quadrature"
@@ -121,7 +121,7 @@ class FirstPassage(AbstractPrintable):
         ]
 
 
-@with_default_settings
+@with_default_jax_settings
 def first_passage(
     params: WheelParams,
     slope_sd: float | Scalar,
@@ -194,7 +194,7 @@ def first_passage(
     estimate_passage = functools.partial(
         _estimate_passage_by_sampling,
         model=resolved_model,
-        options=check_options(options),
+        options=check_step_options(options),
         seed=seed,
         n_walkers=n_walkers,
         relative_tolerance=tol or 0.02,
@@ -267,7 +267,7 @@ def _solve_passage_by_quadrature(
         )
     if (
         not is_traced(params)
-        and not float(model.vertical_map(params).fixed_point(params.slope)) > 0
+        and not float(model.make_vertical_rate_map(params).compute_fixed_point(params.slope)) > 0
     ):
         raise ValueError(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "

@@ -21,8 +21,8 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
 from vrw_jax.numerics import Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, TextRow, describe_ending
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_ending
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_known_name, check_names, is_traced
 from vrw_jax.wheel import Outcome, WheelParams
@@ -68,7 +68,7 @@ class GaitSensitivity(AbstractPrintable):
             return "The gait is stable, and the norms are finite."
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return label and text of each measure, with the parts of its norm."""
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
@@ -90,7 +90,7 @@ class GaitSensitivity(AbstractPrintable):
         return [*text_rows, ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}")]
 
 
-@with_default_settings
+@with_default_jax_settings
 def gait_sensitivity(
     params: WheelParams,
     measures: str | Sequence[str],

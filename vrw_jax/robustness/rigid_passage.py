@@ -44,11 +44,11 @@ def solve_rigid_passage(
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
-    vertical_rate_map, mean_slope = rigid_model.vertical_map(params), params.slope
+    vertical_rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
     steepest_slope = jnp.minimum(
         mean_slope + MAX_SLOPE_STANDARD_DEVIATIONS * slope_sd, vertical_rate_map.slope_of_maximum
     )
-    largest_squared_rate = lax.stop_gradient(vertical_rate_map.fixed_point(steepest_slope))
+    largest_squared_rate = lax.stop_gradient(vertical_rate_map.compute_fixed_point(steepest_slope))
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_nodes)
     squared_rate_nodes = 0.5 * largest_squared_rate * (1.0 + legendre_nodes)
     node_weights = 0.5 * largest_squared_rate * legendre_weights
@@ -56,8 +56,8 @@ def solve_rigid_passage(
     def evaluate_kernel_row(squared_rate: Array) -> tuple[Array, Array]:
         """Return the row of the survival operator at x, and the probability of failure."""
         compute_slope_cosine = lambda next_squared_rate: (
-            (next_squared_rate - vertical_rate_map.offset(squared_rate))
-            / vertical_rate_map.amplitude
+            (next_squared_rate - vertical_rate_map.compute_slope_independent_part(squared_rate))
+            / vertical_rate_map.slope_amplitude
         )
         slope_cosine = compute_slope_cosine(squared_rate_nodes)
         is_node_reachable = jnp.abs(slope_cosine) < 1.0
@@ -69,7 +69,7 @@ def solve_rigid_passage(
             jnp.sqrt(2.0 * jnp.pi) * slope_sd
         )
         squared_rate_density = squared_rate_density / (
-            vertical_rate_map.amplitude * jnp.sqrt(1.0 - slope_cosine**2)
+            vertical_rate_map.slope_amplitude * jnp.sqrt(1.0 - slope_cosine**2)
         )
         flattest_slope = vertical_rate_map.slope_of_maximum - jnp.arccos(
             jnp.clip(compute_slope_cosine(0.0), -1.0, 1.0)
@@ -80,7 +80,7 @@ def solve_rigid_passage(
 
     survival_matrix, failure_probabilities = jax.vmap(evaluate_kernel_row)(squared_rate_nodes)
     survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
-    survival_row_of_gait = evaluate_kernel_row(vertical_rate_map.fixed_point(mean_slope))
+    survival_row_of_gait = evaluate_kernel_row(vertical_rate_map.compute_fixed_point(mean_slope))
     return RigidPassage(
         survival_analysis,
         compute_mean_steps(survival_analysis, survival_matrix, *survival_row_of_gait),

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.cycles import AbstractCycle
 from vrw_jax.models import AbstractWheel, AdvanceResult
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches
-from vrw_jax.printing import AbstractPrintable, TextRow
+from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_to_gait
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_int, check_positive
 from vrw_jax.wheel import Outcome, WheelParams
@@ -104,7 +104,7 @@ class SmallestDisturbance(AbstractPrintable):
             return "The wheel walks on, but not on this gait."
         return Outcome(int(self.outcome)).meaning
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts of size, direction, instant and outcome."""
         if not np.isfinite(self.size):
             return [("largest tried size", f"{self.max_size:.6g} rad/s"), ("ending", self.ending)]
@@ -119,7 +119,7 @@ class SmallestDisturbance(AbstractPrintable):
         ]
 
 
-@with_default_settings
+@with_default_jax_settings
 def smallest_disturbance(
     params: WheelParams,
     *,

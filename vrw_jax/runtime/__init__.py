@@ -2,12 +2,12 @@
 
 from vrw_jax.runtime import disk_cache
 from vrw_jax.runtime.cached_programs import (
-    cached_lane_function,
-    cached_lane_program,
-    cached_trace,
-    compile_exported,
+    compile_cached_lane_function,
+    compile_cached_lane_program,
+    compile_exported_trace,
+    wrap_with_saved_trace,
 )
-from vrw_jax.runtime.disk_cache import source_digest
+from vrw_jax.runtime.disk_cache import compute_source_digest
 from vrw_jax.runtime.lazy_import import lazy_import, xarray
-from vrw_jax.runtime.settings import with_default_settings
+from vrw_jax.runtime.settings import with_default_jax_settings
 from vrw_jax.runtime.start import start_jax

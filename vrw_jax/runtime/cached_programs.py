@@ -1,5 +1,5 @@
-"""Traced functions saved beside JAX's compilation cache, so that the next start need not trace
-them.
+"""Traced functions saved beside JAX's compilation cache, so that later processes need not trace
+again.
 
 JAX's persistent cache avoids compilation but not tracing, which for a limit cycle with derivatives
 takes longer than a scan of thousands of samples. If that cache is on, its folder also contains
@@ -20,123 +20,158 @@ from jax.sharding import SingleDeviceSharding
 
 from vrw_jax import simd
 from vrw_jax.runtime import disk_cache as store
-from vrw_jax.runtime.start import fusion_emitter_options
+from vrw_jax.runtime.start import make_fusion_emitter_options
 
 
-def compile_exported(
-    function: Callable, arguments: tuple, settings: object, device: jax.Device
+def compile_exported_trace(
+    traced_function: Callable,
+    example_arguments: tuple,
+    cache_settings: object,
+    target_device: jax.Device,
 ) -> Callable:
-    """Return `function` compiled for arguments like these, on `device`.
+    """Return `traced_function`, compiled on `target_device` for arguments with the shapes of
+    `example_arguments`.
 
-    The `repr` of `settings` identifies the values in the function's closure. The program is always
-    compiled from the exported trace, saved or not, so that all runs compile the same program.
+    The `repr` of `cache_settings` identifies the values in the function's closure. The program is
+    always compiled from the exported trace, saved or not, so that all runs compile the same
+    program.
     """
-    exported_trace = _export_trace(function, arguments, settings)
-    sharding = SingleDeviceSharding(device)
-    argument_specs = [
-        jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding) for x in exported_trace.in_avals
+    exported_trace = _load_or_export_trace(traced_function, example_arguments, cache_settings)
+    device_sharding = SingleDeviceSharding(target_device)
+    argument_shapes = [
+        jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device_sharding)
+        for x in exported_trace.in_avals
     ]
-    program = (
-        jax.jit(exported_trace.call).lower(*argument_specs).compile(fusion_emitter_options(False))
+    compiled_program = (
+        jax.jit(exported_trace.call)
+        .lower(*argument_shapes)
+        .compile(make_fusion_emitter_options(False))
     )
-    return lambda *arguments: program(*jax.tree.leaves(arguments))
+    return lambda *example_arguments: compiled_program(*jax.tree.leaves(example_arguments))
 
 
-def cached_trace(function: Callable, settings: object) -> Callable:
-    """Return a function that calls `function` through its saved trace if there is one.
+def wrap_with_saved_trace(traced_function: Callable, cache_settings: object) -> Callable:
+    """Return a function that calls `traced_function` through its saved trace if there is one.
 
-    The result is called while a program is traced. `function` must not be mapped or differentiated
-    from outside. As with `compile_exported`, first and later runs use the exported trace.
+    The result is called while a program is traced. `traced_function` must not be mapped or
+    differentiated from outside. As with `compile_exported_trace`, first and later runs use the
+    exported trace.
     """
 
-    def call_cached(*arguments: Any) -> Any:
-        if _is_exporting.get() or not store.cache_folder():
-            return function(*arguments)
-        return _export_trace(function, arguments, settings).call(*jax.tree.leaves(arguments))
+    def call_saved_trace(*arguments: Any) -> Any:
+        if _is_exporting_trace.get() or not store.find_cache_folder():
+            return traced_function(*arguments)
+        return _load_or_export_trace(traced_function, arguments, cache_settings).call(
+            *jax.tree.leaves(arguments)
+        )
 
-    return call_cached
+    return call_saved_trace
 
 
-def cached_lane_program(
-    function: Callable,
+def compile_cached_lane_program(
+    lane_function: Callable,
     scalar_dtypes: Sequence[np.dtype],
-    n_lanes_in: int,
-    dtype: np.dtype,
-    settings: Any,
-    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS,
+    n_lane_arrays: int,
+    lane_dtype: np.dtype,
+    cache_settings: Any,
+    register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
     """Return `simd.compile_lane_program` of a function of this library, with a record on disk.
 
-    `settings` is as for `compile_exported`.
+    `cache_settings` is as for `compile_exported_trace`.
     """
-    key = (settings, store.describe_process())
-    return simd.compile_lane_program(function, scalar_dtypes, n_lanes_in, dtype, key, store, limits)
+    trace_key = (cache_settings, store.describe_trace_environment())
+    return simd.compile_lane_program(
+        lane_function, scalar_dtypes, n_lane_arrays, lane_dtype, trace_key, store, register_limits
+    )
 
 
-def cached_lane_function(
-    function: Callable,
-    shape_function: Callable,
-    settings: object,
-    limits: simd.RegisterLimits = simd.DEFAULT_LIMITS,
+def compile_cached_lane_function(
+    lane_function: Callable,
+    result_shape_function: Callable,
+    cache_settings: object,
+    register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable:
     """Return `simd.compile_lane_function` of a function of this library, with a record on disk."""
     return simd.compile_lane_function(
-        function, shape_function, (settings, store.describe_process()), store, limits
+        lane_function,
+        result_shape_function,
+        (cache_settings, store.describe_trace_environment()),
+        store,
+        register_limits,
     )
 
 
-def _export_trace(function: Callable, arguments: tuple, settings: object) -> export.Exported:
-    """Return the exported trace of `function` for arguments like these, as a function of the
-    flat arguments.
+def _load_or_export_trace(
+    traced_function: Callable, example_arguments: tuple, cache_settings: object
+) -> export.Exported:
+    """Return the exported trace of a function as a function of the flat arguments.
+
+    The trace is loaded from disk if a record exists, and otherwise made for the shapes of
+    `example_arguments`.
     """
-    leaves, structure = jax.tree.flatten(arguments)
-    shapes = [jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+    argument_leaves, argument_structure = jax.tree.flatten(example_arguments)
+    argument_shapes = [
+        jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in argument_leaves
+    ]
     # A trace calls the machine code of one processor, but several may share the folder.
     device_platform = (
         jax.default_backend(),
-        simd.describe_processor() if simd.is_available() else None,
+        simd.describe_processor() if simd.is_machine_code_available() else None,
     )
-    key_parts = (settings, str(structure), shapes, device_platform, store.describe_process())
+    key_parts = (
+        cache_settings,
+        str(argument_structure),
+        argument_shapes,
+        device_platform,
+        store.describe_trace_environment(),
+    )
     record_name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
-    trace_bytes = store.load_bytes(record_name)
-    if trace_bytes is not None:
-        code_names_bytes, _, trace = trace_bytes.partition(b"\n")
+    record_content = store.load_bytes(record_name)
+    if record_content is not None:
+        code_names_bytes, _, serialized_trace = record_content.partition(b"\n")
         try:
-            if simd.ensure_loaded(code_names_bytes.decode().split(), store):
-                return export.deserialize(bytearray(trace))
+            if simd.load_saved_machine_code(code_names_bytes.decode().split(), store):
+                return export.deserialize(bytearray(serialized_trace))
         except Exception:  # JAX documents no type of error for bytes that are no trace.
-            store.warn_unusable(f"{record_name} is no trace")
-    flat_function = jax.jit(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))
+            store.warn_of_unusable_record(f"{record_name} is no trace")
+    flat_function = jax.jit(
+        lambda *argument_leaves: traced_function(
+            *jax.tree.unflatten(argument_structure, argument_leaves)
+        )
+    )
     # Cached traces that are called inside become part of this trace.
-    context_token = _is_exporting.set(True)
+    context_token = _is_exporting_trace.set(True)
     try:
         # The export below finds this trace in JAX's cache.
-        code_names = sorted(_machine_code_names(flat_function.trace(*shapes).jaxpr))
+        code_names = sorted(_find_machine_code_names(flat_function.trace(*argument_shapes).jaxpr))
         allowed_checks = [
             export.DisabledSafetyCheck.custom_call(record_name) for record_name in code_names
         ]
-        exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(*shapes)
+        exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(
+            *argument_shapes
+        )
     finally:
-        _is_exporting.reset(context_token)
+        _is_exporting_trace.reset(context_token)
     store.save_bytes(
         record_name, " ".join(code_names).encode() + b"\n" + bytes(exported_trace.serialize())
     )
     return exported_trace
 
 
-def _machine_code_names(trace: Any) -> set[str]:
+def _find_machine_code_names(traced_program: Any) -> set[str]:
     """Return the names of the machine code that a trace calls."""
-    trace = getattr(trace, "jaxpr", trace)
+    traced_program = getattr(traced_program, "jaxpr", traced_program)
     code_names = {
-        inner_equation.params["code"].name
-        for inner_equation in trace.eqns
+        inner_equation.params["code"].code_name
+        for inner_equation in traced_program.eqns
         if inner_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
     }
-    for equation in trace.eqns:
+    for equation in traced_program.eqns:
         for leaf in jax.tree.leaves(list(equation.params.values())):
             if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):
-                code_names |= _machine_code_names(leaf)
+                code_names |= _find_machine_code_names(leaf)
     return code_names
 
 
-_is_exporting: ContextVar[bool] = ContextVar("_exporting", default=False)
+_is_exporting_trace: ContextVar[bool] = ContextVar("_exporting", default=False)

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 class _LazyLibrary:
     """A library that is imported on the first access to one of its attributes."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, library_name: str) -> None:
+        self._library_name = library_name
 
-    def __getattr__(self, attribute: str) -> Any:
-        return getattr(importlib.import_module(self._name), attribute)
+    def __getattr__(self, attribute_name: str) -> Any:
+        return getattr(importlib.import_module(self._library_name), attribute_name)
 
 
-def lazy_import(name: str) -> Any:
-    """Return the library `name`, which is imported on the first access to an attribute."""
-    return _LazyLibrary(name)
+def lazy_import(library_name: str) -> Any:
+    """Return a library that is imported on the first access to one of its attributes."""
+    return _LazyLibrary(library_name)
 
 
 if TYPE_CHECKING:

@@ -42,52 +42,55 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
                 f"cache is {cache}, a file, but compiled code is kept in a folder: give a folder."
             )
     if check_bool("trust_shared", trust_shared):
-        os.environ[store.TRUST_SHARED_VARIABLE] = "1"  # The setting also holds for child processes.
+        os.environ[store.TRUST_SHARED_CACHE_VARIABLE] = (
+            "1"  # The setting also holds for child processes.
+        )
     jax.config.update("jax_enable_x64", True)
     if cache is not None or "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = _user_cache_folder() / "vrw_jax" if cache is None else cache
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    _require_private_cache()
+        jax_cache_folder = _find_user_cache_folder() / "vrw_jax" if cache is None else cache
+        jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))
+    _require_private_cache_folder()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    flags = os.environ.get("XLA_FLAGS", "")
+    xla_flags = os.environ.get("XLA_FLAGS", "")
     # XLA reads the flags when the first array is created.
-    if _accepts_emitters_flag() and _EMITTERS_FLAG not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS_FLAG}=false".strip()
+    if _accepts_fusion_emitters_flag() and _FUSION_EMITTERS_FLAG not in xla_flags:
+        os.environ["XLA_FLAGS"] = f"{xla_flags} --{_FUSION_EMITTERS_FLAG}=false".strip()
 
 
-def _require_private_cache() -> None:
-    """Create the cache's folder for the user alone, or raise an error if others can write it."""
-    folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not folder or "://" in folder:
+def _require_private_cache_folder() -> None:
+    """Create the cache folder for the user alone. Raise an error if other users can write it."""
+    jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if not jax_cache_folder or "://" in jax_cache_folder:
         return
-    distrust_reason = store.describe_untrusted_folder(Path(folder))
+    distrust_reason = store.describe_untrusted_folder(Path(jax_cache_folder))
     if distrust_reason:
         jax.config.update("jax_compilation_cache_dir", None)
         raise PermissionError(f"{distrust_reason}.")
     with contextlib.suppress(OSError):  # Without the folder nothing is cached.
-        store.make_folder(Path(folder))
+        store.make_cache_folder(Path(jax_cache_folder))
 
 
-def fusion_emitter_options(is_enabled: bool) -> dict[str, str | bool]:
+def make_fusion_emitter_options(is_enabled: bool) -> dict[str, str | bool]:
     """Return the options of `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
 
-    Without these emitters, XLA compiles in half to two thirds of the time. The code is as fast or,
+    Without fusion emitters, XLA compiles in half to two thirds of the time. The code is as fast or,
     for events with unilateral contact, slower by a seventh. Programs whose digits must not depend
     on the process always set the option.
     """
-    has_emitters = _accepts_emitters_flag() and jax.default_backend() == "cpu"
-    return {_EMITTERS_FLAG: is_enabled} if has_emitters else {}
+    has_emitters = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
+    return {_FUSION_EMITTERS_FLAG: is_enabled} if has_emitters else {}
 
 
-_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
+_FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
 
 
-def _accepts_emitters_flag() -> bool:
-    """Return whether this version of XLA accepts the flag; others may abort the process."""
+def _accepts_fusion_emitters_flag() -> bool:
+    """Return whether this version of XLA accepts the flag of fusion emitters. Other versions may
+    abort the process."""
     return jax.__version_info__[:2] in ((0, 9), (0, 10))
 
 
-def _user_cache_folder() -> Path:
+def _find_user_cache_folder() -> Path:
     """Return the folder in which this operating system keeps the user's caches."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))

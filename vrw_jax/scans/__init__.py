@@ -3,7 +3,7 @@
 from vrw_jax.scans import dask, design, execution, forecast, integrity, planning, store
 from vrw_jax.scans.design import (
     MAX_LISTED_SAMPLES,
-    SALTELLI_KIND,
+    SALTELLI_DESIGN_KIND,
     SWEEPABLE_PARAMETERS,
     grid,
     saltelli,
@@ -13,20 +13,20 @@ from vrw_jax.scans.design import (
 )
 from vrw_jax.scans.execution import (
     ScanProgress,
-    find_store,
+    find_matching_store,
     open_or_create_store,
     resolve_executor,
     run_scan,
     scan,
 )
-from vrw_jax.scans.forecast import forecast_scan, format_seconds
-from vrw_jax.scans.integrity import read_manifest
+from vrw_jax.scans.forecast import forecast_scan, format_duration
+from vrw_jax.scans.integrity import read_scan_manifest
 from vrw_jax.scans.measure_catalog import (
-    CATALOGS,
     DIFFERENTIABLE_MEASURES,
-    TOLERANCE_CATALOG,
+    MEASURE_CATALOGS,
+    TOLERANCE_MEASURE_CATALOG,
     add_passage_measures,
-    check_measures,
+    check_measure_names,
 )
 from vrw_jax.scans.planning import ScanPlan, plan_scan
 from vrw_jax.scans.sensitivity_indices import sobol_indices

@@ -21,240 +21,299 @@ from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step,
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
-from vrw_jax.runtime import compile_exported, with_default_settings
+from vrw_jax.runtime import compile_exported_trace, with_default_jax_settings
 from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
-"""Outcome, section state, and measures by name."""
+"""Outcome of a gait, its section state, and its measures by name."""
 
 
 class EvaluationRequest(NamedTuple):
     """Measures to compute for each sample, with the wheel, the model and the options."""
 
-    measures: tuple[str, ...]
-    base: WheelParams
-    model: Any
-    options: StepOptions
+    measure_names: tuple[str, ...]
+    base_wheel: WheelParams
+    wheel_model: Any
+    step_options: StepOptions
     cycle_options: CycleOptions
     # largest permitted error of each measure, in its unit; None for a scan without tolerance
-    tol: float | None
+    error_tolerance: float | None
     # standard deviation of random slopes, rad; None for a scan without measures of such walks
-    slope_sd: float | None = None
+    slope_standard_deviation: float | None = None
 
 
-class CollocationEngine:
-    """Engine that evaluates samples with the paper's model and a fixed set of measures; the first
-    call compiles it.
+class CollocationScanEngine:
+    """Scan engine for the paper's model and a fixed set of measures, compiled by the first call.
 
-    It finds the limit cycle with the requested derivatives by collocation. It then takes one
-    event-driven step from the cycle, for the margins and as a check. Both functions are compiled in
-    parallel.
+    The engine finds each limit cycle with the requested derivatives by collocation. It then takes
+    one event-driven step from the cycle, which gives the margins and checks the cycle. Both
+    functions are compiled in parallel.
     """
 
-    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        """Initialize the engine; `threads` is the number of CPU threads, by default one per
+    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
+        """Initialize the engine; `n_threads` is the number of CPU threads, by default one per
         core.
         """
-        measures, base, model = request.measures, request.base, request.model
-        options, cycle_options = request.options, request.cycle_options
-        self._threads = count_cores() if threads is None else threads
-        self._base, self._model, self._options = base, model, options
+        variable_names, base_wheel, wheel_model = (
+            request.measure_names,
+            request.base_wheel,
+            request.wheel_model,
+        )
+        step_options, cycle_options = request.step_options, request.cycle_options
+        self._n_threads = count_available_cores() if n_threads is None else n_threads
+        self._base_wheel, self._wheel_model, self._step_options = (
+            base_wheel,
+            wheel_model,
+            step_options,
+        )
         requested_derivatives = tuple(
-            derivative for name in measures if (derivative := parse_derivative(name)) is not None
+            requested_derivative
+            for measure_name in variable_names
+            if (requested_derivative := parse_derivative(measure_name)) is not None
         )
-        measure_names = tuple(name for name in measures if parse_derivative(name) is None)
-        parameters = tuple(
-            dict.fromkeys(derivative.parameter for derivative in requested_derivatives)
+        measure_names = tuple(
+            measure_name
+            for measure_name in variable_names
+            if parse_derivative(measure_name) is None
         )
-        swept_indices = np.asarray([PARAMETER_NAMES.index(name) for name in parameters], int)
+        differentiation_parameters = tuple(
+            dict.fromkeys(
+                requested_derivative.parameter_name
+                for requested_derivative in requested_derivatives
+            )
+        )
+        differentiation_indices = np.asarray(
+            [PARAMETER_NAMES.index(measure_name) for measure_name in differentiation_parameters],
+            int,
+        )
 
-        finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+        gait_finder = make_finder(
+            wheel_model, base_wheel.n_legs, cycle_options=cycle_options, step_options=step_options
+        )
 
-        def find_cycle_with_derivatives(values: Array) -> tuple[AbstractCycle, dict[str, Array]]:
+        def find_cycle_with_derivatives(
+            parameter_values: Array,
+        ) -> tuple[AbstractCycle, dict[str, Array]]:
             """Return the limit cycle of one wheel and the requested derivatives by name."""
 
             def find_measures_and_cycle(
-                swept_values: Array,
+                varied_values: Array,
             ) -> tuple[dict[str, Array], AbstractCycle]:
-                cycle = finder.find_cycle_from_values(values.at[swept_indices].set(swept_values))
-                return cycle.measures(
-                    derivative.measure for derivative in requested_derivatives
-                ), cycle
+                limit_cycle = gait_finder.find_cycle_from_values(
+                    parameter_values.at[differentiation_indices].set(varied_values)
+                )
+                return limit_cycle.measures(
+                    requested_derivative.measure_name
+                    for requested_derivative in requested_derivatives
+                ), limit_cycle
 
             if not requested_derivatives:
-                return find_measures_and_cycle(values[swept_indices])[1], {}
-            jacobian, cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
-                values[swept_indices]
+                return find_measures_and_cycle(parameter_values[differentiation_indices])[1], {}
+            measure_jacobian, limit_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)(
+                parameter_values[differentiation_indices]
             )
-            return cycle, {
-                derivative.name: jacobian[derivative.measure][
-                    parameters.index(derivative.parameter)
-                ]
-                for derivative in requested_derivatives
+            return limit_cycle, {
+                requested_derivative.variable_name: measure_jacobian[
+                    requested_derivative.measure_name
+                ][differentiation_parameters.index(requested_derivative.parameter_name)]
+                for requested_derivative in requested_derivatives
             }
 
-        def evaluate_cycle(values: Array) -> GaitOutputs:
-            """Return outcome, section state and measures that follow from the limit cycle."""
-            cycle, derivative_values = find_cycle_with_derivatives(values)
-            names = (
-                *(name for name in measure_names if name in DIFFERENTIABLE_MEASURES),
+        def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
+            """Return the outcome, the section state and the measures of the limit cycle of one
+            wheel."""
+            limit_cycle, derivative_values = find_cycle_with_derivatives(parameter_values)
+            cycle_measure_names = (
+                *(
+                    measure_name
+                    for measure_name in measure_names
+                    if measure_name in DIFFERENTIABLE_MEASURES
+                ),
                 "spectral_radius",
             )
-            return cycle.outcome, cycle.section_state, cycle.measures(names) | derivative_values
-
-        def evaluate_step(values: Array, section_state: Array, options: StepOptions) -> GaitOutputs:
-            """Return outcome, section state and measures that follow from a step from the cycle."""
-            result = model.take_step(
-                wheel_from_parameters(values, base.n_legs), section_state, options
+            return (
+                limit_cycle.outcome,
+                limit_cycle.section_state,
+                limit_cycle.measures(cycle_measure_names) | derivative_values,
             )
-            measures = result.measures()
-            names = (
-                *(name for name in measure_names if name not in DIFFERENTIABLE_MEASURES),
+
+        def evaluate_step(
+            parameter_values: Array, section_state: Array, step_options: StepOptions
+        ) -> GaitOutputs:
+            """Return the outcome, the section state and the measures of one step from the limit
+            cycle."""
+            step_result = wheel_model.take_step(
+                wheel_from_parameters(parameter_values, base_wheel.n_legs),
+                section_state,
+                step_options,
+            )
+            step_measures = step_result.measures()
+            step_measure_names = (
+                *(
+                    measure_name
+                    for measure_name in measure_names
+                    if measure_name not in DIFFERENTIABLE_MEASURES
+                ),
                 *MARGIN_MEASURES,
             )
-            return result.outcome, result.section_state, {name: measures[name] for name in names}
+            return (
+                step_result.outcome,
+                step_result.section_state,
+                {measure_name: step_measures[measure_name] for measure_name in step_measure_names},
+            )
 
-        self._evaluate_cycle: Callable = jax.vmap(evaluate_cycle)
-        self._evaluate_step: Callable = jax.vmap(evaluate_step, in_axes=(0, 0, None))
+        self._evaluate_cycle_batch: Callable = jax.vmap(evaluate_cycle)
+        self._evaluate_step_batch: Callable = jax.vmap(evaluate_step, in_axes=(0, 0, None))
         # The repr of a model omits defaults by identity, and pickling does not preserve identity.
-        model_identity = (type(model).__name__, *vars(model).items())
-        self._cache_key = (measures, base.n_legs, model_identity, cycle_options)
-        self._free_programs: SimpleQueue[_CompiledPrograms] = SimpleQueue()
+        model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
+        self._cache_key = (variable_names, base_wheel.n_legs, model_identity, cycle_options)
+        self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
 
-    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results by variable; `columns` contains the values of each swept parameter,
-        one per sample.
-        """
-        parameter_rows = stack_parameters(columns, self._model, self._base)
+    def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the results of all samples by variable. `sample_columns` contains the values of
+        each swept parameter, one per sample."""
+        parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
         with self._compilation_lock:
             if not self._n_workers:
-                self._compile()
-        batches = (
+                self._compile_programs()
+        parameter_batches = (
             parameter_rows[first_sample : first_sample + batch_sizes.SCAN_BATCH_SIZE]
             for first_sample in range(0, len(parameter_rows), batch_sizes.SCAN_BATCH_SIZE)
         )
-        with ThreadPoolExecutor(self._n_workers) as threads:
-            batch_results = list(threads.map(self._evaluate_batch, batches))
+        with ThreadPoolExecutor(self._n_workers) as thread_pool:
+            batch_results = list(thread_pool.map(self._evaluate_sample_batch, parameter_batches))
         return {
-            name: np.concatenate([results[name] for results in batch_results])[
-                : len(parameter_rows)
-            ]
-            for name in batch_results[0]
+            variable_name: np.concatenate(
+                [batch_result[variable_name] for batch_result in batch_results]
+            )[: len(parameter_rows)]
+            for variable_name in batch_results[0]
         }
 
-    @with_default_settings  # It runs in a thread of its own.
-    def _evaluate_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the results of a batch, which is padded with copies of its first wheel."""
+    @with_default_jax_settings  # It runs in a thread of its own.
+    def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the results of a batch of samples, which is padded with copies of its first
+        wheel.
+        """
         padded_parameter_rows = np.concatenate(
             [
                 parameter_rows,
                 np.repeat(parameter_rows[:1], batch_sizes.SCAN_BATCH_SIZE - len(parameter_rows), 0),
             ]
         )
-        programs = self._free_programs.get()
+        device_programs = self._free_programs.get()
         try:
-            values = jax.device_put(padded_parameter_rows, programs.device)
-            outcome, section_state, cycle_measures = programs.evaluate_cycle(values)
-            options = jax.device_put(self._options, programs.device)
-            step_outcome, step_state, step_measures = programs.evaluate_step(
-                values, section_state, options
+            device_parameter_rows = jax.device_put(padded_parameter_rows, device_programs.device)
+            cycle_outcome, cycle_section_state, cycle_measures = device_programs.evaluate_cycle(
+                device_parameter_rows
+            )
+            device_options = jax.device_put(self._step_options, device_programs.device)
+            step_outcome, step_end_state, step_measures = device_programs.evaluate_step(
+                device_parameter_rows, cycle_section_state, device_options
             )
             confirmed_outcome = confirm_outcome_by_step(
-                outcome, section_state, step_outcome, step_state
+                cycle_outcome, cycle_section_state, step_outcome, step_end_state
             )
-            measures = cycle_measures | step_measures
+            sample_measures = cycle_measures | step_measures
         finally:
-            self._free_programs.put(programs)
-        return mask_failures(confirmed_outcome, measures)
+            self._free_programs.put(device_programs)
+        return mask_failed_samples(confirmed_outcome, sample_measures)
 
-    def _compile(self) -> None:
-        """Compile both functions in parallel for each device; the cores of a CPU share the
-        programs.
-        """
-        devices = jax.local_devices()
-        values = jax.ShapeDtypeStruct(
-            (batch_sizes.SCAN_BATCH_SIZE, len(PARAMETER_NAMES)), self._dtype
+    def _compile_programs(self) -> None:
+        """Compile both functions in parallel for each device. All cores of a CPU use the same
+        programs."""
+        local_devices = jax.local_devices()
+        parameter_dtype = np.dtype(self._base_wheel.damping.dtype)
+        parameter_rows_shape = jax.ShapeDtypeStruct(
+            (batch_sizes.SCAN_BATCH_SIZE, len(PARAMETER_NAMES)), parameter_dtype
         )
-        section_state = jax.ShapeDtypeStruct((batch_sizes.SCAN_BATCH_SIZE, 3), self._dtype)
+        section_states_shape = jax.ShapeDtypeStruct(
+            (batch_sizes.SCAN_BATCH_SIZE, 3), parameter_dtype
+        )
         cache_key = self._cache_key
         # Threads have separate settings.
-        compile_with_defaults = with_default_settings(compile_exported)
-        with ThreadPoolExecutor(2) as threads:
-            step_arguments = (values, section_state, self._options)
+        compile_with_defaults = with_default_jax_settings(compile_exported_trace)
+        with ThreadPoolExecutor(2) as thread_pool:
+            step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
             step_programs = [
-                threads.submit(
+                thread_pool.submit(
                     compile_with_defaults,
-                    self._evaluate_step,
+                    self._evaluate_step_batch,
                     step_arguments,
                     ("step", *cache_key),
                     device,
                 )
-                for device in devices
+                for device in local_devices
             ]
             cycle_programs = [
-                threads.submit(
+                thread_pool.submit(
                     compile_with_defaults,
-                    self._evaluate_cycle,
-                    (values,),
+                    self._evaluate_cycle_batch,
+                    (parameter_rows_shape,),
                     ("cycle", *cache_key),
                     device,
                 )
-                for device in devices
+                for device in local_devices
             ]
         for device, cycle_program, step_program in zip(
-            devices, cycle_programs, step_programs, strict=True
+            local_devices, cycle_programs, step_programs, strict=True
         ):
-            n_programs = self._threads if device.platform == "cpu" and len(devices) == 1 else 1
-            for _ in range(n_programs):
+            n_device_programs = (
+                self._n_threads if device.platform == "cpu" and len(local_devices) == 1 else 1
+            )
+            for _ in range(n_device_programs):
                 self._free_programs.put(
-                    _CompiledPrograms(device, cycle_program.result(), step_program.result())
+                    _CompiledDevicePrograms(device, cycle_program.result(), step_program.result())
                 )
-            self._n_workers += n_programs
-
-    @property
-    def _dtype(self) -> np.dtype:
-        """Return the floating-point type of the parameters."""
-        return np.dtype(self._base.damping.dtype)
+            self._n_workers += n_device_programs
 
 
-class _CompiledPrograms(NamedTuple):
-    """Compiled functions of one device."""
+class _CompiledDevicePrograms(NamedTuple):
+    """Compiled functions of cycles and steps on one device."""
 
     device: jax.Device
     evaluate_cycle: Callable
     evaluate_step: Callable
 
 
-def count_cores() -> int:
+def count_available_cores() -> int:
     """Return the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def stack_parameters(
-    columns: Mapping[str, np.ndarray], model: AbstractWheel, base: WheelParams
+def stack_parameter_rows(
+    sample_columns: Mapping[str, np.ndarray], wheel_model: AbstractWheel, base_wheel: WheelParams
 ) -> np.ndarray:
     """Return the model's parameters of each sample, shape (samples, parameters)."""
-    n = len(next(iter(columns.values())))
-    base_values = np.asarray(model.parameter_values(base))
+    n_samples = len(next(iter(sample_columns.values())))
+    base_parameter_values = np.asarray(wheel_model.parameter_values(base_wheel))
     return np.stack(
         [
-            np.asarray(columns.get(name, np.broadcast_to(value, n)), base_values.dtype)
-            for name, value in zip(model.parameter_names, base_values, strict=True)
+            np.asarray(
+                sample_columns.get(parameter_name, np.broadcast_to(base_value, n_samples)),
+                base_parameter_values.dtype,
+            )
+            for parameter_name, base_value in zip(
+                wheel_model.parameter_names, base_parameter_values, strict=True
+            )
         ],
         axis=-1,
     )
 
 
-def mask_failures(outcome: np.ndarray, values_by_name: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return outcome and measures by name; a sample without a gait has NaN, or -1 in an integer
-    variable.
-    """
-    measures = {name: np.array(value) for name, value in values_by_name.items()}
-    for value in measures.values():
-        missing_value = np.nan if np.issubdtype(value.dtype, np.floating) else -1
-        value[outcome != Outcome.STEPPED] = missing_value
-    return {"outcome": outcome.astype(np.int8)} | measures
+def mask_failed_samples(
+    outcome: np.ndarray, measures_by_name: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
+    """Return outcome and measures by name. In samples without a gait, a measure is NaN, or -1 if it
+    is an integer."""
+    masked_measures = {
+        variable_name: np.array(variable_values)
+        for variable_name, variable_values in measures_by_name.items()
+    }
+    for variable_values in masked_measures.values():
+        missing_value = np.nan if np.issubdtype(variable_values.dtype, np.floating) else -1
+        variable_values[outcome != Outcome.STEPPED] = missing_value
+    return {"outcome": outcome.astype(np.int8)} | masked_measures

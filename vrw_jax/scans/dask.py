@@ -1,8 +1,8 @@
 """Scans on the workers of a dask cluster: a free worker computes each chunk of `run_scan`.
 
 Workers only compute, and the calling process writes the store. If a worker dies, other workers
-compute its chunks. Workers return a description of their environment. A chunk from an environment
-that differs from that of the calling process raises an error, because its last digits might differ.
+compute its chunks. Each worker returns a description of its environment. A chunk raises an error if
+its environment differs from that of the calling process, because its last digits might differ.
 """
 
 import asyncio
@@ -20,63 +20,67 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vrw_jax.runtime import start_jax
-from vrw_jax.scans.collocation_engine import count_cores
+from vrw_jax.scans.collocation_engine import count_available_cores
 from vrw_jax.scans.design import SampleColumns
-from vrw_jax.scans.engines import make_engine
+from vrw_jax.scans.engines import make_scan_engine
 from vrw_jax.scans.planning import (
     ChunkExecutor,
     ChunkResult,
-    EvaluateSamples,
+    SampleEvaluator,
     ScanPlan,
-    describe_difference,
-    describe_environment,
+    describe_computing_environment,
+    describe_settings_difference,
 )
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-QUEUED_CHUNKS_PER_THREAD = 2
-"""Number of submitted chunks per thread, chosen so that a thread always has work and little
-memory is used.
-"""
+N_QUEUED_CHUNKS_PER_THREAD = 2
+"""Number of submitted chunks per thread, chosen because a thread then always has work, and little
+memory is used."""
 
-SCHEDULER_TIMEOUT = "10s"
-"""Longest time in which a scheduler must respond."""
+DASK_SCHEDULER_TIMEOUT = "10s"
+"""Longest time in which a dask scheduler must respond, in dask's notation."""
 
-MAX_SILENT_SECONDS = 10.0
-"""Longest time without a result before the workers are counted, s. It is chosen because workers
-that have just started are connected by then.
-"""
+MAX_SECONDS_WITHOUT_RESULT = 10.0
+"""Longest time without a result before the workers are counted, s. The value is chosen because
+workers that have just started are connected by then."""
 
 
 @contextlib.contextmanager
-def connect_workers(address: str) -> Iterator[ChunkExecutor]:
-    """Yield an executor on the cluster at `address`; "local" starts one process per core."""
+def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
+    """Yield a function that computes chunks on the cluster at `scheduler_address`. The address
+    "local" starts one process per core."""
     try:
         from distributed import Client, LocalCluster
-    except ImportError as error:
+    except ImportError as connection_error:
         raise ValueError(
             "a scan on a cluster needs dask.distributed, which is not installed: "
             "run pip install 'vrw-jax[dask]'."
-        ) from error
+        ) from connection_error
     with contextlib.ExitStack() as exit_stack:
         exit_stack.enter_context(_hide_cancelled_tasks())
-        if address == "local":
-            cluster = LocalCluster(
-                n_workers=count_cores(), threads_per_worker=1, dashboard_address=None
+        if scheduler_address == "local":
+            local_cluster = LocalCluster(
+                n_workers=count_available_cores(), threads_per_worker=1, dashboard_address=None
             )
-            client = Client(exit_stack.enter_context(cluster), set_as_default=False)
+            dask_client = Client(exit_stack.enter_context(local_cluster), set_as_default=False)
         else:
             try:
-                _require_response(address)
-                client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
-            except Exception as error:  # Libraries raise different errors for a wrong address.
+                _require_scheduler_response(scheduler_address)
+                dask_client = Client(
+                    scheduler_address, timeout=DASK_SCHEDULER_TIMEOUT, set_as_default=False
+                )
+            except (
+                Exception
+            ) as connection_error:  # Libraries raise different errors for a wrong address.
                 raise ValueError(
-                    f"no dask scheduler answers at {address!r}: give the address that it printed "
+                    f"no dask scheduler answers at {scheduler_address!r}: give the address that "
+                    f"it printed "
                     "when it started, such as tcp://host:8786, or 'local'."
-                ) from error
-        exit_stack.enter_context(client)
-        yield functools.partial(_compute_chunks, client, address)
+                ) from connection_error
+        exit_stack.enter_context(dask_client)
+        yield functools.partial(_compute_chunks_on_cluster, dask_client, scheduler_address)
 
 
 @contextlib.contextmanager
@@ -84,99 +88,111 @@ def _hide_cancelled_tasks() -> Iterator[None]:
     """Return a context that removes tasks cancelled with a lost scheduler from the log of
     distributed.
     """
-    logger = logging.getLogger("distributed.client")
+    client_logger = logging.getLogger("distributed.client")
 
-    def is_shown(record: logging.LogRecord) -> bool:
-        error_type = record.exc_info[0] if record.exc_info else None
+    def is_log_record_shown(log_record: logging.LogRecord) -> bool:
+        error_type = log_record.exc_info[0] if log_record.exc_info else None
         return error_type is None or not issubclass(error_type, asyncio.CancelledError)
 
-    logger.addFilter(is_shown)
+    client_logger.addFilter(is_log_record_shown)
     try:
         yield
     finally:
-        logger.removeFilter(is_shown)
+        client_logger.removeFilter(is_log_record_shown)
 
 
-def _require_response(address: str) -> None:
-    """Raise a ValueError unless a scheduler responds at `address`; a client would wait without
-    limit.
-    """
+def _require_scheduler_response(scheduler_address: str) -> None:
+    """Raise an error unless a scheduler responds at `scheduler_address`. Without this check, a
+    client would wait without limit."""
     from dask.utils import parse_timedelta
     from distributed.comm import connect
     from distributed.security import Security
 
-    async def connect_once() -> None:
+    async def connect_to_scheduler() -> None:
         arguments = Security().get_connection_args("client")
-        timeout_seconds = parse_timedelta(SCHEDULER_TIMEOUT)
+        timeout_seconds = parse_timedelta(DASK_SCHEDULER_TIMEOUT)
         connection = await asyncio.wait_for(
-            connect(address, timeout=timeout_seconds, **arguments), 2 * timeout_seconds
+            connect(scheduler_address, timeout=timeout_seconds, **arguments), 2 * timeout_seconds
         )
         connection.abort()
 
     with ThreadPoolExecutor(
         1
     ) as connection_pool:  # The event loop of a notebook is already running.
-        connection_pool.submit(asyncio.run, connect_once()).result()
+        connection_pool.submit(asyncio.run, connect_to_scheduler()).result()
 
 
-def _compute_chunks(
-    client: "Client", address: str, plan: ScanPlan, missing_chunks: Sequence[int]
+def _compute_chunks_on_cluster(
+    dask_client: "Client",
+    scheduler_address: str,
+    scan_plan: ScanPlan,
+    missing_chunks: Sequence[int],
 ) -> Iterator[ChunkResult]:
-    """Yield the results of the missing chunks in the order of completion."""
-    pickled_request = pickle.dumps(plan.request)
-    local_environment, remaining_chunks = describe_environment(), iter(missing_chunks)
-    chunk_of_future: dict[Future, int] = {}
+    """Yield the index and the results of each missing chunk, in the order of completion."""
+    pickled_request = pickle.dumps(scan_plan.evaluation_request)
+    local_environment, remaining_chunks = describe_computing_environment(), iter(missing_chunks)
+    chunk_index_by_future: dict[Future, int] = {}
     completed_futures: SimpleQueue[Future] = SimpleQueue()
 
-    def submit_chunks() -> None:
+    def submit_remaining_chunks() -> None:
         """Submit chunks until every thread of the cluster has enough of them."""
-        n_free_slots = QUEUED_CHUNKS_PER_THREAD * max(1, sum(client.nthreads().values())) - len(
-            chunk_of_future
-        )
+        n_free_slots = N_QUEUED_CHUNKS_PER_THREAD * max(
+            1, sum(dask_client.nthreads().values())
+        ) - len(chunk_index_by_future)
         for chunk_index in itertools.islice(remaining_chunks, max(n_free_slots, 0)):
-            columns = plan.design.sample_block(plan.layout.chunk_region(chunk_index))
-            future = client.submit(_compute_in_worker, pickled_request, columns, pure=False)
-            chunk_of_future[future] = chunk_index
-            future.add_done_callback(completed_futures.put)
+            sample_columns = scan_plan.design.select_samples(
+                scan_plan.result_layout.get_chunk_region(chunk_index)
+            )
+            chunk_future = dask_client.submit(
+                _compute_chunk_in_worker, pickled_request, sample_columns, pure=False
+            )
+            chunk_index_by_future[chunk_future] = chunk_index
+            chunk_future.add_done_callback(completed_futures.put)
 
     try:
-        with _explain_loss(address, OSError):
-            submit_chunks()
-        while chunk_of_future:
-            with _explain_loss(address, OSError):
-                future = _wait_for_future(client, address, completed_futures)
-            with _explain_loss(address):
-                worker_environment, results = future.result()
-            environment_difference = describe_difference(local_environment, worker_environment)
+        with _explain_lost_cluster(scheduler_address, OSError):
+            submit_remaining_chunks()
+        while chunk_index_by_future:
+            with _explain_lost_cluster(scheduler_address, OSError):
+                chunk_future = _wait_for_completed_future(
+                    dask_client, scheduler_address, completed_futures
+                )
+            with _explain_lost_cluster(scheduler_address):
+                worker_environment, chunk_results = chunk_future.result()
+            environment_difference = describe_settings_difference(
+                local_environment, worker_environment
+            )
             if environment_difference:
                 raise ValueError(
                     "a worker computes by other means than this process: "
                     f"{environment_difference}. "
                     "Start the workers from the same installation on machines of one kind."
                 )
-            yield chunk_of_future.pop(future), results
-            del future  # The cluster can then release the result.
-            with _explain_loss(address, OSError):
-                submit_chunks()
+            yield chunk_index_by_future.pop(chunk_future), chunk_results
+            del chunk_future  # The cluster can then release the result.
+            with _explain_lost_cluster(scheduler_address, OSError):
+                submit_remaining_chunks()
     finally:
-        if client.status == "running":
-            client.cancel(list(chunk_of_future))
+        if dask_client.status == "running":
+            dask_client.cancel(list(chunk_index_by_future))
 
 
-def _wait_for_future(
-    client: "Client", address: str, completed_futures: "SimpleQueue[Future]"
+def _wait_for_completed_future(
+    dask_client: "Client", scheduler_address: str, completed_futures: "SimpleQueue[Future]"
 ) -> "Future":
     """Return the next completed future; warn once if the cluster has no workers."""
     has_warned = False
     while True:
         try:
-            return completed_futures.get(timeout=MAX_SILENT_SECONDS)
+            return completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
         except Empty:
             pass
-        if not has_warned and not client.nthreads():
+        if not has_warned and not dask_client.nthreads():
             warnings.warn(
-                f"the dask cluster at {address} has no workers, so that nothing is computed: start "
-                f"some, as with `dask worker {address}`; the scan continues as soon as there is "
+                f"the dask cluster at {scheduler_address} has no workers, so that nothing is "
+                f"computed: start "
+                f"some, as with `dask worker {scheduler_address}`; the scan continues as soon "
+                f"as there is "
                 "one.",
                 stacklevel=1,
             )
@@ -184,41 +200,49 @@ def _wait_for_future(
 
 
 @contextlib.contextmanager
-def _explain_loss(address: str, *other_errors: type[Exception]) -> Iterator[None]:
-    """Return a context that replaces errors of lost workers or of a lost scheduler by one sentence
+def _explain_lost_cluster(
+    scheduler_address: str, *further_loss_errors: type[Exception]
+) -> Iterator[None]:
+    """Return a context that replaces errors of lost workers or of a lost scheduler by a ValueError
     with a remedy.
 
-    `other_errors` are further exceptions with the same cause, which the chunk itself cannot raise.
+    `further_loss_errors` are exceptions that the context replaces too, because the chunk itself
+    cannot raise them.
     """
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
 
-    loss_errors: tuple[type[BaseException], ...] = (CancelledError, CommClosedError, *other_errors)
+    loss_errors: tuple[type[BaseException], ...] = (
+        CancelledError,
+        CommClosedError,
+        *further_loss_errors,
+    )
     try:
         yield
-    except KilledWorker as error:
+    except KilledWorker as loss_error:
         raise ValueError(
             "a chunk was given up because each worker that had it died: see to the "
             "workers (their memory, say) and run the same again, it goes on from there."
-        ) from error
-    except loss_errors as error:
+        ) from loss_error
+    except loss_errors as loss_error:
         raise ValueError(
-            f"the dask cluster at {address} is gone: start it again and run the same again, it goes"
+            f"the dask cluster at {scheduler_address} is gone: start it again and run the same "
+            f"again, it goes"
             " on with the chunks that its store lacks."
-        ) from error
+        ) from loss_error
 
 
-def _compute_in_worker(
-    pickled_request: bytes, columns: SampleColumns
+def _compute_chunk_in_worker(
+    pickled_request: bytes, sample_columns: SampleColumns
 ) -> tuple[dict[str, object], Mapping[str, np.ndarray]]:
     """Return the environment of the worker and the results of a chunk by variable."""
     start_jax()
-    return describe_environment(), _make_engine_once(pickled_request)(columns)
+    return describe_computing_environment(), _make_worker_engine(pickled_request)(sample_columns)
 
 
 @functools.cache
-def _make_engine_once(pickled_request: bytes) -> EvaluateSamples:
-    """Return the engine of a pickled request, which a worker creates once."""
+def _make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
+    """Return the scan engine of a pickled request, which each worker creates once."""
     from distributed import get_worker
 
-    return make_engine(pickle.loads(pickled_request), get_worker().state.nthreads)
+    return make_scan_engine(pickle.loads(pickled_request), get_worker().state.nthreads)

@@ -28,28 +28,30 @@ ParameterRange = tuple[float, float]
 """Lower and upper bound of a parameter, in its unit."""
 
 MAX_LISTED_SAMPLES = 10_000_000
-"""Largest number of values of an axis or of samples in a list, chosen because they fit into
-memory.
-"""
+"""Largest number of values of an axis, or of samples in a list, chosen because such a list fits
+into memory."""
 
-SALTELLI_KIND = "saltelli"
+SALTELLI_DESIGN_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
 
 
-class AbstractDesign(abc.ABC):
+class AbstractSampleDesign(abc.ABC):
     """Samples of the wheel's parameters, arranged in an array of shape `shape`."""
 
-    kind: str
-    values: Mapping[str, np.ndarray]
+    design_kind: str
+    values_by_parameter: Mapping[str, np.ndarray]
 
     def __repr__(self) -> str:
-        columns = (f"{name} {format_quantity(values, '')}" for name, values in self.values.items())
-        return f"{self.kind} of {self.size:,}: {', '.join(columns)}"
+        column_texts = (
+            f"{parameter_name} {format_quantity(parameter_values, '')}"
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        )
+        return f"{self.design_kind} of {self.size:,}: {', '.join(column_texts)}"
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def swept_parameters(self) -> tuple[str, ...]:
         """Return the names of the swept parameters."""
-        return tuple(self.values)
+        return tuple(self.values_by_parameter)
 
     @property
     def size(self) -> int:
@@ -67,66 +69,78 @@ class AbstractDesign(abc.ABC):
         """Return the lengths of the axes."""
 
     @abc.abstractmethod
-    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, region: tuple[slice, ...]) -> SampleColumns:
         """Return the samples of a rectangular region by parameter, flattened with the last axis
-        fastest.
-        """
+        varying fastest."""
 
     @abc.abstractmethod
-    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the coordinates of a labeled result: for each name the axis and the values."""
+    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        """Return the coordinates of a labeled result. For each name they give the axis and the
+        values."""
 
-    def describe_identity(self) -> dict[str, object]:
+    def describe_design(self) -> dict[str, object]:
         """Return the identity of the design: kind, names, shape and a digest of all numbers."""
         return {
-            "kind": self.kind,
-            "swept": list(self.names),
+            "kind": self.design_kind,
+            "swept": list(self.swept_parameters),
             "shape": list(self.shape),
-            "digest": digest_columns(self.kind, self.values),
+            "digest": digest_sample_columns(self.design_kind, self.values_by_parameter),
         }
 
 
-def digest_columns(kind: str, values: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 digest of a kind, and of the names and values of the columns."""
-    digest = hashlib.sha256(json.dumps([kind, *values]).encode())
-    for column in values.values():
-        digest.update(np.ascontiguousarray(column, dtype="<f8").tobytes())
-    return digest.hexdigest()
+def digest_sample_columns(design_kind: str, values_by_parameter: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 digest of a design's kind, and of the names and values of its
+    parameters.
+    """
+    column_digest = hashlib.sha256(json.dumps([design_kind, *values_by_parameter]).encode())
+    for parameter_values in values_by_parameter.values():
+        column_digest.update(np.ascontiguousarray(parameter_values, dtype="<f8").tobytes())
+    return column_digest.hexdigest()
 
 
 @dataclass(frozen=True, repr=False)
-class Grid(AbstractDesign):
+class GridDesign(AbstractSampleDesign):
     """Design of every combination of the parameters' values, with one axis per parameter."""
 
-    values: Mapping[str, np.ndarray]
-    kind: str = "grid"
+    values_by_parameter: Mapping[str, np.ndarray]
+    design_kind: str = "grid"
 
     @property
     def dims(self) -> tuple[str, ...]:
-        return self.names
+        return self.swept_parameters
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(len(column) for column in self.values.values())
+        return tuple(
+            len(parameter_values) for parameter_values in self.values_by_parameter.values()
+        )
 
-    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
+    def select_samples(self, sample_region: tuple[slice, ...]) -> SampleColumns:
         axis_columns = [
-            column[axis_region]
-            for column, axis_region in zip(self.values.values(), region, strict=True)
+            parameter_values[axis_region]
+            for parameter_values, axis_region in zip(
+                self.values_by_parameter.values(), sample_region, strict=True
+            )
         ]
         mesh_columns = np.meshgrid(*axis_columns, indexing="ij")
-        return {name: axis.ravel() for name, axis in zip(self.names, mesh_columns, strict=True)}
+        return {
+            parameter_name: mesh_column.ravel()
+            for parameter_name, mesh_column in zip(self.swept_parameters, mesh_columns, strict=True)
+        }
 
-    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        return {name: (name, column) for name, column in self.values.items()}
+    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        return {
+            parameter_name: (parameter_name, parameter_values)
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
 
 
 @dataclass(frozen=True, repr=False)
-class Samples(AbstractDesign):
+class SampleListDesign(AbstractSampleDesign):
     """Design of single samples along the axis `sample`; all parameters may vary together."""
 
-    values: Mapping[str, np.ndarray]
-    kind: str = "samples"
+    values_by_parameter: Mapping[str, np.ndarray]
+    design_kind: str = "samples"
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -134,43 +148,55 @@ class Samples(AbstractDesign):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return (len(next(iter(self.values.values()))),)
+        return (len(next(iter(self.values_by_parameter.values()))),)
 
-    def sample_block(self, region: tuple[slice, ...]) -> SampleColumns:
-        return {name: column[region[0]] for name, column in self.values.items()}
+    def select_samples(self, sample_region: tuple[slice, ...]) -> SampleColumns:
+        return {
+            parameter_name: parameter_values[sample_region[0]]
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
 
-    def result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
-        index = {"sample": ("sample", np.arange(self.size))}
-        return index | {name: ("sample", column) for name, column in self.values.items()}
+    def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
+        sample_index_coordinate = {"sample": ("sample", np.arange(self.size))}
+        return sample_index_coordinate | {
+            parameter_name: ("sample", parameter_values)
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
 
 
-def _require_one_form(name: str, mapping: Mapping | None, keyword_values: Mapping) -> Mapping:
-    """Return the parameters of a design, given either as one mapping or as keywords."""
-    if mapping is not None and keyword_values:
+def _require_mapping_or_keywords(
+    function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
+) -> Mapping:
+    """Return the parameters of a design, given as one mapping or as keywords. Raise a TypeError if
+    both are given."""
+    if parameter_mapping is not None and parameter_keywords:
         raise TypeError(
-            f"{name} has a mapping and the keywords {', '.join(keyword_values)}: give either "
+            f"{function_name} has a mapping and the keywords {', '.join(parameter_keywords)}: "
+            f"give either "
             "one mapping or keywords."
         )
-    return keyword_values if mapping is None else mapping
+    return parameter_keywords if parameter_mapping is None else parameter_mapping
 
 
-def _require_count(name: str, n: int | None) -> int:
-    """Return the number of samples, which has no default; raise a TypeError if it is None."""
-    if n is None:
-        raise TypeError(f"n is None, but {name} needs a number of samples: give n=1024, say.")
-    return n
+def _require_sample_count(function_name: str, n_samples: int | None) -> int:
+    """Return the number of samples; raise a TypeError if it is None, because it has no default."""
+    if n_samples is None:
+        raise TypeError(
+            f"n is None, but {function_name} needs a number of samples: give n=1024, say."
+        )
+    return n_samples
 
 
 def grid(
     values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
     /,
     **parameters: Sequence[float] | np.ndarray,
-) -> Grid:
+) -> GridDesign:
     """Return the design of every combination of the values, e.g. `grid(damping=..., slope=...)`.
 
     Args:
         values: the values of each parameter, as any sequence of numbers.
-        **parameters: the same as keywords, if no mapping is given.
+        **parameters: the values as keywords, if no mapping is given.
 
     Returns:
         A design whose axes are the parameters.
@@ -182,22 +208,26 @@ def grid(
         >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
         (2, 5)
     """
-    values = _require_one_form("grid", values, parameters)
-    columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
-    for name, column in columns.items():
-        if len(np.unique(column)) != len(column):
+    values = _require_mapping_or_keywords("grid", values, parameters)
+    value_columns = {
+        parameter_name: _to_value_column(parameter_name, parameter_values)
+        for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
+    }
+    for parameter_name, value_column in value_columns.items():
+        if len(np.unique(value_column)) != len(value_column):
             raise ValueError(
-                f"{name} holds a value twice, but each value of a grid's axis names one place: "
+                f"{parameter_name} holds a value twice, but each value of a grid's axis names "
+                f"one place: "
                 "give every value once."
             )
-    return Grid(columns)
+    return GridDesign(value_columns)
 
 
 def samples(
     values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
     /,
     **parameters: Sequence[float] | np.ndarray,
-) -> Samples:
+) -> SampleListDesign:
     """Return the design of given samples, e.g. `samples({"damping": [100], "slope": [0.29]})`.
 
     A sample outside a parameter's domain, or not finite, gets the outcome BAD_INPUT.
@@ -216,15 +246,20 @@ def samples(
         >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
         (2,)
     """
-    values = _require_one_form("samples", values, parameters)
-    columns = {name: _to_column(name, value) for name, value in _require_sweepable(values).items()}
-    column_lengths = {name: len(column) for name, column in columns.items()}
+    values = _require_mapping_or_keywords("samples", values, parameters)
+    value_columns = {
+        parameter_name: _to_value_column(parameter_name, parameter_values)
+        for parameter_name, parameter_values in _require_sweepable_parameters(values).items()
+    }
+    column_lengths = {
+        parameter_name: len(value_column) for parameter_name, value_column in value_columns.items()
+    }
     if len(set(column_lengths.values())) > 1:
         raise ValueError(
             f"the columns have lengths {column_lengths}, but a sample takes one value from each: "
             "give columns of one length."
         )
-    return Samples(columns)
+    return SampleListDesign(value_columns)
 
 
 def sobol(
@@ -232,7 +267,7 @@ def sobol(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> Samples:
+) -> SampleListDesign:
     """Return `n` samples of a scrambled Sobol' sequence.
 
     The samples are spread most evenly if n is a power of 2.
@@ -255,11 +290,18 @@ def sobol(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    n, ranges = _require_count("sobol", n), _require_one_form("sobol", ranges, parameters)
-    names, lower, upper, n = _parse_box(ranges, n)
-    exponent = max(int(n - 1).bit_length(), 0)
-    unit_points = qmc.Sobol(len(names), rng=_make_generator(seed)).random_base2(exponent)[:n]
-    return _scale_to_box(names, lower, upper, unit_points, "sobol")
+    n, ranges = (
+        _require_sample_count("sobol", n),
+        _require_mapping_or_keywords("sobol", ranges, parameters),
+    )
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
+    sample_count_exponent = max(int(n - 1).bit_length(), 0)
+    unit_points = qmc.Sobol(len(parameter_names), rng=_make_random_generator(seed)).random_base2(
+        sample_count_exponent
+    )[:n]
+    return _scale_unit_points_to_box(
+        parameter_names, lower_bounds, upper_bounds, unit_points, "sobol"
+    )
 
 
 def uniform(
@@ -267,7 +309,7 @@ def uniform(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> Samples:
+) -> SampleListDesign:
     """Return `n` independent samples, uniformly distributed over the box.
 
     Args:
@@ -286,10 +328,15 @@ def uniform(
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    n, ranges = _require_count("uniform", n), _require_one_form("uniform", ranges, parameters)
-    names, lower, upper, n = _parse_box(ranges, n)
-    unit_points = _make_generator(seed).random((n, len(names)))
-    return _scale_to_box(names, lower, upper, unit_points, "uniform")
+    n, ranges = (
+        _require_sample_count("uniform", n),
+        _require_mapping_or_keywords("uniform", ranges, parameters),
+    )
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
+    unit_points = _make_random_generator(seed).random((n, len(parameter_names)))
+    return _scale_unit_points_to_box(
+        parameter_names, lower_bounds, upper_bounds, unit_points, "uniform"
+    )
 
 
 def saltelli(
@@ -297,7 +344,7 @@ def saltelli(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> Samples:
+) -> SampleListDesign:
     """Return samples for `sobol_indices`: `n` rows of 2 + d samples for d parameters.
 
     A row holds two independent points of the box, A and B, and copies of A in which one coordinate
@@ -321,15 +368,18 @@ def saltelli(
     """
     from scipy.stats import qmc  # This import is slow.
 
-    n, ranges = _require_count("saltelli", n), _require_one_form("saltelli", ranges, parameters)
-    names, lower, upper, n = _parse_box(ranges, n)
+    n, ranges = (
+        _require_sample_count("saltelli", n),
+        _require_mapping_or_keywords("saltelli", ranges, parameters),
+    )
+    parameter_names, lower_bounds, upper_bounds, n = _parse_sampling_box(ranges, n)
     if n & (n - 1):
         raise ValueError(
             f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
             f"give n = {1 << n.bit_length()}, say."
         )
-    n_parameters = len(names)
-    unit_points = qmc.Sobol(2 * n_parameters, rng=_make_generator(seed)).random_base2(
+    n_parameters = len(parameter_names)
+    unit_points = qmc.Sobol(2 * n_parameters, rng=_make_random_generator(seed)).random_base2(
         n.bit_length() - 1
     )
     first_points, second_points = unit_points[:, :n_parameters], unit_points[:, n_parameters:]
@@ -337,34 +387,39 @@ def saltelli(
         np.where(np.arange(n_parameters) == parameter_index, second_points, first_points)
         for parameter_index in range(n_parameters)
     ]
-    return _scale_to_box(
-        names,
-        lower,
-        upper,
+    return _scale_unit_points_to_box(
+        parameter_names,
+        lower_bounds,
+        upper_bounds,
         np.concatenate([first_points, second_points, *mixed_points]),
-        SALTELLI_KIND,
+        SALTELLI_DESIGN_KIND,
     )
 
 
-def _scale_to_box(
-    names: list[str], lower: np.ndarray, upper: np.ndarray, unit_points: np.ndarray, kind: str
-) -> Samples:
-    """Return the design of points of the unit cube, shape (samples, parameters), scaled to the
-    box.
-    """
-    values = lower + (upper - lower) * unit_points
-    return Samples(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), kind)
+def _scale_unit_points_to_box(
+    parameter_names: list[str],
+    lower_bounds: np.ndarray,
+    upper_bounds: np.ndarray,
+    unit_points: np.ndarray,
+    design_kind: str,
+) -> SampleListDesign:
+    """Return the design of points of the unit cube, shape (samples, parameters), scaled to the box
+    between the bounds."""
+    scaled_points = lower_bounds + (upper_bounds - lower_bounds) * unit_points
+    return SampleListDesign(
+        dict(zip(parameter_names, np.ascontiguousarray(scaled_points.T), strict=True)), design_kind
+    )
 
 
-def _make_generator(seed: int) -> np.random.Generator:
+def _make_random_generator(seed: int) -> np.random.Generator:
     """Return a generator of random numbers; raise an error if the seed is not a whole number."""
     return np.random.default_rng(check_int("seed", seed, 0))
 
 
-def _parse_box(
+def _parse_sampling_box(
     ranges: Mapping[str, ParameterRange], n: int
 ) -> tuple[list[str], np.ndarray, np.ndarray, int]:
-    """Return names, lower and upper bounds of the parameters, and the number of samples."""
+    """Return the parameters, their lower and upper bounds, and the checked number of samples."""
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(
@@ -372,45 +427,49 @@ def _parse_box(
             "a grid."
         )
     bound_pairs = [
-        check_range(f"the range of {name}", bound_pair)
-        for name, bound_pair in _require_sweepable(ranges).items()
+        check_range(f"the range of {parameter_name}", bound_pair)
+        for parameter_name, bound_pair in _require_sweepable_parameters(ranges).items()
     ]
-    bounds = np.asarray(bound_pairs)
-    return list(ranges), bounds[:, 0], bounds[:, 1], n
+    parameter_bounds = np.asarray(bound_pairs)
+    return list(ranges), parameter_bounds[:, 0], parameter_bounds[:, 1], n
 
 
-def _require_sweepable(values: Mapping[str, object]) -> Mapping:
-    """Return `values`; raise a ValueError if a name is not a sweepable parameter or there is
-    none.
-    """
-    check_type("the design", values, Mapping, "write {'damping': (100.0, 200.0)}")
-    if not values:
+def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> Mapping:
+    """Return `values_by_parameter`; raise a ValueError if it is empty or has a name that cannot be
+    swept."""
+    check_type("the design", values_by_parameter, Mapping, "write {'damping': (100.0, 200.0)}")
+    if not values_by_parameter:
         raise ValueError(
             "the design sweeps no parameter, but a scan needs at least one: "
             f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
         )
-    for name in values:
-        check_parameter_name(name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
-    return values
+    for parameter_name in values_by_parameter:
+        check_parameter_name(parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
+    return values_by_parameter
 
 
-def _to_column(name: str, value: object) -> np.ndarray:
-    """Return the values of one parameter as a vector; raise an error if they are not numbers."""
-    check_not_traced("a design", "use jax.vmap", value)
+def _to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
+    """Return the values of one parameter as a vector of floats; raise an error if they are not
+    numbers."""
+    check_not_traced("a design", "use jax.vmap", parameter_values)
     try:
-        column = np.atleast_1d(np.asarray(value))
+        value_column = np.atleast_1d(np.asarray(parameter_values))
     # Lists may have different lengths, and the conversion of a foreign object may raise any error.
     except Exception:
-        column = np.array([None])
-    if column.dtype.kind not in "fiu" and column.size:
+        value_column = np.array([None])
+    if value_column.dtype.kind not in "fiu" and value_column.size:
         raise TypeError(
-            f"{name} is {format_value(value)}, but it must be a list of numbers: write [100.0]."
+            f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
+            f"numbers: write [100.0]."
         )
-    column = column.astype(float)
-    if column.ndim != 1:
+    value_column = value_column.astype(float)
+    if value_column.ndim != 1:
         raise ValueError(
-            f"{name} has shape {column.shape}, but it must be a list of numbers: give one axis."
+            f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
+            f"numbers: give one axis."
         )
-    if not len(column):
-        raise ValueError(f"{name} has no values, but a scan needs at least one: add some.")
-    return column
+    if not len(value_column):
+        raise ValueError(
+            f"{parameter_name} has no values, but a scan needs at least one: add some."
+        )
+    return value_column

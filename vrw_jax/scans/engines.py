@@ -1,4 +1,4 @@
-"""Engines that compute steady gaits with unilateral contact, with the simplest valid model, or to a
+"""Scan engines for unilateral contact, for the simplest valid model, and for measures to a
 tolerance.
 
 With unilateral contact the result is the gait to which a walk from a slow start converges, or the
@@ -28,200 +28,245 @@ from vrw_jax.measures import PASSAGE_MEASURES
 from vrw_jax.models import GaitMethod, ViscoelasticWheel
 from vrw_jax.numerics import batch_sizes, map_in_batches, map_in_numpy_batches
 from vrw_jax.robustness import first_passage
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.scans.collocation_engine import (
-    CollocationEngine,
+    CollocationScanEngine,
     EvaluationRequest,
-    count_cores,
-    mask_failures,
-    stack_parameters,
+    count_available_cores,
+    mask_failed_samples,
+    stack_parameter_rows,
 )
-from vrw_jax.scans.measure_catalog import error_variable_name, parse_derivative
-from vrw_jax.selection import SELECTION_MARGINS, ModelCode, find_selection_reason
+from vrw_jax.scans.measure_catalog import make_error_variable_name, parse_derivative
+from vrw_jax.selection import MODEL_SELECTION_MARGINS, ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
 
-SampleMapping = Mapping[str, np.ndarray]
+SampleColumnMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
-ResultColumns = dict[str, np.ndarray]
+VariableColumns = dict[str, np.ndarray]
 """Results by variable, with one value per sample."""
 
 
-class UnilateralEngine:
-    """Engine that evaluates samples with unilateral contact and a fixed set of measures."""
+class UnilateralScanEngine:
+    """Scan engine for unilateral contact and a fixed set of measures."""
 
-    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        measures, base = request.measures, request.base
-        model, options = request.model, request.options
-        self._base, self._model = base, model
-        self._threads = count_cores() if threads is None else threads
-        derivatives = tuple(
-            derivative for name in measures if (derivative := parse_derivative(name)) is not None
+    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
+        variable_names, base_wheel = request.measure_names, request.base_wheel
+        wheel_model, step_options = request.wheel_model, request.step_options
+        self._base_wheel, self._wheel_model = base_wheel, wheel_model
+        self._n_threads = count_available_cores() if n_threads is None else n_threads
+        requested_derivatives = tuple(
+            requested_derivative
+            for variable_name in variable_names
+            if (requested_derivative := parse_derivative(variable_name)) is not None
         )
         measure_names = (
-            *(name for name in measures if parse_derivative(name) is None),
+            *(
+                variable_name
+                for variable_name in variable_names
+                if parse_derivative(variable_name) is None
+            ),
             "spectral_radius",
         )
 
-        finder: Any = make_finder(model, base.n_legs, step_options=options)
-        self._finder = dataclasses.replace(
-            finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
+        gait_finder: Any = make_finder(wheel_model, base_wheel.n_legs, step_options=step_options)
+        self._gait_finder = dataclasses.replace(
+            gait_finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
         )
-        read_measure = type(finder).read_measure
-        self._measure_reader, self._derivatives = (
+        read_measure = type(gait_finder).read_measure
+        self._measure_reader, self._requested_derivatives = (
             MeasureReader(read_measure, measure_names),
-            derivatives,
+            requested_derivatives,
         )
         self._derivative_reader = MeasureReader(
-            read_measure, tuple(dict.fromkeys(derivative.measure for derivative in derivatives))
+            read_measure,
+            tuple(
+                dict.fromkeys(
+                    requested_derivative.measure_name
+                    for requested_derivative in requested_derivatives
+                )
+            ),
         )
 
-    def __call__(self, columns: SampleMapping) -> ResultColumns:
-        """Return the results by variable; `columns` contains the values of each swept parameter,
-        one per sample.
-        """
-        values = stack_parameters(columns, self._model, self._base)
-        value_parts = np.array_split(
-            values, max(self._threads, -(-len(values) // batch_sizes.SCAN_TASK_SIZE))
+    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+        """Return the results of all samples by variable. `sample_columns` contains the values of
+        each swept parameter, one per sample."""
+        parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
+        parameter_row_parts = np.array_split(
+            parameter_rows,
+            max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
         )
-        first_part, *other_parts = (
-            results_of_part for results_of_part in value_parts if len(results_of_part)
+        first_parameter_rows, *other_parameter_rows = (
+            part_result for part_result in parameter_row_parts if len(part_result)
         )
-        results = [self._evaluate_part(first_part)]  # The first call compiles for all threads.
-        with ThreadPoolExecutor(self._threads) as threads:
-            results += threads.map(self._evaluate_part, other_parts)
+        part_results = [
+            self._evaluate_sample_part(first_parameter_rows)
+        ]  # The first call compiles for all threads.
+        with ThreadPoolExecutor(self._n_threads) as n_threads:
+            part_results += n_threads.map(self._evaluate_sample_part, other_parameter_rows)
         return {
-            name: np.concatenate([results_of_part[name] for results_of_part in results])
-            for name in results[0]
+            variable_name: np.concatenate(
+                [part_result[variable_name] for part_result in part_results]
+            )
+            for variable_name in part_results[0]
         }
 
-    @with_default_settings  # It runs in a thread of its own.
-    def _evaluate_part(self, values: np.ndarray) -> ResultColumns:
-        """Return the results of the gait to which a walk from a slow start converges, for each
-        sample.
-        """
+    @with_default_jax_settings  # It runs in a thread of its own.
+    def _evaluate_sample_part(self, parameter_rows: np.ndarray) -> VariableColumns:
+        """Return the results of each sample's gait, to which a walk from a slow start converges."""
         # Over a period friction balances the weight along the slope; with less friction there is no
         # gait.
-        friction, slope = values[:, -1], values[:, PARAMETER_NAMES.index("slope")]
+        friction, slope = parameter_rows[:, -1], parameter_rows[:, PARAMETER_NAMES.index("slope")]
         has_enough_friction = friction >= np.tan(slope)
-        results = self._evaluate_gaits(
-            values[has_enough_friction] if has_enough_friction.any() else values[:1]
+        gait_results = self._evaluate_gaits(
+            parameter_rows[has_enough_friction] if has_enough_friction.any() else parameter_rows[:1]
         )
         # Samples without a gait may have any index.
-        result_index = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
-        results_of_all = {name: leaf[result_index] for name, leaf in results.items()}
-        outcome = np.where(
-            has_enough_friction, results_of_all.pop("outcome"), Outcome.NO_CYCLE_FOUND
+        gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
+        sample_results = {
+            variable_name: variable_values[gait_indices]
+            for variable_name, variable_values in gait_results.items()
+        }
+        sample_outcome = np.where(
+            has_enough_friction, sample_results.pop("outcome"), Outcome.NO_CYCLE_FOUND
         )
-        return mask_failures(outcome, results_of_all)
+        return mask_failed_samples(sample_outcome, sample_results)
 
-    def _evaluate_gaits(self, values: np.ndarray) -> ResultColumns:
-        """Return outcome, measures and derivatives of the gaits of wheels by name, shape
-        (wheels,).
-        """
-        cycle = find_slow_gaits(self._finder, values)
-        results = map_in_batches(
-            lambda cycles: _read_measures(self._measure_reader, cycles),
+    def _evaluate_gaits(self, parameter_rows: np.ndarray) -> VariableColumns:
+        """Return outcome, measures and derivatives of the gaits of some wheels by name, shape
+        (wheels,)."""
+        slow_gaits = find_slow_gaits(self._gait_finder, parameter_rows)
+        gait_results = map_in_batches(
+            lambda gait_batch: _read_gait_measures(self._measure_reader, gait_batch),
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            cycle,
+            slow_gaits,
         )
-        if self._derivatives:
-            differentiable_cycles = self._finder.find_gaits(
-                jnp.asarray(values), cycle.section_state
+        if self._requested_derivatives:
+            differentiable_cycles = self._gait_finder.find_gaits(
+                jnp.asarray(parameter_rows), slow_gaits.section_state
             )
-            _, jacobians = map_in_batches(
-                lambda cycles: evaluate_on_gaits(self._derivative_reader, cycles),
+            _, measure_jacobians = map_in_batches(
+                lambda gait_batch: evaluate_on_gaits(self._derivative_reader, gait_batch),
                 (batch_sizes.GAIT_READ_BATCH_SIZE,),
                 differentiable_cycles,
             )
-            names = self._model.parameter_names
-            for derivative in self._derivatives:
-                results[derivative.name] = jacobians[derivative.measure][
-                    :, names.index(derivative.parameter)
-                ]
-        results["outcome"] = cycle.outcome
-        return {name: np.asarray(leaf) for name, leaf in results.items()}
+            parameter_names = self._wheel_model.parameter_names
+            for requested_derivative in self._requested_derivatives:
+                gait_results[requested_derivative.variable_name] = measure_jacobians[
+                    requested_derivative.measure_name
+                ][:, parameter_names.index(requested_derivative.parameter_name)]
+        gait_results["outcome"] = slow_gaits.outcome
+        return {
+            variable_name: np.asarray(variable_values)
+            for variable_name, variable_values in gait_results.items()
+        }
 
 
 @eqx.filter_jit
-def _read_measures(reader: MeasureReader, cycle: ReturnMapCycle) -> dict[str, Array]:
+def _read_gait_measures(
+    measure_reader: MeasureReader, gait_batch: ReturnMapCycle
+) -> dict[str, Array]:
     """Return the measures of a batch of gaits by name."""
-    first_step = jax.tree.map(lambda leaf: leaf[:, 0], cycle.steps)
-    return eqx.filter_vmap(reader)(cycle, first_step)
+    first_step = jax.tree.map(lambda step_values: step_values[:, 0], gait_batch.steps)
+    return eqx.filter_vmap(measure_reader)(gait_batch, first_step)
 
 
-PAPER_MEASURE_SUMS: dict[str, tuple[str, ...]] = {
+PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {
     "duration_single": ("duration_sls1", "duration_sls2"),
     "duration_flight": (),
     "slip": (),
     "energy_lost_impacts": ("energy_lost_landing", "energy_lost_stopper"),
     "energy_lost_friction": (),
 }
-"""Measures with unilateral contact as sums of measures of the paper's model."""
+"""Measures of the paper's model whose sum is a measure with unilateral contact, by the name of the
+latter."""
 
 
-class LadderEngine:
-    """Engine that evaluates each sample with the simplest valid model."""
+class ModelSelectionScanEngine:
+    """Scan engine that evaluates each sample with the simplest valid model."""
 
-    def __init__(self, request: EvaluationRequest, threads: int | None = None) -> None:
-        self._measures, self._base, self._model = request.measures, request.base, request.model
+    def __init__(self, request: EvaluationRequest, n_threads: int | None = None) -> None:
+        self._measure_names, self._base_wheel, self._wheel_model = (
+            request.measure_names,
+            request.base_wheel,
+            request.wheel_model,
+        )
         self._paper_model = ViscoelasticWheel()
-        paper_measures = (
-            measure
-            for name in request.measures
-            for measure in PAPER_MEASURE_SUMS.get(name, (name,))
+        paper_measure_names = (
+            paper_measure
+            for measure_name in request.measure_names
+            for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE.get(
+                measure_name, (measure_name,)
+            )
         )
         paper_request = request._replace(
-            measures=tuple(dict.fromkeys(paper_measures)), model=self._paper_model
+            measure_names=tuple(dict.fromkeys(paper_measure_names)), wheel_model=self._paper_model
         )
-        self._paper_engine = CollocationEngine(paper_request, threads)
-        self._unilateral_engine = UnilateralEngine(
-            request._replace(model=request.model.fallback_model), threads
+        self._paper_engine = CollocationScanEngine(paper_request, n_threads)
+        self._unilateral_engine = UnilateralScanEngine(
+            request._replace(wheel_model=request.wheel_model.fallback_model), n_threads
         )
 
-    def __call__(self, columns: SampleMapping) -> ResultColumns:
-        """Return the results by variable, with `rung` (the model's code) and `reason` of each
-        sample.
+    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+        """Return the results of all samples by variable, including `model_codes` (the code of the
+        model) and `selection_reasons`.
         """
-        n_samples = len(next(iter(columns.values())))
-        friction = columns.get(FRICTION_NAME, np.full(n_samples, float(self._model.friction)))
-        paper_results = self._paper_engine(
-            {"damping": np.full(n_samples, float(self._base.damping))}
-            | {name: column for name, column in columns.items() if name != FRICTION_NAME}
+        n_samples = len(next(iter(sample_columns.values())))
+        sample_friction = sample_columns.get(
+            FRICTION_NAME, np.full(n_samples, float(self._wheel_model.friction))
         )
-        reason = self.find_reasons(paper_results, friction)
-        rung = np.where(reason == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL).astype(np.int8)
-        names = (*self._measures, "outcome", "spectral_radius")
-        results = {
-            name: sum(
-                (paper_results[paper_measure] for paper_measure in PAPER_MEASURE_SUMS[name]),
+        paper_results = self._paper_engine(
+            {"damping": np.full(n_samples, float(self._base_wheel.damping))}
+            | {
+                variable_name: sample_column
+                for variable_name, sample_column in sample_columns.items()
+                if variable_name != FRICTION_NAME
+            }
+        )
+        selection_reasons = self.find_selection_reasons(paper_results, sample_friction)
+        model_codes = np.where(
+            selection_reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
+        ).astype(np.int8)
+        variable_names = (*self._measure_names, "outcome", "spectral_radius")
+        sample_results = {
+            variable_name: sum(
+                (
+                    paper_results[paper_measure]
+                    for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE[variable_name]
+                ),
                 start=np.zeros(n_samples),
             )
-            if name in PAPER_MEASURE_SUMS
-            else paper_results[name]
-            for name in names
+            if variable_name in PAPER_MEASURES_BY_CONTACT_MEASURE
+            else paper_results[variable_name]
+            for variable_name in variable_names
         }
-        unilateral_samples = np.flatnonzero(rung == ModelCode.UNILATERAL)
+        unilateral_samples = np.flatnonzero(model_codes == ModelCode.UNILATERAL)
         if unilateral_samples.size:
             unilateral_results = self._unilateral_engine(
-                {name: column[unilateral_samples] for name, column in columns.items()}
+                {
+                    variable_name: sample_column[unilateral_samples]
+                    for variable_name, sample_column in sample_columns.items()
+                }
             )
-            for name in names:
-                results[name][unilateral_samples] = unilateral_results[name]
-        return results | {"rung": rung, "reason": reason}
+            for variable_name in variable_names:
+                sample_results[variable_name][unilateral_samples] = unilateral_results[
+                    variable_name
+                ]
+        return sample_results | {"rung": model_codes, "reason": selection_reasons}
 
-    def find_reasons(self, paper_results: ResultColumns, friction: np.ndarray) -> np.ndarray:
-        """Return `ModelChoice.reason_code` of each gait of the paper's model, from the margins
-        over its step.
-        """
-        names = (*SELECTION_MARGINS, "outcome")
-        reason = map_in_numpy_batches(
+    def find_selection_reasons(
+        self, paper_results: VariableColumns, sample_friction: np.ndarray
+    ) -> np.ndarray:
+        """Return `ModelChoice.reason_code` of each sample, from the margins of its gait with the
+        paper's model."""
+        variable_names = (*MODEL_SELECTION_MARGINS, "outcome")
+        selection_reasons = map_in_numpy_batches(
             _find_selection_reasons,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            {name: paper_results[name] for name in names},
-            friction - self._paper_model.friction,
+            {variable_name: paper_results[variable_name] for variable_name in variable_names},
+            sample_friction - self._paper_model.friction,
         )
-        return reason.astype(np.int8)
+        return selection_reasons.astype(np.int8)
 
 
 @jax.jit
@@ -230,94 +275,141 @@ def _find_selection_reasons(measures: dict[str, Array], friction_difference: Arr
     return find_selection_reason(measures, friction_difference)[0]
 
 
-class ToleranceEngine:
-    """Engine that computes measures to a tolerance; see `vrw.measure_to_tolerance`."""
+class ToleranceScanEngine:
+    """Scan engine that computes measures to a tolerance; see `vrw.measure_to_tolerance`."""
 
     def __init__(self, request: EvaluationRequest) -> None:
-        assert request.tol is not None
-        self._measures, self._base, self._model = request.measures, request.base, request.model
-        self._tol = request.tol
-
-    def __call__(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results by variable; `columns` contains the values of each swept parameter,
-        one per sample.
-        """
-        *wheel_columns, friction = stack_parameters(columns, self._model, self._base).T
-        params = wheel_from_parameters(tuple(map(jnp.asarray, wheel_columns)), self._base.n_legs)
-        stoppers = self._model.stoppers
-        measure_result = measure_to_tolerance(
-            self._measures, params, self._tol, friction=friction, stoppers=stoppers
+        assert request.error_tolerance is not None
+        self._measure_names, self._base_wheel, self._wheel_model = (
+            request.measure_names,
+            request.base_wheel,
+            request.wheel_model,
         )
-        results = {
-            name: measure_result.values[:, measure_index]
-            for measure_index, name in enumerate(self._measures)
+        self._error_tolerance = request.error_tolerance
+
+    def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the results of all samples by variable. `sample_columns` contains the values of
+        each swept parameter, one per sample."""
+        *wheel_columns, sample_friction = stack_parameter_rows(
+            sample_columns, self._wheel_model, self._base_wheel
+        ).T
+        params = wheel_from_parameters(
+            tuple(map(jnp.asarray, wheel_columns)), self._base_wheel.n_legs
+        )
+        stoppers = self._wheel_model.stoppers
+        measure_result = measure_to_tolerance(
+            self._measure_names,
+            params,
+            self._error_tolerance,
+            friction=sample_friction,
+            stoppers=stoppers,
+        )
+        sample_results = {
+            measure_name: measure_result.values[:, measure_index]
+            for measure_index, measure_name in enumerate(self._measure_names)
         }
-        results |= {
-            error_variable_name(name): measure_result.errors[:, measure_index]
-            for measure_index, name in enumerate(self._measures)
+        sample_results |= {
+            make_error_variable_name(measure_name): measure_result.errors[:, measure_index]
+            for measure_index, measure_name in enumerate(self._measure_names)
         }
-        rung = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
-        return mask_failures(measure_result.outcomes, results | {"rung": rung})
+        model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
+        return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
 
 
-class PassageEngine:
-    """Engine that adds walks over random slopes to the gaits of another engine.
+class PassageScanEngine:
+    """Scan engine that adds measures of walks over random slopes to the gaits of another engine.
 
     Samples are computed one after another, each with the same random numbers.
     """
 
-    def __init__(self, request: EvaluationRequest, slope_sd: float, gait_engine: Any) -> None:
-        self._base, self._model, self._slope_sd = request.base, request.model, slope_sd
-        self._names = tuple(name for name in request.measures if name in PASSAGE_MEASURES)
+    def __init__(
+        self, request: EvaluationRequest, slope_standard_deviation: float, gait_engine: Any
+    ) -> None:
+        self._base_wheel, self._wheel_model, self._slope_standard_deviation = (
+            request.base_wheel,
+            request.wheel_model,
+            slope_standard_deviation,
+        )
+        self._passage_measure_names = tuple(
+            name for name in request.measure_names if name in PASSAGE_MEASURES
+        )
         self._gait_engine = gait_engine
 
-    def __call__(self, columns: SampleMapping) -> ResultColumns:
-        """Return the results by variable; `columns` contains the values of each swept parameter,
-        one per sample.
-        """
-        results: ResultColumns = dict(self._gait_engine(columns))
-        outcome = results["outcome"]
-        passages = np.full((len(self._names), len(outcome)), np.nan, self._base.damping.dtype)
-        for sample in np.flatnonzero(outcome == Outcome.STEPPED) if self._names else ():
-            values = {name: float(column[sample]) for name, column in columns.items()}
-            passages[:, sample] = self._measure_passage(values)
-        return results | dict(zip(self._names, passages, strict=True))
+    def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
+        """Return the results of all samples by variable. `sample_columns` contains the values of
+        each swept parameter, one per sample."""
+        sample_results: VariableColumns = dict(self._gait_engine(sample_columns))
+        gait_outcomes = sample_results["outcome"]
+        passage_measures = np.full(
+            (len(self._passage_measure_names), len(gait_outcomes)),
+            np.nan,
+            self._base_wheel.damping.dtype,
+        )
+        for sample_index in (
+            np.flatnonzero(gait_outcomes == Outcome.STEPPED) if self._passage_measure_names else ()
+        ):
+            swept_values = {
+                parameter_name: float(sample_column[sample_index])
+                for parameter_name, sample_column in sample_columns.items()
+            }
+            passage_measures[:, sample_index] = self._measure_sample_passage(swept_values)
+        return sample_results | dict(
+            zip(self._passage_measure_names, passage_measures, strict=True)
+        )
 
-    def _measure_passage(self, values: Mapping[str, float]) -> list[float]:
-        """Return the measures of one sample; NaN if hardly any step of its walks succeeds."""
-        model, params = self._model, self._base
-        for name, value in values.items():
-            model, params = model.with_parameter(params, name, jnp.asarray(value))
+    def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
+        """Return the passage measures of one sample; they are NaN if hardly any step of the walks
+        succeeds."""
+        wheel_model, params = self._wheel_model, self._base_wheel
+        for parameter_name, parameter_value in swept_values.items():
+            wheel_model, params = wheel_model.with_parameter(
+                params, parameter_name, jnp.asarray(parameter_value)
+            )
         try:
             # mypy takes the name for the module `robustness.first_passage`.
-            passage = first_passage(params, self._slope_sd, model=model)  # type: ignore[operator]
+            passage_result = first_passage(
+                params, self._slope_standard_deviation, model=wheel_model
+            )  # type: ignore[operator]
         except ValueError:
-            return [np.nan] * len(self._names)
-        by_name = {
-            "mean_steps": passage.mean_steps,
-            "mean_steps_error": passage.error,
-            "failure_probability": passage.failure_probability,
+            return [np.nan] * len(self._passage_measure_names)
+        measures_by_name = {
+            "mean_steps": passage_result.mean_steps,
+            "mean_steps_error": passage_result.error,
+            "failure_probability": passage_result.failure_probability,
         }
-        return [float(by_name[name]) for name in self._names]
+        return [
+            float(measures_by_name[parameter_name])
+            for parameter_name in self._passage_measure_names
+        ]
 
 
-def make_engine(
-    request: EvaluationRequest, threads: int | None = None
-) -> CollocationEngine | UnilateralEngine | LadderEngine | ToleranceEngine | PassageEngine:
-    """Return the engine for a scan of this model, or for a scan to a tolerance."""
-    if request.tol is not None:
-        return ToleranceEngine(request)
-    engine_class: Any = ENGINE_CLASSES[request.model.capabilities.gait_method]
-    if request.slope_sd is None:
-        return engine_class(request, threads)
-    measures = tuple(name for name in request.measures if name not in PASSAGE_MEASURES)
-    gait_engine = engine_class(request._replace(measures=measures), threads)
-    return PassageEngine(request, request.slope_sd, gait_engine)
+def make_scan_engine(
+    request: EvaluationRequest, n_threads: int | None = None
+) -> (
+    CollocationScanEngine
+    | UnilateralScanEngine
+    | ModelSelectionScanEngine
+    | ToleranceScanEngine
+    | PassageScanEngine
+):
+    """Return the engine that computes the samples of a request."""
+    if request.error_tolerance is not None:
+        return ToleranceScanEngine(request)
+    scan_engine_class: Any = SCAN_ENGINE_CLASSES[request.wheel_model.capabilities.gait_method]
+    if request.slope_standard_deviation is None:
+        return scan_engine_class(request, n_threads)
+    gait_measure_names = tuple(
+        measure_name
+        for measure_name in request.measure_names
+        if measure_name not in PASSAGE_MEASURES
+    )
+    gait_engine = scan_engine_class(request._replace(measure_names=gait_measure_names), n_threads)
+    return PassageScanEngine(request, request.slope_standard_deviation, gait_engine)
 
 
-ENGINE_CLASSES = {
-    GaitMethod.COLLOCATION: CollocationEngine,
-    GaitMethod.CONTACT_WALKS: UnilateralEngine,
-    GaitMethod.SELECTION: LadderEngine,
+SCAN_ENGINE_CLASSES = {
+    GaitMethod.COLLOCATION: CollocationScanEngine,
+    GaitMethod.CONTACT_WALKS: UnilateralScanEngine,
+    GaitMethod.SELECTION: ModelSelectionScanEngine,
 }
 """Engine classes by gait method, for the methods that scans support."""

@@ -18,24 +18,24 @@ import numpy as np
 
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.design import AbstractDesign
+from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.planning import (
     ChunkExecutor,
     ChunkResult,
     ScanPlan,
-    describe_difference,
-    describe_environment,
+    describe_computing_environment,
+    describe_settings_difference,
     plan_scan,
 )
 from vrw_jax.scans.store import (
     PROVENANCE_ATTRIBUTE,
-    AbstractStore,
-    MemoryStore,
-    ZarrStore,
-    create_store,
+    AbstractResultStore,
+    MemoryResultStore,
+    ZarrResultStore,
+    create_empty_store,
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
@@ -43,7 +43,7 @@ from vrw_jax.validation import check_callable, check_path, raise_for_renamed_arg
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
-"""Function that is called with the progress after each chunk."""
+"""Function that is called with the progress of a scan after each chunk."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class ScanProgress:
     n_reused: int  # samples that an earlier run computed
 
 
-@with_default_settings
+@with_default_jax_settings
 @raise_for_renamed_arguments(report="on_progress")
 def scan(
-    design: AbstractDesign,
+    design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,
     *,
     base: WheelParams | None = None,
@@ -133,160 +133,172 @@ def scan(
         tol=tol,
         slope_sd=slope_sd,
     )
-    with resolve_executor(dask) as executor:
-        return run_scan(scan_plan, store, on_progress=on_progress, executor=executor)
+    with resolve_executor(dask) as chunk_executor:
+        return run_scan(scan_plan, store, on_progress=on_progress, chunk_executor=chunk_executor)
 
 
 def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
-    """Return the context of a dask cluster's workers, or of None if this process computes."""
+    """Return the context of an executor on a dask cluster, or a context of None if this process
+    computes."""
     if dask is None:
         return contextlib.nullcontext()
-    from vrw_jax.scans.dask import connect_workers
+    from vrw_jax.scans.dask import connect_dask_workers
 
-    return connect_workers(dask)
+    return connect_dask_workers(dask)
 
 
-@with_default_settings
+@with_default_jax_settings
 def run_scan(
     scan_plan: ScanPlan,
-    store: str | Path | AbstractStore | None = None,
+    store: str | Path | AbstractResultStore | None = None,
     *,
     on_progress: ProgressCallback | None = None,
-    executor: ChunkExecutor | None = None,
+    chunk_executor: ChunkExecutor | None = None,
 ) -> xr.Dataset:
-    """Return the dataset of a plan, computed in this process or by `executor`."""
-    if isinstance(store, AbstractStore):
-        storage = store
+    """Return the labeled dataset of a scan plan, computed in this process or by
+    `chunk_executor`.
+    """
+    if isinstance(store, AbstractResultStore):
+        result_store = store
     elif store is None:
-        storage = MemoryStore(scan_plan.layout, scan_plan.store_attrs)
+        result_store = MemoryResultStore(scan_plan.result_layout, scan_plan.store_attributes)
     else:
-        storage = open_or_create_store(scan_plan, Path(store))
-        if storage.damage_description:
-            warnings.warn(f"{storage.damage_description}: computed again.", stacklevel=3)
-    if storage.damage_description or storage.find_missing_chunks():
-        with storage.open_for_writing():
-            _compute_chunks(
+        result_store = open_or_create_store(scan_plan, Path(store))
+        if result_store.damage_description:
+            warnings.warn(f"{result_store.damage_description}: computed again.", stacklevel=3)
+    if result_store.damage_description or result_store.find_missing_chunks():
+        with result_store.open_for_writing():
+            _compute_and_write_chunks(
                 scan_plan,
-                storage,
-                storage.find_missing_chunks(),
+                result_store,
+                result_store.find_missing_chunks(),
                 on_progress,
-                executor or _compute_in_process,
+                chunk_executor or _compute_chunks_in_process,
             )
-    return storage.load_dataset()
+    return result_store.load_dataset()
 
 
-def _compute_chunks(
+def _compute_and_write_chunks(
     scan_plan: ScanPlan,
-    storage: AbstractStore,
+    result_store: AbstractResultStore,
     missing_chunks: list[int],
     on_progress: ProgressCallback | None,
-    executor: ChunkExecutor,
+    chunk_executor: ChunkExecutor,
 ) -> None:
-    """Compute the missing chunks and write them, with a report after each."""
+    """Compute the missing chunks, write each to the store, and report the progress after each."""
     chunk_shapes = {
-        chunk_index: scan_plan.layout.shape_of_chunk(chunk_index) for chunk_index in missing_chunks
+        chunk_index: scan_plan.result_layout.get_chunk_sample_shape(chunk_index)
+        for chunk_index in missing_chunks
     }
-    n_samples, n_done, n_failed = sum(map(math.prod, chunk_shapes.values())), 0, 0
+    n_samples, n_samples_done, n_samples_failed = sum(map(math.prod, chunk_shapes.values())), 0, 0
     if on_progress is not None:
         on_progress(ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples))
     try:
-        for chunk_index, results in executor(scan_plan, missing_chunks):
+        for chunk_index, chunk_columns in chunk_executor(scan_plan, missing_chunks):
             chunk_shape = chunk_shapes[chunk_index]
             chunk_results = {
-                name: values.reshape(*chunk_shape, *values.shape[1:])
-                for name, values in results.items()
+                variable_name: variable_values.reshape(*chunk_shape, *variable_values.shape[1:])
+                for variable_name, variable_values in chunk_columns.items()
             }
-            with _explain_full_disk(storage, scan_plan.layout.n_chunks):
-                storage.write_chunk(chunk_index, chunk_results)
-            n_done += math.prod(chunk_shape)
-            n_failed += int(np.count_nonzero(results["outcome"] != Outcome.STEPPED))
+            try:
+                result_store.write_chunk(chunk_index, chunk_results)
+            except OSError as disk_error:
+                if disk_error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                n_chunks_done = scan_plan.result_layout.n_chunks - len(
+                    result_store.find_missing_chunks()
+                )
+                raise OSError(
+                    disk_error.errno,
+                    f"no space is left for {result_store.store_location}, where {n_chunks_done} "
+                    f"chunks are "
+                    "complete: make room and run the same again, it goes on from there",
+                ) from disk_error
+            n_samples_done += math.prod(chunk_shape)
+            n_samples_failed += int(np.count_nonzero(chunk_columns["outcome"] != Outcome.STEPPED))
             if on_progress is not None:
                 on_progress(
-                    ScanProgress(n_samples, n_done, n_failed, scan_plan.design.size - n_samples)
+                    ScanProgress(
+                        n_samples,
+                        n_samples_done,
+                        n_samples_failed,
+                        scan_plan.design.size - n_samples,
+                    )
                 )
     except KeyboardInterrupt:
+        if isinstance(result_store, MemoryResultStore):
+            raise KeyboardInterrupt(
+                "stopped, and nothing is kept: give store=, a folder, to continue another time."
+            ) from None
+        n_chunks = scan_plan.result_layout.n_chunks
+        n_chunks_done = n_chunks - len(result_store.find_missing_chunks())
         raise KeyboardInterrupt(
-            _describe_interruption(storage, scan_plan.layout.n_chunks)
+            f"stopped: {n_chunks_done} of {n_chunks} chunks are kept in "
+            f"{result_store.store_location}; run "
+            "the same again, it goes on from there."
         ) from None
 
 
-def _describe_interruption(storage: AbstractStore, n_chunks: int) -> str:
-    """Return a sentence about the chunks that an interrupted scan keeps."""
-    if isinstance(storage, MemoryStore):
-        return "stopped, and nothing is kept: give store=, a folder, to continue another time."
-    n_done = n_chunks - len(storage.find_missing_chunks())
-    return (
-        f"stopped: {n_done} of {n_chunks} chunks are kept in {storage.location}; run the same "
-        "again, it goes on from there."
-    )
-
-
-def _compute_in_process(
+def _compute_chunks_in_process(
     scan_plan: ScanPlan, missing_chunks: Sequence[int]
 ) -> Iterator[ChunkResult]:
-    """Yield the missing chunks, computed one after another in this process."""
-    engine = scan_plan.build_engine()
+    """Yield the index and the results of each missing chunk, computed one after another in this
+    process."""
+    scan_engine = scan_plan.build_scan_engine()
     for chunk_index in missing_chunks:
         yield (
             chunk_index,
-            engine(scan_plan.design.sample_block(scan_plan.layout.chunk_region(chunk_index))),
+            scan_engine(
+                scan_plan.design.select_samples(
+                    scan_plan.result_layout.get_chunk_region(chunk_index)
+                )
+            ),
         )
 
 
-def open_or_create_store(scan_plan: ScanPlan, path: Path) -> ZarrStore:
-    """Return the store at `path`, created if there is none; raise a ValueError if it contains
-    another scan.
-    """
-    storage = find_store(scan_plan, path)
-    if storage is None:
-        create_store(path, scan_plan.layout, scan_plan.store_attrs)
-        storage = find_store(scan_plan, path)
-        assert storage is not None
-    manifest = read_stored_manifest(path) or {}
-    setting_difference = describe_difference(manifest[PROVENANCE_ATTRIBUTE], describe_environment())
-    n_missing = len(storage.find_missing_chunks())
-    if setting_difference and n_missing:
-        damaged_text = (
-            f" ({len(storage.damaged_chunks)} of them damaged)" if storage.damaged_chunks else ""
+def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
+    """Return the store at `store_path`, created if there is none. Raise a ValueError if the store
+    contains another scan."""
+    zarr_store = find_matching_store(scan_plan, store_path)
+    if zarr_store is None:
+        create_empty_store(store_path, scan_plan.result_layout, scan_plan.store_attributes)
+        zarr_store = find_matching_store(scan_plan, store_path)
+        assert zarr_store is not None
+    stored_manifest = read_stored_manifest(store_path) or {}
+    setting_difference = describe_settings_difference(
+        stored_manifest[PROVENANCE_ATTRIBUTE], describe_computing_environment()
+    )
+    n_missing_chunks = len(zarr_store.find_missing_chunks())
+    if setting_difference and n_missing_chunks:
+        damaged_chunks_text = (
+            f" ({len(zarr_store.damaged_chunks)} of them damaged)"
+            if zarr_store.damaged_chunks
+            else ""
         )
         raise ValueError(
-            f"{path} lacks {n_missing} of {scan_plan.layout.n_chunks} chunks{damaged_text} and "
+            f"{store_path} lacks {n_missing_chunks} of {scan_plan.result_layout.n_chunks} "
+            f"chunks{damaged_chunks_text} and "
             "was begun by other means, so that its last digits might not fit: "
             f"{setting_difference}. "
             "Go on with what it was begun with, or begin anew in another place."
         )
-    return storage
+    return zarr_store
 
 
-def find_store(scan_plan: ScanPlan, path: Path, verify: bool = True) -> ZarrStore | None:
-    """Return the store at `path`, or None if there is none; raise a ValueError if it contains
-    another scan.
-    """
-    manifest = read_stored_manifest(path)
-    if manifest is None:
+def find_matching_store(
+    scan_plan: ScanPlan, store_path: Path, verifies_files: bool = True
+) -> ZarrResultStore | None:
+    """Return the store at `store_path`, or None if there is none. Raise a ValueError if the store
+    contains another scan."""
+    stored_manifest = read_stored_manifest(store_path)
+    if stored_manifest is None:
         return None
-    setting_difference = describe_difference(manifest[MANIFEST_ATTRIBUTE], scan_plan.settings)
+    setting_difference = describe_settings_difference(
+        stored_manifest[MANIFEST_ATTRIBUTE], scan_plan.scan_settings
+    )
     if setting_difference:
         raise ValueError(
-            f"{path} holds a scan made with other settings: {setting_difference}. "
+            f"{store_path} holds a scan made with other settings: {setting_difference}. "
             "Give another place for this scan, or go back to those settings, or delete the store."
         )
-    return ZarrStore(path, scan_plan.layout, verify)
-
-
-@contextlib.contextmanager
-def _explain_full_disk(storage: AbstractStore, n_chunks: int) -> Iterator[None]:
-    """Return a context that replaces the error of a full disk by one with the number of complete
-    chunks.
-    """
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        n_done = n_chunks - len(storage.find_missing_chunks())
-        raise OSError(
-            error.errno,
-            f"no space is left for {storage.location}, where {n_done} chunks are complete: make "
-            "room and run the same again, it goes on from there",
-        ) from error
+    return ZarrResultStore(store_path, scan_plan.result_layout, verifies_files)

@@ -9,104 +9,123 @@ from time import perf_counter
 
 import numpy as np
 
-from vrw_jax.runtime import with_default_settings
-from vrw_jax.scans.collocation_engine import count_cores
-from vrw_jax.scans.design import AbstractDesign, SampleColumns
-from vrw_jax.scans.execution import find_store
-from vrw_jax.scans.measure_catalog import select_catalog
+from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.scans.collocation_engine import count_available_cores
+from vrw_jax.scans.design import AbstractSampleDesign, SampleColumns
+from vrw_jax.scans.execution import find_matching_store
+from vrw_jax.scans.measure_catalog import select_measure_catalog
 from vrw_jax.scans.planning import ScanPlan
 
-STARTUP_SECONDS = 5.0
+SCAN_STARTUP_SECONDS = 5.0
 """Typical time until the first sample with cached code, s; see docs/benchmarks/scans.md."""
 
-TYPICAL_MEMORY_BYTES = 0.5e9
+TYPICAL_SCAN_MEMORY_BYTES = 0.5e9
 """Typical memory of code and arrays, in bytes; see docs/benchmarks/scans.md."""
 
 
-@with_default_settings
-def forecast_scan(plan: ScanPlan, store: str | Path | None = None) -> dict[str, str]:
-    """Return sizes, chunks, memory and time of a scan as texts by name; nothing is written.
+@with_default_jax_settings
+def forecast_scan(scan_plan: ScanPlan, store_path: str | Path | None = None) -> dict[str, str]:
+    """Return sizes, chunks, memory and time of a scan as texts by name, without writing anything.
 
     Time and memory are measured by computing samples that are spread over the design.
     """
-    layout, n_samples = plan.layout, plan.design.size
-    catalog = select_catalog(plan.request.model, plan.request.tol, plan.request.slope_sd)
-    existing_store = None if store is None else find_store(plan, Path(store), verify=False)
+    result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
+    measure_catalog = select_measure_catalog(
+        scan_plan.evaluation_request.wheel_model,
+        scan_plan.evaluation_request.error_tolerance,
+        scan_plan.evaluation_request.slope_standard_deviation,
+    )
+    existing_store = (
+        None
+        if store_path is None
+        else find_matching_store(scan_plan, Path(store_path), verifies_files=False)
+    )
     missing_chunks = (
-        list(range(layout.n_chunks))
+        list(range(result_layout.n_chunks))
         if existing_store is None
         else existing_store.find_missing_chunks()
     )
     n_samples_left = sum(
-        math.prod(layout.shape_of_chunk(chunk_index)) for chunk_index in missing_chunks
+        math.prod(result_layout.get_chunk_sample_shape(chunk_index))
+        for chunk_index in missing_chunks
     )
-    chunk_size = math.prod(layout.chunk_shape)
+    chunk_size = math.prod(result_layout.chunk_shape)
     axes_text = " x ".join(
-        f"{n_measured} {name}" for name, n_measured in zip(layout.dims, layout.shape, strict=True)
+        f"{n_measured_samples} {axis_name}"
+        for axis_name, n_measured_samples in zip(
+            result_layout.sample_dimension_names, result_layout.sample_shape, strict=True
+        )
     )
-    forecast = {
+    forecast_texts = {
         "samples": f"{n_samples:,} ({axes_text})",
-        "measures": ", ".join(plan.requested_measures),
-        "always included": ", ".join(catalog.always_included),
-        "chunks": f"{layout.n_chunks:,} of up to {chunk_size:,} samples, "
+        "measures": ", ".join(scan_plan.requested_measures),
+        "always included": ", ".join(measure_catalog.always_included_variables),
+        "chunks": f"{result_layout.n_chunks:,} of up to {chunk_size:,} samples, "
         f"{len(missing_chunks):,} to compute",
-        "result": f"{_format_bytes(n_samples * layout.bytes_per_sample)} before compression",
+        "result": f"{_format_bytes(n_samples * result_layout.bytes_per_sample)} before compression",
     }
     if not n_samples_left:
-        return forecast | {"time": "none: the store is complete"}
-    n_measured = min(n_samples_left, catalog.forecast_samples_per_core * count_cores())
-    engine = plan.build_engine()
-    start_time = perf_counter()
-    engine(_select_spread_samples(plan.design, 1))
-    compiled_time = perf_counter()
-    engine(_select_spread_samples(plan.design, n_measured))
-    samples_per_second = n_measured / (perf_counter() - compiled_time)
-    memory_bytes = _measure_peak_memory() + chunk_size * 2 * layout.bytes_per_sample
-    return forecast | {
-        "memory": f"about {_format_bytes(memory_bytes)}, "
-        + ("whatever the number of samples" if store is not None else "plus the result"),
-        "time": f"about {format_seconds(n_samples_left / samples_per_second + STARTUP_SECONDS)}: "
+        return forecast_texts | {"time": "none: the store is complete"}
+    n_measured_samples = min(
+        n_samples_left, measure_catalog.forecast_samples_per_core * count_available_cores()
+    )
+    scan_engine = scan_plan.build_scan_engine()
+    start_seconds = perf_counter()
+    scan_engine(_select_spread_samples(scan_plan.design, 1))
+    compiled_seconds = perf_counter()
+    scan_engine(_select_spread_samples(scan_plan.design, n_measured_samples))
+    samples_per_second = n_measured_samples / (perf_counter() - compiled_seconds)
+    forecast_memory_bytes = (
+        _measure_peak_memory_bytes() + chunk_size * 2 * result_layout.bytes_per_sample
+    )
+    return forecast_texts | {
+        "memory": f"about {_format_bytes(forecast_memory_bytes)}, "
+        + ("whatever the number of samples" if store_path is not None else "plus the result"),
+        "time": f"about "
+        f"{format_duration(n_samples_left / samples_per_second + SCAN_STARTUP_SECONDS)}: "
         f"{n_samples_left:,} samples at {samples_per_second:,.0f} per "
-        f"second on {count_cores()} cores, {STARTUP_SECONDS:.0f} s to start",
-        "measured": f"just now, on {n_measured:,} samples spread over the design; the code "
-        f"for it took {compiled_time - start_time:.0f} s and is kept",
+        f"second on {count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
+        "measured": f"just now, on {n_measured_samples:,} samples spread over the design; the code "
+        f"for it took {compiled_seconds - start_seconds:.0f} s and is kept",
     }
 
 
-def _select_spread_samples(design: AbstractDesign, n_selected: int) -> SampleColumns:
-    """Return samples that are spread evenly over a design, by parameter."""
-    sample_numbers = np.linspace(0, design.size - 1, n_selected).round().astype(np.int64)
+def _select_spread_samples(design: AbstractSampleDesign, n_selected_samples: int) -> SampleColumns:
+    """Return samples that are spread evenly over a design, as one column per parameter."""
+    sample_numbers = np.linspace(0, design.size - 1, n_selected_samples).round().astype(np.int64)
     sample_indices = zip(*np.unravel_index(sample_numbers, design.shape), strict=True)
     single_samples = [
-        design.sample_block(tuple(slice(int(i), int(i) + 1) for i in index_of_sample))
-        for index_of_sample in sample_indices
+        design.select_samples(tuple(slice(int(i), int(i) + 1) for i in sample_index))
+        for sample_index in sample_indices
     ]
     return {
-        name: np.concatenate([sample_columns[name] for sample_columns in single_samples])
-        for name in design.names
+        parameter_name: np.concatenate(
+            [sample_columns[parameter_name] for sample_columns in single_samples]
+        )
+        for parameter_name in design.swept_parameters
     }
 
 
-def _measure_peak_memory() -> float:
+def _measure_peak_memory_bytes() -> float:
     """Return the peak memory of this process, in bytes."""
     try:
         import resource
     except ImportError:  # Windows has no such module.
-        return TYPICAL_MEMORY_BYTES
+        return TYPICAL_SCAN_MEMORY_BYTES
     bytes_per_unit = 1 if sys.platform == "darwin" else 1024
     return float(bytes_per_unit) * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _format_bytes(n_bytes: int | float) -> str:
-    """Return a number of bytes as text with a unit."""
-    for unit in ("B", "kB", "MB"):
+    """Return a number of bytes as text in B, kB, MB or GB."""
+    for byte_unit in ("B", "kB", "MB"):
         if n_bytes < 1000:
-            return f"{n_bytes:.3g} {unit}"
+            return f"{n_bytes:.3g} {byte_unit}"
         n_bytes /= 1000
     return f"{n_bytes:.3g} GB"
 
 
-def format_seconds(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Return a time in seconds as text in s, min or h."""
     if seconds < 90:
         return f"{seconds:.0f} s"

@@ -14,23 +14,23 @@ from vrw_jax.measures import (
     measure_attrs,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.selection import SELECTION_ATTRS
+from vrw_jax.selection import MODEL_SELECTION_ATTRIBUTES
 from vrw_jax.tolerance import MEASURE_FUNCTIONS
 from vrw_jax.validation import suggest_name
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
-ALWAYS_INCLUDED = ("outcome", "spectral_radius", *MARGIN_MEASURES)
+ALWAYS_INCLUDED_VARIABLES = ("outcome", "spectral_radius", *MARGIN_MEASURES)
 """Variables of every scan, requested or not: outcome, stability and margins of the gait."""
 
 DIFFERENTIABLE_MEASURES = CollocationFinder.cycle_measures
-"""Measures that are computed from the limit cycle itself; only these have derivatives."""
+"""Measures that are computed from the limit cycle alone. Only these measures have derivatives."""
 
-REQUESTABLE_MEASURES = (
+REQUESTABLE_PAPER_MEASURES = (
     *DIFFERENTIABLE_MEASURES,
     *(name for name in STEP_MEASURES if name not in (*DIFFERENTIABLE_MEASURES, "outcome")),
 )
 
-DEFAULT_MEASURES = (
+DEFAULT_SCAN_MEASURES = (
     "dls_fraction",
     "speed",
     "period",
@@ -47,9 +47,9 @@ DEFAULT_MEASURES = (
 class MeasureCatalog(NamedTuple):
     """Names of the variables that a scan of one model can compute."""
 
-    requestable: tuple[str, ...]
-    always_included: tuple[str, ...]  # measures in every scan, requested or not
-    differentiable: tuple[str, ...]
+    requestable_measures: tuple[str, ...]
+    always_included_variables: tuple[str, ...]  # measures in every scan, requested or not
+    differentiable_measures: tuple[str, ...]
     # parameters by which measures can be differentiated
     differentiation_parameters: tuple[str, ...]
     default_measures: tuple[str, ...]
@@ -64,15 +64,15 @@ _CONTACT_DEFAULT_MEASURES = (
     "slip",
     "energy_lost_impacts",
 )
-PAPER_CATALOG = MeasureCatalog(
-    REQUESTABLE_MEASURES,
-    ALWAYS_INCLUDED,
+PAPER_MEASURE_CATALOG = MeasureCatalog(
+    REQUESTABLE_PAPER_MEASURES,
+    ALWAYS_INCLUDED_VARIABLES,
     DIFFERENTIABLE_MEASURES,
     PARAMETER_NAMES,
-    DEFAULT_MEASURES,
+    DEFAULT_SCAN_MEASURES,
     1024,
 )
-UNILATERAL_CATALOG = MeasureCatalog(
+UNILATERAL_MEASURE_CATALOG = MeasureCatalog(
     (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
     ("outcome", "spectral_radius"),
     UNILATERAL_DIFFERENTIABLE_NAMES,
@@ -80,148 +80,187 @@ UNILATERAL_CATALOG = MeasureCatalog(
     _CONTACT_DEFAULT_MEASURES,
     16,
 )
-LADDER_CATALOG = MeasureCatalog(
+MODEL_SELECTION_MEASURE_CATALOG = MeasureCatalog(
     (*UNILATERAL_DIFFERENTIABLE_NAMES, "spectral_margin"),
-    ("outcome", "spectral_radius", *SELECTION_ATTRS),
+    ("outcome", "spectral_radius", *MODEL_SELECTION_ATTRIBUTES),
     tuple(name for name in UNILATERAL_DIFFERENTIABLE_NAMES if name in DIFFERENTIABLE_MEASURES),
     PARAMETER_NAMES,
     _CONTACT_DEFAULT_MEASURES,
     64,
 )
-CATALOGS = {
-    GaitMethod.COLLOCATION: PAPER_CATALOG,
-    GaitMethod.CONTACT_WALKS: UNILATERAL_CATALOG,
-    GaitMethod.SELECTION: LADDER_CATALOG,
+MEASURE_CATALOGS = {
+    GaitMethod.COLLOCATION: PAPER_MEASURE_CATALOG,
+    GaitMethod.CONTACT_WALKS: UNILATERAL_MEASURE_CATALOG,
+    GaitMethod.SELECTION: MODEL_SELECTION_MEASURE_CATALOG,
 }
 """Catalogs by gait method, for the methods that scans support."""
-TOLERANCE_CATALOG = MeasureCatalog(
+TOLERANCE_MEASURE_CATALOG = MeasureCatalog(
     tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
 """Catalog of scans to a tolerance, in which each measure has an error."""
-ERROR_SUFFIX = "_error"
+ERROR_VARIABLE_SUFFIX = "_error"
 """Suffix of the variable that contains the error of a measure."""
 
 
-def select_catalog(
-    model: AbstractWheel, tol: float | None = None, slope_sd: float | None = None
+def select_measure_catalog(
+    wheel_model: AbstractWheel,
+    error_tolerance: float | None = None,
+    slope_standard_deviation: float | None = None,
 ) -> MeasureCatalog:
-    """Return the catalog of a model, or that of scans to a tolerance if `tol` is given.
+    """Return the catalog of a model, or the catalog of scans to a tolerance if `error_tolerance` is
+    given.
 
-    If `slope_sd` is given, it contains measures of walks over random slopes too.
+    If `slope_standard_deviation` is given, the catalog also contains measures of walks over random
+    slopes.
     """
-    if tol is not None:
-        return TOLERANCE_CATALOG
-    catalog = CATALOGS[model.capabilities.gait_method]
-    return catalog if slope_sd is None else add_passage_measures(catalog)
+    if error_tolerance is not None:
+        return TOLERANCE_MEASURE_CATALOG
+    measure_catalog = MEASURE_CATALOGS[wheel_model.capabilities.gait_method]
+    return (
+        measure_catalog
+        if slope_standard_deviation is None
+        else add_passage_measures(measure_catalog)
+    )
 
 
-def add_passage_measures(catalog: MeasureCatalog) -> MeasureCatalog:
-    """Return a catalog with the measures of walks over random slopes, which take a second each."""
-    return catalog._replace(
-        requestable=(*catalog.requestable, *PASSAGE_MEASURES),
+def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
+    """Return a catalog extended by measures of walks over random slopes, which take a second per
+    sample."""
+    return measure_catalog._replace(
+        requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),
         default_measures=tuple(PASSAGE_MEASURES),
         forecast_samples_per_core=1,
     )
 
 
-def error_variable_name(measure: str) -> str:
+def make_error_variable_name(measure_name: str) -> str:
     """Return the name of the variable that contains the error of a measure."""
-    return measure + ERROR_SUFFIX
+    return measure_name + ERROR_VARIABLE_SUFFIX
 
 
-_DERIVATIVE_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
+_DERIVATIVE_NAME_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
 
 
 class MeasureDerivative(NamedTuple):
     """Derivative of a measure with respect to a parameter, along the branch of limit cycles."""
 
-    measure: str
-    parameter: str
+    measure_name: str
+    parameter_name: str
 
     @property
-    def name(self) -> str:
+    def variable_name(self) -> str:
         """Return the name of the variable that contains the derivative."""
-        return f"d_{self.measure}_d_{self.parameter}"
+        return f"d_{self.measure_name}_d_{self.parameter_name}"
 
     @property
-    def variable_attrs(self) -> dict[str, object]:
+    def variable_attributes(self) -> dict[str, object]:
         """Return unit, name, symbol and description of the derivative."""
-        measure, parameter = MEASURES[self.measure], MEASURES[self.parameter]
-        unit = f"{measure.unit}/({parameter.unit})"
-        if parameter.unit == "1":
-            unit = measure.unit
+        measure_description, parameter_description = (
+            MEASURES[self.measure_name],
+            MEASURES[self.parameter_name],
+        )
+        derivative_unit = f"{measure_description.unit}/({parameter_description.unit})"
+        if parameter_description.unit == "1":
+            derivative_unit = measure_description.unit
         return {
-            "units": unit,
-            "long_name": f"derivative of {measure.long_name} by {parameter.long_name}",
-            "symbol": f"∂({measure.symbol})/∂{parameter.symbol}",
+            "units": derivative_unit,
+            "long_name": f"derivative of {measure_description.long_name} by "
+            f"{parameter_description.long_name}",
+            "symbol": f"∂({measure_description.symbol})/∂{parameter_description.symbol}",
             "description": "Along the branch of limit cycles, by the implicit function theorem.",
         }
 
 
-def parse_derivative(name: str) -> MeasureDerivative | None:
+def parse_derivative(variable_name: str) -> MeasureDerivative | None:
     """Return the derivative named as in 'd dls_fraction / d damping', or None for a measure."""
-    match = _DERIVATIVE_PATTERN.fullmatch(name.strip())
-    return MeasureDerivative(*match.groups()) if match else None
+    name_match = _DERIVATIVE_NAME_PATTERN.fullmatch(variable_name.strip())
+    return MeasureDerivative(*name_match.groups()) if name_match else None
 
 
-def canonicalize_name(name: str) -> str:
-    """Return the name of the variable that contains the requested measure, valid as a file name."""
-    requested_derivative = parse_derivative(name)
-    return name.strip() if requested_derivative is None else requested_derivative.name
+def canonicalize_variable_name(measure_name: str) -> str:
+    """Return the name of the variable that contains the requested measure. The name is valid as a
+    file name."""
+    requested_derivative = parse_derivative(measure_name)
+    return (
+        measure_name.strip() if requested_derivative is None else requested_derivative.variable_name
+    )
 
 
-def check_measures(names: Iterable[str], catalog: MeasureCatalog) -> tuple[str, ...]:
-    """Return the names of the requested variables, each once, without those that every scan has.
+def check_measure_names(
+    measure_names: Iterable[str], measure_catalog: MeasureCatalog
+) -> tuple[str, ...]:
+    """Return the names of the requested variables, each once, without the variables that every scan
+    contains.
 
     Raise a ValueError for an unknown name.
     """
     checked_names: dict[str, None] = {}
-    known_names = (*catalog.requestable, *catalog.always_included)
-    for name in names:
-        requested_derivative = parse_derivative(name)
+    known_names = (
+        *measure_catalog.requestable_measures,
+        *measure_catalog.always_included_variables,
+    )
+    for measure_name in measure_names:
+        requested_derivative = parse_derivative(measure_name)
         if requested_derivative is None:
-            if name in PASSAGE_MEASURES and name not in known_names:
+            if measure_name in PASSAGE_MEASURES and measure_name not in known_names:
                 raise ValueError(
-                    f"{name!r} is a measure of walks over random slopes, whose standard deviation "
+                    f"{measure_name!r} is a measure of walks over random slopes, whose standard "
+                    f"deviation "
                     "is missing: give slope_sd, in rad, and no tol."
                 )
-            if name not in known_names:
+            if measure_name not in known_names:
                 raise ValueError(
-                    f"{name!r} is no measure of a scan{suggest_name(name, known_names)}: "
-                    f"choose from {', '.join(catalog.requestable)}, or a derivative such as "
+                    f"{measure_name!r} is no measure of a "
+                    f"scan{suggest_name(measure_name, known_names)}: "
+                    f"choose from {', '.join(measure_catalog.requestable_measures)}, or a "
+                    f"derivative such as "
                     "'d dls_fraction / d damping'."
                 )
-            if name not in catalog.always_included:
-                checked_names[name] = None
+            if measure_name not in measure_catalog.always_included_variables:
+                checked_names[measure_name] = None
             continue
-        if not catalog.differentiable:
+        if not measure_catalog.differentiable_measures:
             raise ValueError(
-                f"{name!r} is a derivative, but a scan to a tolerance computes only measures: "
+                f"{measure_name!r} is a derivative, but a scan to a tolerance computes only "
+                f"measures: "
                 "drop it, or scan without tol."
             )
-        if requested_derivative.measure not in catalog.differentiable:
+        differentiable_measures = measure_catalog.differentiable_measures
+        if requested_derivative.measure_name not in differentiable_measures:
             raise ValueError(
-                f"{name!r} asks for a derivative of {requested_derivative.measure!r}"
-                f"{suggest_name(requested_derivative.measure, catalog.differentiable)}, but a scan "
-                f"differentiates only {', '.join(catalog.differentiable)}: choose one of these."
+                f"{measure_name!r} asks for a derivative of {requested_derivative.measure_name!r}"
+                f"{suggest_name(requested_derivative.measure_name, differentiable_measures)}, but "
+                "a "
+                f"scan differentiates only {', '.join(differentiable_measures)}: choose one of "
+                "these."
             )
-        parameters = catalog.differentiation_parameters
-        if requested_derivative.parameter not in parameters:
+        differentiation_parameters = measure_catalog.differentiation_parameters
+        parameter_name = requested_derivative.parameter_name
+        if parameter_name not in differentiation_parameters:
             raise ValueError(
-                f"{name!r} asks for a derivative by {requested_derivative.parameter!r}"
-                f"{suggest_name(requested_derivative.parameter, parameters)}, but it must be by a "
-                f"parameter: choose from {', '.join(parameters)}."
+                f"{measure_name!r} asks for a derivative by {parameter_name!r}"
+                f"{suggest_name(parameter_name, differentiation_parameters)}, but it must be by a "
+                f"parameter: choose from {', '.join(differentiation_parameters)}."
             )
-        checked_names[requested_derivative.name] = None
+        checked_names[requested_derivative.variable_name] = None
     return tuple(checked_names)
 
 
-def get_variable_attrs(name: str) -> dict[str, object]:
-    """Return unit, name and description of the variable `name` of a scan."""
-    if name in SELECTION_ATTRS:
-        return dict(SELECTION_ATTRS[name])
-    if name.removesuffix(ERROR_SUFFIX) in MEASURE_FUNCTIONS and name.endswith(ERROR_SUFFIX):
-        measure = MEASURES[name.removesuffix(ERROR_SUFFIX)]
-        return {"units": measure.unit, "long_name": f"bound of the error of {measure.long_name}"}
-    derivative = parse_derivative(name)
-    return measure_attrs(name) if derivative is None else derivative.variable_attrs
+def get_variable_attributes(variable_name: str) -> dict[str, object]:
+    """Return unit, long name and description of a variable of a scan."""
+    if variable_name in MODEL_SELECTION_ATTRIBUTES:
+        return dict(MODEL_SELECTION_ATTRIBUTES[variable_name])
+    if variable_name.removesuffix(
+        ERROR_VARIABLE_SUFFIX
+    ) in MEASURE_FUNCTIONS and variable_name.endswith(ERROR_VARIABLE_SUFFIX):
+        measure_description = MEASURES[variable_name.removesuffix(ERROR_VARIABLE_SUFFIX)]
+        return {
+            "units": measure_description.unit,
+            "long_name": f"bound of the error of {measure_description.long_name}",
+        }
+    measure_derivative = parse_derivative(variable_name)
+    return (
+        measure_attrs(variable_name)
+        if measure_derivative is None
+        else measure_derivative.variable_attributes
+    )

@@ -16,42 +16,43 @@ from vrw_jax.cycles import CycleOptions, make_finder
 from vrw_jax.measures import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
 from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
-from vrw_jax.runtime import source_digest
+from vrw_jax.runtime import compute_source_digest
 from vrw_jax.scans.collocation_engine import EvaluationRequest
-from vrw_jax.scans.design import AbstractDesign, SampleColumns
-from vrw_jax.scans.engines import make_engine
+from vrw_jax.scans.design import AbstractSampleDesign, SampleColumns
+from vrw_jax.scans.engines import make_scan_engine
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.measure_catalog import (
-    canonicalize_name,
-    check_measures,
-    error_variable_name,
-    get_variable_attrs,
-    select_catalog,
+    canonicalize_variable_name,
+    check_measure_names,
+    get_variable_attributes,
+    make_error_variable_name,
+    select_measure_catalog,
 )
 from vrw_jax.scans.store import (
     PROVENANCE_ATTRIBUTE,
-    REQUESTED_ATTRIBUTE,
+    REQUESTED_MEASURES_ATTRIBUTE,
     ResultLayout,
     VariableLayout,
     choose_chunk_shape,
-    find_first_difference,
+    find_first_settings_difference,
 )
-from vrw_jax.selection import describe_models
-from vrw_jax.simulation import ModelLike, check_model, check_options
+from vrw_jax.selection import describe_accepted_models
+from vrw_jax.simulation import ModelLike, check_model, check_step_options
 from vrw_jax.validation import check_int, check_names, check_positive, check_type
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, WheelParams
 
 MAX_SCAN_SAMPLES = 1_000_000_000
-"""Largest number of samples of a scan, chosen because it takes over a day and some hundred GB."""
+"""Largest number of samples of a scan, chosen because so many samples take over a day and some
+hundred GB."""
 
 
-PASSAGE_CHUNK_SIZE = 16
-"""Number of samples that are written at a time if walks over random slopes are measured, chosen
-because each sample takes a second or more."""
+N_PASSAGE_SAMPLES_PER_CHUNK = 16
+"""Number of samples that are written at a time if walks over random slopes are measured. The value
+is chosen because each sample takes a second or more."""
 
 
-STORED_KINDS = {"StepOptions": "Options"}
-"""Names of classes in stores, if they differ from the names in Python."""
+STORED_CLASS_NAMES = {"StepOptions": "Options"}
+"""Names of classes in stores, by name in Python, if the two names differ."""
 
 STORED_FIELD_NAMES = {
     "StepOptions": {
@@ -69,7 +70,7 @@ STORED_FIELD_NAMES = {
     },
     "UnilateralWheel": {"infinite_friction_rule": "infinite"},
 }
-"""Names of fields in stores by class, if they differ from the names in Python."""
+"""Names of fields in stores, by class and name in Python, if the two names differ."""
 
 STORED_MODEL_NAMES = {
     "model_name": "rung",
@@ -77,69 +78,91 @@ STORED_MODEL_NAMES = {
     "batch_kernel": "lanes",
     "is_compliant": "legs_yield",
 }
-"""Names of class variables of models in stores, if they differ from the names in Python."""
+"""Names of class variables of models in stores, by name in Python, if the two names differ."""
 
-EvaluateSamples = Callable[[SampleColumns], Mapping[str, np.ndarray]]
+SampleEvaluator = Callable[[SampleColumns], Mapping[str, np.ndarray]]
 """Function that returns the results of samples by variable, with the axis of samples first."""
 
 ChunkResult = tuple[int, Mapping[str, np.ndarray]]
 """Index of a chunk, and its results by variable."""
 
 ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
-"""Function that computes chunks of a plan, given by index, and yields them in any order."""
+"""Function that computes the chunks with the given indices and yields their results in any
+order.
+"""
 
 
 @dataclass(frozen=True)
 class ScanPlan:
     """Checked arguments and layout of a scan."""
 
-    design: AbstractDesign
-    request: EvaluationRequest
-    layout: ResultLayout
+    design: AbstractSampleDesign
+    evaluation_request: EvaluationRequest
+    result_layout: ResultLayout
     requested_measures: tuple[str, ...]  # names of the requested measures, as the caller gave them
     config_text: str
 
     @property
-    def settings(self) -> dict[str, object]:
-        """Return the settings that a store must have so that the scan can continue in it."""
-        measures, base, model, options, cycle_options, tol, slope_sd = self.request
-        fixed_names = (name for name in PARAMETER_NAMES if name not in self.design.names)
+    def scan_settings(self) -> dict[str, object]:
+        """Return the settings that a store must have so that this scan can continue in the
+        store.
+        """
+        (
+            measure_names,
+            base_wheel,
+            wheel_model,
+            step_options,
+            cycle_options,
+            error_tolerance,
+            slope_standard_deviation,
+        ) = self.evaluation_request
+        fixed_parameters = (
+            setting_name
+            for setting_name in PARAMETER_NAMES
+            if setting_name not in self.design.swept_parameters
+        )
         return {
-            "design": self.design.describe_identity(),
-            "wheel": {name: float(getattr(base, name)) for name in fixed_names}
-            | {"n_legs": base.n_legs},
-            "measures": list(measures),
-            "model": _record_fields(model),
-            "options": _record_fields(options),
-            "cycle_options": _record_fields(cycle_options),
-            "dtype": str(base.damping.dtype),
-            "chunk": list(self.layout.chunk_shape),
+            "design": self.design.describe_design(),
+            "wheel": {
+                setting_name: float(getattr(base_wheel, setting_name))
+                for setting_name in fixed_parameters
+            }
+            | {"n_legs": base_wheel.n_legs},
+            "measures": list(measure_names),
+            "model": _record_settings(wheel_model),
+            "options": _record_settings(step_options),
+            "cycle_options": _record_settings(cycle_options),
+            "dtype": str(base_wheel.damping.dtype),
+            "chunk": list(self.result_layout.chunk_shape),
         } | {
-            name: value
-            for name, value in (("tol", tol), ("slope_sd", slope_sd))
-            if value is not None
+            setting_name: setting_value
+            for setting_name, setting_value in (
+                ("tol", error_tolerance),
+                ("slope_sd", slope_standard_deviation),
+            )
+            if setting_value is not None
         }
 
     @property
-    def store_attrs(self) -> dict[str, object]:
+    def store_attributes(self) -> dict[str, object]:
         """Return the attributes of the labeled result and its store."""
         return {
             "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
-            f"{', '.join(self.design.names)}",
+            f"{', '.join(self.design.swept_parameters)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
-            MANIFEST_ATTRIBUTE: json.dumps(self.settings),  # Other formats have no tables.
-            PROVENANCE_ATTRIBUTE: json.dumps(describe_environment()),
-            REQUESTED_ATTRIBUTE: ", ".join(self.requested_measures),
+            MANIFEST_ATTRIBUTE: json.dumps(self.scan_settings),  # Other formats have no tables.
+            PROVENANCE_ATTRIBUTE: json.dumps(describe_computing_environment()),
+            REQUESTED_MEASURES_ATTRIBUTE: ", ".join(self.requested_measures),
             "config": self.config_text,
         }
 
-    def build_engine(self) -> EvaluateSamples:
-        """Return the engine that computes the samples."""
-        return make_engine(self.request)
+    def build_scan_engine(self) -> SampleEvaluator:
+        """Return the engine that computes the samples of this plan."""
+        return make_scan_engine(self.evaluation_request)
 
 
 def plan_scan(
-    design: AbstractDesign,
+    design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,
     *,
     base: WheelParams | None = None,
@@ -152,7 +175,7 @@ def plan_scan(
     slope_sd: float | None = None,
 ) -> ScanPlan:
     """Return the checked plan of a scan, with the layout of its result; nothing is computed."""
-    if not isinstance(design, AbstractDesign):
+    if not isinstance(design, AbstractSampleDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
             "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
@@ -160,12 +183,14 @@ def plan_scan(
     base = WheelParams() if base is None else base
     check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
     base.require_single("give numbers, and what varies in the design")
-    options, model = check_options(options), check_model(model)
+    options, model = check_step_options(options), check_model(model)
     options.check_tolerances(np.dtype(base.damping.dtype))
-    finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
-    finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
-    default_chunk = batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else PASSAGE_CHUNK_SIZE
-    chunk = default_chunk if chunk is None else check_int("chunk", chunk)
+    gait_finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+    gait_finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
+    default_chunk_size = (
+        batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
+    )
+    chunk = default_chunk_size if chunk is None else check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
             f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
@@ -174,14 +199,14 @@ def plan_scan(
     if not model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but a scan is of gaits with compliant legs: give "
-            f"{describe_models('scan')}."
+            f"{describe_accepted_models('scan')}."
         )
-    if FRICTION_NAME in design.names and FRICTION_NAME not in model.parameter_names:
+    if FRICTION_NAME in design.swept_parameters and FRICTION_NAME not in model.parameter_names:
         raise ValueError(
             "the design sweeps friction, which does not affect the paper's wheel: give "
-            f"model={describe_models('scan', FRICTION_NAME)}."
+            f"model={describe_accepted_models('scan', FRICTION_NAME)}."
         )
-    tol = None if tol is None else _check_tolerance(model, check_positive("tol", tol))
+    tol = None if tol is None else _check_tolerance_of_model(model, check_positive("tol", tol))
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
         if tol is not None:
@@ -189,122 +214,152 @@ def plan_scan(
                 "tol and slope_sd are both given, but a scan to a tolerance has no measures of "
                 "walks over random slopes: drop one of them."
             )
-    catalog = select_catalog(model, tol, slope_sd)
+    measure_catalog = select_measure_catalog(model, tol, slope_sd)
     requested_measures = (
-        catalog.default_measures if measures is None else check_names("measures", measures)
+        measure_catalog.default_measures if measures is None else check_names("measures", measures)
     )
-    names = check_measures(requested_measures, catalog)
-    canonical_names = (canonicalize_name(name) for name in requested_measures)
+    measure_names = check_measure_names(requested_measures, measure_catalog)
+    canonical_names = (
+        canonicalize_variable_name(measure_name) for measure_name in requested_measures
+    )
     variable_names = dict.fromkeys(
         variable_name
-        for name in canonical_names
-        for variable_name in (name, error_variable_name(name))[: 1 + bool(tol)]
+        for measure_name in canonical_names
+        for variable_name in (measure_name, make_error_variable_name(measure_name))[: 1 + bool(tol)]
     )
     cycle_options = CycleOptions() if cycle_options is None else cycle_options
-    request = EvaluationRequest(names, base, model, options, cycle_options, tol, slope_sd)
-    layout = _make_layout(
-        design, tuple(variable_names | dict.fromkeys(catalog.always_included)), base, chunk
+    evaluation_request = EvaluationRequest(
+        measure_names, base, model, options, cycle_options, tol, slope_sd
     )
-    return ScanPlan(design, request, layout, requested_measures, config_text)
+    result_layout = _make_result_layout(
+        design,
+        tuple(variable_names | dict.fromkeys(measure_catalog.always_included_variables)),
+        base,
+        chunk,
+    )
+    return ScanPlan(design, evaluation_request, result_layout, requested_measures, config_text)
 
 
-def _check_tolerance(model: AbstractWheel, tol: float) -> float:
-    """Return the tolerance; raise a ValueError if a tolerance cannot refer to the model."""
-    fields: dict[str, Any] = type(model).__dataclass_fields__
-    default_only_fields = model.capabilities.fixed_by_tolerance
+def _check_tolerance_of_model(wheel_model: AbstractWheel, error_tolerance: float) -> float:
+    """Return the tolerance of errors; raise a ValueError if no tolerance can refer to the model."""
+    model_fields: dict[str, Any] = type(wheel_model).__dataclass_fields__
+    default_only_fields = wheel_model.capabilities.fixed_by_tolerance
     if default_only_fields is None or any(
-        getattr(model, name) != fields[name].default for name in default_only_fields
+        getattr(wheel_model, field_name) != model_fields[field_name].default
+        for field_name in default_only_fields
     ):
         raise ValueError(
-            f"tol is given and model is {model!r}, but a tolerance refers to unilateral contact "
+            f"tol is given and model is {wheel_model!r}, but a tolerance refers to unilateral "
+            f"contact "
             "with no settings other than friction and stoppers: give "
             "model=vrw.UnilateralWheel(friction=...)."
         )
-    return tol
+    return error_tolerance
 
 
-def describe_environment() -> dict[str, object]:
+def describe_computing_environment() -> dict[str, object]:
     """Return the digest of the source, the versions and the device of this process."""
-    environment = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
+    provenance_record = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
     processor_features = simd.describe_processor()[2].split(",")
     instruction_sets = [
-        name for name in VECTOR_INSTRUCTION_SETS if f"+{name}" in processor_features
+        instruction_set
+        for instruction_set in VECTOR_INSTRUCTION_SETS
+        if f"+{instruction_set}" in processor_features
     ]
-    processor = " ".join([platform.machine(), *instruction_sets])
+    processor_text = " ".join([platform.machine(), *instruction_sets])
     return {
-        "code": source_digest(),
-        "versions": environment["versions"],
-        "device": f"{jax.default_backend()}: {environment['device']}, {processor}",
+        "code": compute_source_digest(),
+        "versions": provenance_record["versions"],
+        "device": f"{jax.default_backend()}: {provenance_record['device']}, {processor_text}",
     }
 
 
 VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
-"""Instruction sets that decide which sums the compiler fuses, and thus the last digits."""
+"""Instruction sets that decide which products and sums the compiler fuses, and thus the last
+digits."""
 
 
-def describe_difference(stored_settings: object, current_settings: object) -> str:
-    """Return a description of the first setting that differs, or an empty string."""
-    name, stored_value, current_value = find_first_difference(stored_settings, current_settings)
-    if not name:
+def describe_settings_difference(stored_settings: object, current_settings: object) -> str:
+    """Return a sentence about the first setting that differs, or an empty string."""
+    setting_name, stored_value, current_value = find_first_settings_difference(
+        stored_settings, current_settings
+    )
+    if not setting_name:
         return ""
-    if name == "design.digest":
+    if setting_name == "design.digest":
         return "the values of the swept parameters differ"
-    if name == "code":
+    if setting_name == "code":
         return "the library's code differs"
-    return f"{name} is {stored_value!r} there and {current_value!r} here"
+    return f"{setting_name} is {stored_value!r} there and {current_value!r} here"
 
 
-def _make_layout(
-    design: AbstractDesign, names: tuple[str, ...], base: WheelParams, chunk: int
+def _make_result_layout(
+    design: AbstractSampleDesign,
+    variable_names: tuple[str, ...],
+    base_wheel: WheelParams,
+    chunk_size: int,
 ) -> ResultLayout:
-    """Return the layout of the variables `names` over a design, in chunks of at most `chunk`
-    samples.
-    """
-    dtype = str(base.damping.dtype)
-    legs = locked_leg_coordinate(base.n_legs)
+    """Return the layout of the variables of a result over a design, in chunks of at most
+    `chunk_size` samples."""
+    parameter_dtype = str(base_wheel.damping.dtype)
+    locked_legs = locked_leg_coordinate(base_wheel.n_legs)
 
-    def make_variable(name: str) -> VariableLayout:
+    def make_variable_layout(variable_name: str) -> VariableLayout:
         """Return type, missing value and attributes of one variable."""
-        attributes = get_variable_attrs(name)
-        if name in ("outcome", "rung", "reason"):
-            return VariableLayout(name, "int8", -1, attributes)
-        if name == "solver_steps":
-            return VariableLayout(name, "int32", -1, attributes)
-        if name in MARGIN_MEASURES and MARGIN_MEASURES[name].dimension:
-            return VariableLayout(name, dtype, np.nan, attributes, ("leg",), legs.shape)
-        return VariableLayout(name, dtype, np.nan, attributes)
+        variable_attributes = get_variable_attributes(variable_name)
+        if variable_name in ("outcome", "rung", "reason"):
+            return VariableLayout(variable_name, "int8", -1, variable_attributes)
+        if variable_name == "solver_steps":
+            return VariableLayout(variable_name, "int32", -1, variable_attributes)
+        if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].dimension:
+            return VariableLayout(
+                variable_name,
+                parameter_dtype,
+                np.nan,
+                variable_attributes,
+                ("leg",),
+                locked_legs.shape,
+            )
+        return VariableLayout(variable_name, parameter_dtype, np.nan, variable_attributes)
 
-    coordinates = {
-        name: (
-            dim,
-            values,
-            measure_attrs(name) if name in (*PARAMETER_NAMES, FRICTION_NAME) else {},
+    result_coordinates = {
+        coordinate_name: (
+            dimension_name,
+            coordinate_values,
+            measure_attrs(coordinate_name)
+            if coordinate_name in (*PARAMETER_NAMES, FRICTION_NAME)
+            else {},
         )
-        for name, (dim, values) in design.result_coordinates().items()
+        for coordinate_name, (
+            dimension_name,
+            coordinate_values,
+        ) in design.make_result_coordinates().items()
     }
-    coordinates["leg"] = ("leg", legs.values, legs.attrs)
+    result_coordinates["leg"] = ("leg", locked_legs.values, locked_legs.attrs)
     return ResultLayout(
-        dims=design.dims,
-        shape=design.shape,
-        chunk_shape=choose_chunk_shape(design.shape, chunk),
-        variables=tuple(make_variable(name) for name in names),
-        coordinates=coordinates,
+        sample_dimension_names=design.dims,
+        sample_shape=design.shape,
+        chunk_shape=choose_chunk_shape(design.shape, chunk_size),
+        variable_layouts=tuple(
+            make_variable_layout(coordinate_name) for coordinate_name in variable_names
+        ),
+        result_coordinates=result_coordinates,
     )
 
 
-def _record_fields(settings: object) -> dict[str, object]:
-    """Return the class name and the fields of settings as values of JSON."""
-    class_name = type(settings).__name__
-    record: dict[str, object] = {"kind": STORED_KINDS.get(class_name, class_name)}
+def _record_settings(settings_object: object) -> dict[str, object]:
+    """Return the class name and the fields of an object as values of JSON."""
+    class_name = type(settings_object).__name__
+    field_record: dict[str, object] = {"kind": STORED_CLASS_NAMES.get(class_name, class_name)}
     stored_names = STORED_MODEL_NAMES | STORED_FIELD_NAMES.get(class_name, {})
-    for name in type(settings).__dataclass_fields__:  # type: ignore[attr-defined]
-        value = getattr(settings, name)
-        if isinstance(value, StepOptions | ModelCapabilities):
+    for field_name in type(settings_object).__dataclass_fields__:  # type: ignore[attr-defined]
+        field_value = getattr(settings_object, field_name)
+        if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
-        if value is None or isinstance(value, bool | int | str):
-            record[stored_names.get(name, name)] = value
-        elif isinstance(value, tuple):
-            record[stored_names.get(name, name)] = list(value)
+        if field_value is None or isinstance(field_value, bool | int | str):
+            field_record[stored_names.get(field_name, field_name)] = field_value
+        elif isinstance(field_value, tuple):
+            field_record[stored_names.get(field_name, field_name)] = list(field_value)
         else:
-            record[stored_names.get(name, name)] = float(value)
-    return record
+            field_record[stored_names.get(field_name, field_name)] = float(field_value)
+    return field_record

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.design import SALTELLI_KIND
-from vrw_jax.scans.integrity import read_manifest
+from vrw_jax.scans.design import SALTELLI_DESIGN_KIND
+from vrw_jax.scans.integrity import read_scan_manifest
 from vrw_jax.validation import check_names, check_type, suggest_name
 from vrw_jax.wheel import Outcome
 
@@ -24,16 +24,16 @@ from vrw_jax.wheel import Outcome
 class SobolOptions:
     """Options of the estimate of Sobol' indices.
 
-    - `min_rows`: smallest number of rows, chosen because indices of fewer rows are noise;
-    - `n_resamples`: number of bootstrap resamples of the rows;
+    - `min_saltelli_rows`: smallest number of rows, chosen because indices of fewer rows are noise;
+    - `n_bootstrap_resamples`: number of bootstrap resamples of the rows;
     - `interval_quantiles`: quantiles that bound the interval, chosen for a 95 % interval;
-    - `max_roundoff_spread`: largest spread of a measure, as a fraction of its largest magnitude,
-      that counts as round-off. It is chosen because that spread is 4e-14 for measures, and 5e-12
-      for margins, if parameters differ in their last digit alone.
+    - `max_roundoff_spread`: largest spread of a measure that counts as round-off, as a fraction of
+      the largest magnitude. The value is chosen because round-off in the parameters causes spreads
+      of 4e-14 in measures and 5e-12 in margins.
     """
 
-    min_rows: int = 64
-    n_resamples: int = 200
+    min_saltelli_rows: int = 64
+    n_bootstrap_resamples: int = 200
     interval_quantiles: tuple[float, float] = (0.025, 0.975)
     max_roundoff_spread: float = 1e-11
 
@@ -45,7 +45,7 @@ def sobol_indices(
 
     The first-order index is the share of a measure's variance that one parameter causes by itself.
     The total index is the share that would vanish if the parameter were known. Each has the bounds
-    `lower` and `upper` of a 95 % bootstrap interval.
+    `lower_bounds` and `upper_bounds` of a 95 % bootstrap interval.
 
     Rows with a sample without a gait are omitted, and then more rows, so that their number `rows`
     is a power of two. `left_out` is the share of rows without a gait. If it is not small, the
@@ -53,14 +53,14 @@ def sobol_indices(
     The indices are then not those of the region with gaits.
 
     A measure that varies by no more than round-off has no variance: its indices are 0, it is marked
-    in `is_constant`, and a warning names it.
+    in `is_constant_measure`, and a warning names it.
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
         measures: names of variables of the scan.
 
     Returns:
-        A dataset of `first_order`, `total`, their intervals and `is_constant`.
+        A dataset of `first_order`, `total`, their intervals and `is_constant_measure`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -72,106 +72,131 @@ def sobol_indices(
         [0.8, 0.2]
     """
     check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
-    design = read_manifest(scan.attrs).get("design", {})
-    if design.get("kind") != SALTELLI_KIND:
+    design_settings = read_scan_manifest(scan.attrs).get("design", {})
+    if design_settings.get("kind") != SALTELLI_DESIGN_KIND:
         raise ValueError(
-            f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices need those "
+            f"the scan's samples are of kind {design_settings.get('kind')!r}, but Sobol' indices "
+            "need those "
             "of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
-    parameters, measure_names = list(design["swept"]), list(check_names("measures", measures))
-    for name in measure_names:
-        if name not in scan or scan[name].dims != ("sample",):
+    swept_parameters, measure_names = (
+        list(design_settings["swept"]),
+        list(check_names("measures", measures)),
+    )
+    for measure_name in measure_names:
+        if measure_name not in scan or scan[measure_name].dims != ("sample",):
             raise ValueError(
-                f"{name!r} is no measure of this scan{suggest_name(name, map(str, scan))}: "
+                f"{measure_name!r} is no measure of this "
+                f"scan{suggest_name(measure_name, map(str, scan))}: "
                 "ask for one that was scanned."
             )
-    options = SobolOptions()
-    n_blocks = 2 + len(parameters)
-    has_gaits = (scan.outcome.values == Outcome.STEPPED).reshape(n_blocks, -1).all(axis=0)
-    rows_with_gaits = np.flatnonzero(has_gaits)
+    sobol_options = SobolOptions()
+    n_samples_per_row = 2 + len(swept_parameters)
+    has_gaits_in_row = (
+        (scan.outcome.values == Outcome.STEPPED).reshape(n_samples_per_row, -1).all(axis=0)
+    )
+    rows_with_gaits = np.flatnonzero(has_gaits_in_row)
     n_rows = 1 << (len(rows_with_gaits).bit_length() - 1) if len(rows_with_gaits) else 0
-    if n_rows < options.min_rows:
+    if n_rows < sobol_options.min_saltelli_rows:
         raise ValueError(
-            f"only {len(rows_with_gaits)} of {len(has_gaits)} rows walk throughout, but indices "
-            f"need {options.min_rows}: narrow the ranges to where there are gaits, or take more "
+            f"only {len(rows_with_gaits)} of {len(has_gaits_in_row)} rows walk throughout, but "
+            "indices "
+            f"need {sobol_options.min_saltelli_rows}: narrow the ranges to where there are gaits, "
+            "or take more "
             "rows."
         )
     selected_rows = rows_with_gaits[:n_rows]
     measure_values = np.stack(
-        [scan[name].values.reshape(n_blocks, -1)[:, selected_rows] for name in measure_names],
+        [
+            scan[measure_name].values.reshape(n_samples_per_row, -1)[:, selected_rows]
+            for measure_name in measure_names
+        ],
         axis=1,
     )
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    compute_indices = _SobolIndices(measure_values, options.max_roundoff_spread)
-    estimates = compute_indices(np.arange(n_rows))
+    estimate_indices = _SobolIndexEstimator(measure_values, sobol_options.max_roundoff_spread)
+    index_estimates = estimate_indices(np.arange(n_rows))
     resampled_estimates = [
-        compute_indices(random_generator.integers(0, n_rows, n_rows))
-        for _ in range(options.n_resamples)
+        estimate_indices(random_generator.integers(0, n_rows, n_rows))
+        for _ in range(sobol_options.n_bootstrap_resamples)
     ]
-    lower, upper = np.quantile(resampled_estimates, options.interval_quantiles, axis=0)
-    has_no_variance = compute_indices.is_constant(measure_values)
+    lower_bounds, upper_bounds = np.quantile(
+        resampled_estimates, sobol_options.interval_quantiles, axis=0
+    )
+    has_no_variance = estimate_indices.is_constant_measure(measure_values)
     if has_no_variance.any():
         warnings.warn(
             f"{', '.join(np.array(measure_names)[has_no_variance])}: constant over these samples "
             "but for round-off, so that there is no variance to share, and the indices are 0.",
             stacklevel=2,
         )
-    data: dict[str, tuple] = {}
-    for i, (name, label) in enumerate((("first_order", "first-order"), ("total", "total"))):
-        attrs = {"units": "1", "long_name": f"{label} Sobol' index"}
+    index_variables: dict[str, tuple] = {}
+    for i, (measure_name, index_label) in enumerate(
+        (("first_order", "first-order"), ("total", "total"))
+    ):
+        index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
         for index_suffix, interval_bounds in (
-            ("", estimates),
-            ("_lower", lower),
-            ("_upper", upper),
+            ("", index_estimates),
+            ("_lower", lower_bounds),
+            ("_upper", upper_bounds),
         ):
-            data[name + index_suffix] = (("measure", "parameter"), interval_bounds[i], attrs)
-    data["is_constant"] = (
+            index_variables[measure_name + index_suffix] = (
+                ("measure", "parameter"),
+                interval_bounds[i],
+                index_attributes,
+            )
+    index_variables["is_constant_measure"] = (
         "measure",
         has_no_variance,
         {"long_name": "varies by round-off alone"},
     )
     return xr.Dataset(
-        data,
-        coords={"measure": measure_names, "parameter": parameters},
-        attrs={"rows": n_rows, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits)},
+        index_variables,
+        coords={"measure": measure_names, "parameter": swept_parameters},
+        attrs={"rows": n_rows, "left_out": 1.0 - len(rows_with_gaits) / len(has_gaits_in_row)},
     )
 
 
-class _SobolIndices:
-    """Estimator of first-order and total indices from rows of a design.
+class _SobolIndexEstimator:
+    """Estimator of first-order and total Sobol' indices from rows of a design.
 
-    - `values`: measures of the samples, shape (2 + parameters, measures, rows);
-    - `roundoff`: spread of each measure that counts as round-off.
+    - `measure_values`: measures of the samples, shape (2 + parameters, measures, rows);
+    - `roundoff_spreads`: largest spread of each measure that counts as round-off.
     """
 
-    def __init__(self, values: np.ndarray, max_roundoff_spread: float) -> None:
-        self.values = values
-        self.roundoff = max_roundoff_spread * np.abs(values).max(axis=(0, 2))
+    def __init__(self, measure_values: np.ndarray, max_roundoff_spread: float) -> None:
+        self.measure_values = measure_values
+        self.roundoff_spreads = max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
 
-    def is_constant(self, values: np.ndarray) -> np.ndarray:
-        """Return whether each measure varies only by round-off between these samples."""
-        has_small_spread: np.ndarray = np.ptp(values[:2], axis=(0, 2)) <= self.roundoff
+    def is_constant_measure(self, sample_values: np.ndarray) -> np.ndarray:
+        """Return whether each measure varies only by round-off between the samples."""
+        has_small_spread: np.ndarray = (
+            np.ptp(sample_values[:2], axis=(0, 2)) <= self.roundoff_spreads
+        )
         return has_small_spread
 
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return the indices from these rows, shape (2, measures, parameters); 0 for constant
-        measures.
-        """
+    def __call__(self, row_indices: np.ndarray) -> np.ndarray:
+        """Return the indices from the rows with `row_indices`, shape (2, measures, parameters).
+        Indices of constant measures are 0."""
         from scipy.stats import sobol_indices as compute_sobol_indices
 
-        drawn_values = self.values[..., rows]
-        is_varying = np.flatnonzero(~self.is_constant(drawn_values))
-        n_blocks, n_measures, _ = drawn_values.shape
-        indices = np.zeros((2, n_measures, n_blocks - 2))
-        if len(is_varying):
-            drawn_values = drawn_values[:, is_varying]
+        resampled_values = self.measure_values[..., row_indices]
+        varying_measures = np.flatnonzero(~self.is_constant_measure(resampled_values))
+        n_samples_per_row, n_measures, _ = resampled_values.shape
+        index_estimates = np.zeros((2, n_measures, n_samples_per_row - 2))
+        if len(varying_measures):
+            resampled_values = resampled_values[:, varying_measures]
             measure_functions = {
-                "f_A": drawn_values[0],
-                "f_B": drawn_values[1],
-                "f_AB": drawn_values[2:],
+                "f_A": resampled_values[0],
+                "f_B": resampled_values[1],
+                "f_AB": resampled_values[2:],
             }
-            estimate = compute_sobol_indices(func=measure_functions, n=len(rows))
-            indices[0, is_varying] = np.reshape(estimate.first_order, (len(is_varying), -1))
-            indices[1, is_varying] = np.reshape(estimate.total_order, (len(is_varying), -1))
-        return indices
+            scipy_estimate = compute_sobol_indices(func=measure_functions, n=len(row_indices))
+            index_estimates[0, varying_measures] = np.reshape(
+                scipy_estimate.first_order, (len(varying_measures), -1)
+            )
+            index_estimates[1, varying_measures] = np.reshape(
+                scipy_estimate.total_order, (len(varying_measures), -1)
+            )
+        return index_estimates

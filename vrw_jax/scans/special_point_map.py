@@ -16,9 +16,9 @@ from vrw_jax.branches import (
 )
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.scans.design import AbstractDesign
+from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.execution import ProgressCallback, scan
-from vrw_jax.selection import describe_models
+from vrw_jax.selection import describe_accepted_models
 from vrw_jax.simulation import ModelLike, check_model
 from vrw_jax.validation import check_callable, check_names, check_type
 from vrw_jax.wheel import Outcome, WheelParams
@@ -48,23 +48,26 @@ class SpecialPointMap(NamedTuple):
         return f"{n_changes} changes of sign between neighboring samples have no curve nearby."
 
     def __str__(self) -> str:
-        lines = [self.ending]
-        for change in self.unexplained_changes:
-            values = [
-                float(self.scan[name][leg_index])
-                for name, leg_index in zip(
-                    self.scan.outcome.dims, change.sample_indices, strict=True
+        text_lines = [self.ending]
+        for sign_change in self.unexplained_changes:
+            parameter_values = [
+                float(self.scan[parameter_name][sample_index])
+                for parameter_name, sample_index in zip(
+                    self.scan.outcome.dims, sign_change.sample_indices, strict=True
                 )
             ]
-            lines.append(f"    {change.quantity_name} at ({values[0]:.6g}, {values[1]:.6g})")
-        return "\n\n".join([*map(str, self.curves), "\n".join(lines)])
+            text_lines.append(
+                f"    {sign_change.quantity_name} at "
+                f"({parameter_values[0]:.6g}, {parameter_values[1]:.6g})"
+            )
+        return "\n\n".join([*map(str, self.curves), "\n".join(text_lines)])
 
     def __repr__(self) -> str:
         return str(self)
 
 
 def map_special_points(
-    design: AbstractDesign,
+    design: AbstractSampleDesign,
     measures: str | Iterable[str] = ("dls_fraction",),
     *,
     base: WheelParams | None = None,
@@ -103,7 +106,7 @@ def map_special_points(
         ...     special_points.scan, "speed", special_points.curves
         ... )  # doctest: +SKIP
     """
-    check_type("design", design, AbstractDesign, "give vrw.grid(damping=[...], slope=[...])")
+    check_type("design", design, AbstractSampleDesign, "give vrw.grid(damping=[...], slope=[...])")
     require_map_grid(design)
     if on_stage is not None:
         check_callable("on_stage", on_stage, "that takes a sentence")
@@ -111,7 +114,7 @@ def map_special_points(
     if "map" not in wheel_model.capabilities.commands:
         raise ValueError(
             f"model is {type(wheel_model).__name__}, but special points are mapped for "
-            f"{describe_models('map')}: give that."
+            f"{describe_accepted_models('map')}: give that."
         )
     scanned_samples = scan(
         design,
@@ -129,29 +132,31 @@ def map_special_points(
 
 def follow_special_points(
     scanned_samples: xr.Dataset,
-    base: WheelParams,
-    model: Any,
+    base_wheel: WheelParams,
+    wheel_model: Any,
     on_stage: Callable[[str], None] | None = None,
 ) -> SpecialPointMap:
-    """Return the map of special points over the two parameters of a scan with their measures."""
+    """Return the map of special points over the two parameters of a scan, which must contain the
+    measures of special points."""
     if not np.any(scanned_samples.outcome.values == Outcome.STEPPED):
         raise ValueError("no gait was found on the grid: choose another.")
     return SpecialPointMap(
-        scanned_samples, *trace_special_points(scanned_samples, base, model, on_stage)
+        scanned_samples, *trace_special_points(scanned_samples, base_wheel, wheel_model, on_stage)
     )
 
 
-def require_map_grid(design: AbstractDesign) -> None:
+def require_map_grid(design: AbstractSampleDesign) -> None:
     """Raise a ValueError unless the design is a grid over two parameters with ascending values."""
     if len(design.shape) != 2:
         raise ValueError(
-            f"the design sweeps {', '.join(design.names)}, but a map is a grid over two "
+            f"the design sweeps {', '.join(design.swept_parameters)}, but a map is a grid over two "
             "parameters: sweep two below [grid], or in vrw.grid."
         )
-    for name in design.names:
-        values = design.values[name]
-        if len(values) < 2 or not np.all(np.diff(values) > 0.0):
+    for parameter_name in design.swept_parameters:
+        parameter_values = design.values_by_parameter[parameter_name]
+        if len(parameter_values) < 2 or not np.all(np.diff(parameter_values) > 0.0):
             raise ValueError(
-                f"{name} has the values {values.tolist()}, but each side of a map has at least two "
+                f"{parameter_name} has the values {parameter_values.tolist()}, but each side of "
+                f"a map has at least two "
                 "ascending ones: sort them, or give more."
             )

@@ -25,23 +25,23 @@ import numpy as np
 from vrw_jax.runtime import lazy_import
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.integrity import (
-    ATTRIBUTES_KEY,
     CHECKSUM_ARRAY_NAME,
     CHECKSUM_GROUP_NAME,
-    COORDINATES_KEY,
+    COORDINATE_DIGESTS_KEY,
     DIGEST_SIZE_BYTES,
     MANIFEST_ATTRIBUTE,
     METADATA_FILE_NAME,
-    VARIABLES_KEY,
+    SCAN_VARIABLES_KEY,
+    STORE_ATTRIBUTES_KEY,
     ChunkChecksums,
     StoredMetadata,
-    describe_damage,
-    digest_values,
-    read_manifest,
-    seal_attributes,
-    store_lock,
+    add_attribute_seal,
+    describe_store_damage,
+    digest_coordinate_values,
+    lock_store,
+    read_scan_manifest,
 )
-from vrw_jax.scans.measure_catalog import canonicalize_name
+from vrw_jax.scans.measure_catalog import canonicalize_variable_name
 from vrw_jax.validation import check_bool, check_path
 
 if TYPE_CHECKING:
@@ -50,43 +50,44 @@ else:
     zarr = lazy_import("zarr")
 
 PROVENANCE_ATTRIBUTE = "provenance"
-"""Name of the attribute that describes the origin of the numbers."""
+"""Name of the attribute that describes the origin of the results."""
 
-REQUESTED_ATTRIBUTE = "asked"
-"""Name of the attribute that contains the requested measures."""
+REQUESTED_MEASURES_ATTRIBUTE = "asked"
+"""Name of the attribute that lists the requested measures."""
 
 ChunkRegion = tuple[slice, ...]
 """Slices of a chunk along the axes of the samples."""
-ChunkBlock = Mapping[str, np.ndarray]
+ChunkVariables = Mapping[str, np.ndarray]
 """Results of one chunk by variable; the axes of the samples come first."""
 
 
 @dataclass(frozen=True)
 class VariableLayout:
-    """Description of one variable; `dims` and `shape` do not include the axes of the samples."""
+    """Description of one variable of a result. Its dimensions and its shape do not include the axes
+    of the samples."""
 
-    name: str
+    variable_name: str
     dtype: str
     fill_value: float | int
-    attrs: Mapping[str, Any]
-    dims: tuple[str, ...] = ()
-    shape: tuple[int, ...] = ()
+    variable_attributes: Mapping[str, Any]
+    extra_dimension_names: tuple[str, ...] = ()
+    extra_shape: tuple[int, ...] = ()
 
     @property
     def bytes_per_sample(self) -> int:
-        """Return the size of the value of one sample, in bytes."""
-        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
+        """Return the size of the variable's value of one sample, in bytes."""
+        return np.dtype(self.dtype).itemsize * math.prod(self.extra_shape)
 
 
 @dataclass(frozen=True)
 class ResultLayout:
     """Description of a result: its axes, chunks, variables and coordinates."""
 
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
+    sample_dimension_names: tuple[str, ...]
+    sample_shape: tuple[int, ...]
     chunk_shape: tuple[int, ...]
-    variables: tuple[VariableLayout, ...]
-    coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, Any]]]
+    variable_layouts: tuple[VariableLayout, ...]
+    result_coordinates: Mapping[str, tuple[str, np.ndarray, Mapping[str, Any]]]
 
     @property
     def n_chunks(self) -> int:
@@ -98,10 +99,10 @@ class ResultLayout:
         """Return the number of chunks along each axis."""
         return tuple(
             -(-axis_length // chunk_length)
-            for axis_length, chunk_length in zip(self.shape, self.chunk_shape, strict=True)
+            for axis_length, chunk_length in zip(self.sample_shape, self.chunk_shape, strict=True)
         )
 
-    def chunk_region(self, chunk_index: int) -> ChunkRegion:
+    def get_chunk_region(self, chunk_index: int) -> ChunkRegion:
         """Return the slices of a chunk along the axes of the samples."""
         chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
         return tuple(
@@ -110,37 +111,40 @@ class ResultLayout:
                 min((int(axis_index) + 1) * chunk_length, axis_length),
             )
             for axis_index, chunk_length, axis_length in zip(
-                chunk_indices, self.chunk_shape, self.shape, strict=True
+                chunk_indices, self.chunk_shape, self.sample_shape, strict=True
             )
         )
 
-    def shape_of_chunk(self, chunk_index: int) -> tuple[int, ...]:
-        """Return the shape of a chunk, which is smaller at the end of an axis."""
+    def get_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
+        """Return the shape of a chunk along the axes of the samples; a chunk at the end of an axis
+        may be smaller."""
         return tuple(
-            axis_slice.stop - axis_slice.start for axis_slice in self.chunk_region(chunk_index)
+            axis_slice.stop - axis_slice.start for axis_slice in self.get_chunk_region(chunk_index)
         )
 
     @property
     def bytes_per_sample(self) -> int:
         """Return the size of the results of one sample, uncompressed, in bytes."""
-        return sum(variable.bytes_per_sample for variable in self.variables)
+        return sum(variable.bytes_per_sample for variable in self.variable_layouts)
 
 
-def choose_chunk_shape(shape: tuple[int, ...], max_samples: int) -> tuple[int, ...]:
-    """Return the shape of a slab of at most `max_samples` samples with whole last axes."""
-    chunk_shape, samples_left = [1] * len(shape), max_samples
-    for axis in range(len(shape) - 1, -1, -1):
-        chunk_shape[axis] = min(shape[axis], max(samples_left, 1))
-        samples_left //= chunk_shape[axis]
-        if chunk_shape[axis] < shape[axis]:
+def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
+    """Return the shape of chunks of at most `max_chunk_samples` samples, in which the last axes are
+    complete."""
+    chunk_shape, samples_left = [1] * len(sample_shape), max_chunk_samples
+    for axis_index in range(len(sample_shape) - 1, -1, -1):
+        chunk_shape[axis_index] = min(sample_shape[axis_index], max(samples_left, 1))
+        samples_left //= chunk_shape[axis_index]
+        if chunk_shape[axis_index] < sample_shape[axis_index]:
             break
     return tuple(chunk_shape)
 
 
-class AbstractStore(abc.ABC):
-    """Storage that accepts chunks, lists the missing ones and returns the labeled result."""
+class AbstractResultStore(abc.ABC):
+    """Storage that accepts the results of chunks, lists missing chunks and returns the labeled
+    result."""
 
-    location: str = "memory"
+    store_location: str = "memory"
     damage_description: str = ""
     """Description of the damage of the store; an empty string if there is none."""
 
@@ -149,7 +153,7 @@ class AbstractStore(abc.ABC):
         """Return the indices of the chunks that are not computed yet, in ascending order."""
 
     @abc.abstractmethod
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
         """Write the results of a chunk and mark the chunk as written."""
 
     @abc.abstractmethod
@@ -161,123 +165,148 @@ class AbstractStore(abc.ABC):
         """Return the context of all writing, which removes unfinished files and holds the lock."""
 
 
-class MemoryStore(AbstractStore):
+class MemoryResultStore(AbstractResultStore):
     """Storage of a scan's results in memory."""
 
-    def __init__(self, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
-        self._layout, self._attrs = layout, attrs
-        self._is_chunk_done = np.zeros(layout.n_chunks, bool)
+    def __init__(self, result_layout: ResultLayout, store_attributes: Mapping[str, object]) -> None:
+        self._result_layout, self._store_attributes = result_layout, store_attributes
+        self._is_chunk_done = np.zeros(result_layout.n_chunks, bool)
         try:
-            self._arrays = {
-                variable.name: np.full(
-                    (*layout.shape, *variable.shape), variable.fill_value, variable.dtype
+            self._variable_arrays = {
+                variable_layout.variable_name: np.full(
+                    (*result_layout.sample_shape, *variable_layout.extra_shape),
+                    variable_layout.fill_value,
+                    variable_layout.dtype,
                 )
-                for variable in layout.variables
+                for variable_layout in result_layout.variable_layouts
             }
-        except MemoryError as error:
-            n_samples = math.prod(layout.shape)
+        except MemoryError as memory_error:
+            n_samples = math.prod(result_layout.sample_shape)
             raise ValueError(
                 f"the result of {n_samples:,} samples takes "
-                f"{n_samples * layout.bytes_per_sample / 1e9:,.0f} GB, more than this memory "
+                f"{n_samples * result_layout.bytes_per_sample / 1e9:,.0f} GB, more than this "
+                f"memory "
                 "holds: give a store, whose chunks go to the disk."
-            ) from error
+            ) from memory_error
 
     def find_missing_chunks(self) -> list[int]:
         return [int(chunk_index) for chunk_index in np.flatnonzero(~self._is_chunk_done)]
 
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
-        region = self._layout.chunk_region(chunk_index)
-        for name, array in self._arrays.items():
-            array[region] = chunk_results[name]
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
+        chunk_region = self._result_layout.get_chunk_region(chunk_index)
+        for variable_name, variable_array in self._variable_arrays.items():
+            variable_array[chunk_region] = chunk_results[variable_name]
         self._is_chunk_done[chunk_index] = True
 
     def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
     def load_dataset(self) -> xr.Dataset:
-        layout = self._layout
+        result_layout = self._result_layout
         dataset = xr.Dataset(
             {
-                variable.name: (
-                    (*layout.dims, *variable.dims),
-                    self._arrays[variable.name],
-                    dict(variable.attrs),
+                variable_layout.variable_name: (
+                    (*result_layout.sample_dimension_names, *variable_layout.extra_dimension_names),
+                    self._variable_arrays[variable_layout.variable_name],
+                    dict(variable_layout.variable_attributes),
                 )
-                for variable in layout.variables
+                for variable_layout in result_layout.variable_layouts
             },
             coords={
-                name: (dim, values, dict(attrs))
-                for name, (dim, values, attrs) in layout.coordinates.items()
+                coordinate_name: (dimension_name, coordinate_values, dict(coordinate_attributes))
+                for coordinate_name, (
+                    dimension_name,
+                    coordinate_values,
+                    coordinate_attributes,
+                ) in result_layout.result_coordinates.items()
             },
-            attrs=dict(self._attrs),
+            attrs=dict(self._store_attributes),
         )
-        return _arrange_as_requested(dataset)
+        return _arrange_requested_variables(dataset)
 
 
-class ZarrStore(AbstractStore):
-    """Storage of a scan's results in a folder; `verify` selects the search for damaged chunks."""
+class ZarrResultStore(AbstractResultStore):
+    """Storage of a scan's results in a folder; `verifies_files` selects the search for damaged
+    chunks."""
 
-    def __init__(self, path: Path, layout: ResultLayout, verify: bool = True) -> None:
-        self._path, self._layout, self.location, self._verify = path, layout, str(path), verify
-        self._open()
-        self.damage_description = describe_damage(
-            path, self.damaged_chunks, self._damaged_coordinates, self._damaged_metadata
+    def __init__(
+        self, store_path: Path, result_layout: ResultLayout, verifies_files: bool = True
+    ) -> None:
+        self._store_path, self._result_layout, self.store_location, self._verifies_files = (
+            store_path,
+            result_layout,
+            str(store_path),
+            verifies_files,
+        )
+        self._open_arrays()
+        self.damage_description = describe_store_damage(
+            store_path, self.damaged_chunks, self._damaged_coordinates, self._damaged_metadata
         )
 
-    def _open(self) -> None:
-        """Open the arrays and find damage; arrays with damaged metadata stay closed."""
-        metadata, self._checksums = StoredMetadata(self._path), None
-        self._damaged_metadata = metadata.find_damaged() if self._verify else []
+    def _open_arrays(self) -> None:
+        """Open the arrays and find damage. Arrays with damaged metadata remain closed."""
+        stored_metadata, self._chunk_checksums = StoredMetadata(self._store_path), None
+        self._damaged_metadata = (
+            stored_metadata.find_damaged_metadata() if self._verifies_files else []
+        )
         self.damaged_chunks: list[int] = []
         self._damaged_coordinates: list[str] = []
         try:
-            self._group = _open_group(self._path, "r+", metadata)
-            self._checksums = ChunkChecksums(self._path, self._group, metadata)
-        except METADATA_ERRORS:
+            self._zarr_group = _open_zarr_group(self._store_path, "r+", stored_metadata)
+            self._chunk_checksums = ChunkChecksums(
+                self._store_path, self._zarr_group, stored_metadata
+            )
+        except ZARR_METADATA_ERRORS:
             if not self._damaged_metadata:
                 raise
             return  # The metadata are written again before anything else is.
-        if self._verify:
-            self.damaged_chunks = self._checksums.find_damaged_chunks()
-            self._damaged_coordinates = self._checksums.find_damaged_coordinates()
+        if self._verifies_files:
+            self.damaged_chunks = self._chunk_checksums.find_damaged_chunks()
+            self._damaged_coordinates = self._chunk_checksums.find_damaged_coordinates()
 
     def find_missing_chunks(self) -> list[int]:
-        if self._checksums is None:
-            return list(range(self._layout.n_chunks))
-        is_done = self._checksums.is_chunk_marked()
-        is_done[np.asarray(self.damaged_chunks, int)] = False
-        return [int(chunk_index) for chunk_index in np.flatnonzero(~is_done)]
+        if self._chunk_checksums is None:
+            return list(range(self._result_layout.n_chunks))
+        are_chunks_done = self._chunk_checksums.are_chunks_marked()
+        are_chunks_done[np.asarray(self.damaged_chunks, int)] = False
+        return [int(chunk_index) for chunk_index in np.flatnonzero(~are_chunks_done)]
 
-    def write_chunk(self, chunk_index: int, chunk_results: ChunkBlock) -> None:
-        region = self._layout.chunk_region(chunk_index)
-        for variable in self._layout.variables:
-            _get_array(self._group, variable.name)[region] = chunk_results[variable.name]
-        assert self._checksums is not None
-        self._checksums.mark_chunk(chunk_index)
-        self.damaged_chunks = [chunk for chunk in self.damaged_chunks if chunk != chunk_index]
+    def write_chunk(self, chunk_index: int, chunk_results: ChunkVariables) -> None:
+        chunk_region = self._result_layout.get_chunk_region(chunk_index)
+        for variable_layout in self._result_layout.variable_layouts:
+            _get_zarr_array(self._zarr_group, variable_layout.variable_name)[chunk_region] = (
+                chunk_results[variable_layout.variable_name]
+            )
+        assert self._chunk_checksums is not None
+        self._chunk_checksums.mark_chunk_as_written(chunk_index)
+        self.damaged_chunks = [
+            damaged_chunk for damaged_chunk in self.damaged_chunks if damaged_chunk != chunk_index
+        ]
 
     def load_dataset(self) -> xr.Dataset:
-        return open_scan(self._path, verify=False)
+        return open_scan(self._store_path, verify=False)
 
     @contextlib.contextmanager
     def open_for_writing(self) -> Iterator[None]:
-        with store_lock(self._path):
-            for path in self._path.rglob("*.partial"):
-                path.unlink(missing_ok=True)
+        with lock_store(self._store_path):
+            for partial_path in self._store_path.rglob("*.partial"):
+                partial_path.unlink(missing_ok=True)
             if self._damaged_metadata:
-                _rewrite_metadata(self._path, self._layout)
-                self._open()
-            for name in self._damaged_coordinates:
-                _get_array(self._group, name)[:] = self._layout.coordinates[name][1]
+                _rewrite_store_metadata(self._store_path, self._result_layout)
+                self._open_arrays()
+            for coordinate_name in self._damaged_coordinates:
+                _get_zarr_array(self._zarr_group, coordinate_name)[:] = (
+                    self._result_layout.result_coordinates[coordinate_name][1]
+                )
             self._damaged_coordinates = []
             yield
 
 
-def _get_array(group: zarr.Group, name: str) -> zarr.Array:
-    """Return the array `name` of a Zarr group; raise an error if it is no array."""
-    array = group[name]
-    assert isinstance(array, zarr.Array)
-    return array
+def _get_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
+    """Return an array of a Zarr group; raise an error if the name belongs to a group."""
+    zarr_array = zarr_group[array_name]
+    assert isinstance(zarr_array, zarr.Array)
+    return zarr_array
 
 
 def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
@@ -306,144 +335,169 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     """
     check_path("path", path, "give the folder that a scan wrote")
     verify = check_bool("verify", verify)
-    metadata = _read_scan_metadata(Path(path))
-    damaged_metadata = metadata.find_damaged() if verify else []
+    stored_metadata = _read_scan_metadata(Path(path))
+    damaged_metadata = stored_metadata.find_damaged_metadata() if verify else []
     try:
-        group = _open_group(Path(path), "r", metadata)
-        checksums = ChunkChecksums(Path(path), group, metadata)
+        zarr_group = _open_zarr_group(Path(path), "r", stored_metadata)
+        chunk_checksums = ChunkChecksums(Path(path), zarr_group, stored_metadata)
         if verify:
-            damage_description = describe_damage(
+            damage_description = describe_store_damage(
                 path,
-                checksums.find_damaged_chunks(),
-                checksums.find_damaged_coordinates(),
+                chunk_checksums.find_damaged_chunks(),
+                chunk_checksums.find_damaged_coordinates(),
                 damaged_metadata,
             )
             if damage_description:
-                raise ValueError(f"{damage_description}: {RECOMPUTE_REMEDY}")
+                raise ValueError(f"{damage_description}: {RECOMPUTE_DAMAGED_REMEDY}")
         dataset = xr.open_zarr(
             path,
-            consolidated=group.metadata.consolidated_metadata is not None,
+            consolidated=zarr_group.metadata.consolidated_metadata is not None,
             chunks=None,
             mask_and_scale=False,
             decode_times=False,
         )
-    except METADATA_ERRORS as error:
-        if isinstance(error, ValueError) and RECOMPUTE_REMEDY in str(error):
+    except ZARR_METADATA_ERRORS as metadata_error:
+        if isinstance(metadata_error, ValueError) and RECOMPUTE_DAMAGED_REMEDY in str(
+            metadata_error
+        ):
             raise
-        reason = ", ".join(damaged_metadata) or " ".join(str(error).split()).rstrip(".")
+        damage_reason = ", ".join(damaged_metadata) or " ".join(str(metadata_error).split()).rstrip(
+            "."
+        )
         raise ValueError(
-            f"{path} can't be opened ({reason}): run the scan again, which mends the arrays that "
+            f"{path} can't be opened ({damage_reason}): run the scan again, which mends the "
+            f"arrays that "
             "it wrote, and delete others without dimension names."
-        ) from error
+        ) from metadata_error
     dataset = dataset.assign_attrs(
         {
             attribute_name: attribute_value
-            for attribute_name, attribute_value in metadata.attributes.items()
+            for attribute_name, attribute_value in stored_metadata.store_attributes.items()
             if attribute_name != "coordinates"
         }
     )
-    return _arrange_as_requested(dataset)
+    return _arrange_requested_variables(dataset)
 
 
-RECOMPUTE_REMEDY = (
+RECOMPUTE_DAMAGED_REMEDY = (
     "run the scan again, which computes these anew, or read the rest with "
     "open_scan(path, verify=False)."
 )
-METADATA_ERRORS = (
+ZARR_METADATA_ERRORS = (
     ArithmeticError, AssertionError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
 """Exceptions that zarr, its codecs and xarray raise for metadata that they cannot interpret."""
 
 
-def _open_group(path: Path, mode: Literal["r", "r+"], metadata: StoredMetadata) -> zarr.Group:
-    """Return the group of a store, opened with the first copy of its metadata that can be read."""
-    variables = metadata.mark_attributes.get(VARIABLES_KEY, ())
-    for uses_consolidated in (None, False):
+def _open_zarr_group(
+    store_path: Path, access_mode: Literal["r", "r+"], stored_metadata: StoredMetadata
+) -> zarr.Group:
+    """Return the group of a store, opened with the first copy of the metadata that can be read."""
+    variable_names = stored_metadata.mark_attributes.get(SCAN_VARIABLES_KEY, ())
+    for uses_consolidated_metadata in (None, False):
         try:
-            group = zarr.open_group(
-                path, mode=mode, zarr_format=3, use_consolidated=uses_consolidated
+            zarr_group = zarr.open_group(
+                store_path,
+                mode=access_mode,
+                zarr_format=3,
+                use_consolidated=uses_consolidated_metadata,
             )
-            for name in (*metadata.coordinates, *variables, "outcome"):
-                _get_array(group, name)
-            return group
-        except METADATA_ERRORS:
-            if uses_consolidated is False:
+            for array_name in (*stored_metadata.coordinate_names, *variable_names, "outcome"):
+                _get_zarr_array(zarr_group, array_name)
+            return zarr_group
+        except ZARR_METADATA_ERRORS:
+            if uses_consolidated_metadata is False:
                 raise
     raise AssertionError
 
 
-def _arrange_as_requested(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the dataset with the requested variables first, in their order and by their names.
+def _arrange_requested_variables(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the dataset with the requested variables first, in the requested order and with the
+    requested names.
 
-    A file name cannot be "d speed / d damping", so the array of that variable in a store has
-    another name.
+    A file name cannot be "d speed / d damping", so the array of that variable has another name in a
+    store.
     """
-    requested_text = dataset.attrs.get(REQUESTED_ATTRIBUTE)
-    names = (
+    requested_text = dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
+    requested_measures = (
         str(requested_text).split(", ")
         if requested_text
-        else read_manifest(dataset.attrs).get("measures", [])
+        else read_scan_manifest(dataset.attrs).get("measures", [])
     )
-    requested_names = {
-        canonicalize_name(name): name
-        for name in reversed(names)
-        if canonicalize_name(name) in dataset
+    requested_name_by_variable = {
+        canonicalize_variable_name(variable_name): variable_name
+        for variable_name in reversed(requested_measures)
+        if canonicalize_variable_name(variable_name) in dataset
     }
-    names_in_order = list(dict.fromkeys(map(canonicalize_name, names)))
-    ordered_names = dict.fromkeys(
+    variables_in_order = list(dict.fromkeys(map(canonicalize_variable_name, requested_measures)))
+    ordered_variables = dict.fromkeys(
         [
-            *(name for name in names_in_order if name in requested_names),
+            *(
+                variable_name
+                for variable_name in variables_in_order
+                if variable_name in requested_name_by_variable
+            ),
             *map(str, dataset.data_vars),
         ]
     )
-    return dataset[list(ordered_names)].rename(
-        {name: requested_names[name] for name in requested_names if name != requested_names[name]}
+    return dataset[list(ordered_variables)].rename(
+        {
+            variable_name: requested_name_by_variable[variable_name]
+            for variable_name in requested_name_by_variable
+            if variable_name != requested_name_by_variable[variable_name]
+        }
     )
 
 
-def _read_scan_metadata(path: Path) -> StoredMetadata:
-    """Return the metadata of a store; raise a ValueError if the folder is not a store of a scan."""
-    metadata = StoredMetadata(path)
+def _read_scan_metadata(store_path: Path) -> StoredMetadata:
+    """Return the metadata of a store; raise a ValueError if the folder does not contain a store of
+    a scan."""
+    stored_metadata = StoredMetadata(store_path)
     if (
-        metadata.root_metadata.get("node_type") != "group"
-        or metadata.root_metadata.get("zarr_format") != 3
+        stored_metadata.root_metadata.get("node_type") != "group"
+        or stored_metadata.root_metadata.get("zarr_format") != 3
     ):
         raise ValueError(
-            f"{path} is no scan's store: give the folder that `vrw scan` wrote, or a new place."
+            f"{store_path} is no scan's store: give the folder that `vrw scan` wrote, or a new "
+            f"place."
         )
-    if MANIFEST_ATTRIBUTE not in metadata.attributes:
+    if MANIFEST_ATTRIBUTE not in stored_metadata.store_attributes:
         raise ValueError(
-            f"{path} is a Zarr store, but not a scan's: give the folder that `vrw scan` wrote."
+            f"{store_path} is a Zarr store, but not a scan's: give the folder that `vrw scan` "
+            f"wrote."
         )
-    return metadata
+    return stored_metadata
 
 
-def read_stored_manifest(path: Path) -> dict | None:
-    """Return the settings and provenance of the store at `path`, or None if there is no store."""
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+def read_stored_manifest(store_path: Path) -> dict | None:
+    """Return settings and provenance of the store at `store_path`, or None if there is no store."""
+    if not store_path.exists() or (store_path.is_dir() and not any(store_path.iterdir())):
         return None
-    attrs = _read_scan_metadata(path).attributes
+    store_attributes = _read_scan_metadata(store_path).store_attributes
     try:
-        provenance_record = attrs.get(PROVENANCE_ATTRIBUTE, {})
+        provenance_record = store_attributes.get(PROVENANCE_ATTRIBUTE, {})
         provenance_record = (
             json.loads(provenance_record)
             if isinstance(provenance_record, str)
             else provenance_record
         )
-        return {MANIFEST_ATTRIBUTE: read_manifest(attrs), PROVENANCE_ATTRIBUTE: provenance_record}
+        return {
+            MANIFEST_ATTRIBUTE: read_scan_manifest(store_attributes),
+            PROVENANCE_ATTRIBUTE: provenance_record,
+        }
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"{path} has damaged attributes ({error}): give another place for this scan."
+            f"{store_path} has damaged attributes ({error}): give another place for this scan."
         ) from error
 
 
-def find_first_difference(
-    stored_settings: object, current_settings: object, name: str = ""
+def find_first_settings_difference(
+    stored_settings: object, current_settings: object, setting_path: str = ""
 ) -> tuple[str, object, object]:
     """Return the name and both values of the first setting that differs, or ("", None, None)."""
     if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
-        for key in [
+        for setting_name in [
             *stored_settings,
             *(
                 setting_name
@@ -451,10 +505,10 @@ def find_first_difference(
                 if setting_name not in stored_settings
             ),
         ]:
-            nested_difference = find_first_difference(
-                stored_settings.get(key),
-                current_settings.get(key),
-                f"{name}.{key}" if name else str(key),
+            nested_difference = find_first_settings_difference(
+                stored_settings.get(setting_name),
+                current_settings.get(setting_name),
+                f"{setting_path}.{setting_name}" if setting_path else str(setting_name),
             )
             if nested_difference[0]:
                 return nested_difference
@@ -462,102 +516,126 @@ def find_first_difference(
     return (
         ("", None, None)
         if stored_settings == current_settings
-        else (name, stored_settings, current_settings)
+        else (setting_path, stored_settings, current_settings)
     )
 
 
-def create_store(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
-    """Create an empty store at `path` atomically; a store that another process creates first is
-    kept.
-    """
+def create_empty_store(
+    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+) -> None:
+    """Create an empty store at `store_path` atomically. If another process creates a store there
+    first, keep that store."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+        store_path.parent.mkdir(parents=True, exist_ok=True)
+        temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
         temporary_path.mkdir()
-    except OSError as error:
-        reason = error.strerror or "no folder can be made there"
+    except OSError as creation_error:
+        failure_reason = creation_error.strerror or "no folder can be made there"
         raise OSError(
-            error.errno, f"no store can be made at {path} ({reason}): give a place of your own"
-        ) from error
+            creation_error.errno,
+            f"no store can be made at {store_path} ({failure_reason}): give a place of your own",
+        ) from creation_error
     try:
-        _create_arrays(temporary_path, layout, attrs)
-        temporary_path.rename(path)
-    except BaseException as error:
+        _create_zarr_arrays(temporary_path, result_layout, store_attributes)
+        temporary_path.rename(store_path)
+    except BaseException as creation_error:
         shutil.rmtree(temporary_path, ignore_errors=True)
-        if not (isinstance(error, OSError) and read_stored_manifest(path) is not None):
+        if not (
+            isinstance(creation_error, OSError) and read_stored_manifest(store_path) is not None
+        ):
             raise
 
 
-def _create_arrays(path: Path, layout: ResultLayout, attrs: Mapping[str, object]) -> None:
-    """Create the Zarr group at `path` with its coordinates, empty variables and marks."""
+def _create_zarr_arrays(
+    store_path: Path, result_layout: ResultLayout, store_attributes: Mapping[str, object]
+) -> None:
+    """Create the Zarr group of a store with its coordinates, empty variables and marks."""
     from zarr.codecs import Crc32cCodec, ZstdCodec
 
     # xarray reads from this attribute which arrays are coordinates, and removes it on opening.
-    group_attrs = {**attrs, "coordinates": " ".join(layout.coordinates)}
-    group = zarr.create_group(path, zarr_format=3, attributes=group_attrs)
+    group_attributes = {
+        **store_attributes,
+        "coordinates": " ".join(result_layout.result_coordinates),
+    }
+    zarr_group = zarr.create_group(store_path, zarr_format=3, attributes=group_attributes)
     compressors = [ZstdCodec(level=3), Crc32cCodec()]  # The checksum reveals damage.
-    for name, (dim, values, coordinate_attrs) in layout.coordinates.items():
-        array = group.create_array(
-            name,
-            shape=values.shape,
-            chunks=values.shape,
-            dtype=values.dtype,
-            dimension_names=(dim,),
+    for coordinate_name, (
+        dimension_name,
+        coordinate_values,
+        coordinate_attributes,
+    ) in result_layout.result_coordinates.items():
+        coordinate_array = zarr_group.create_array(
+            coordinate_name,
+            shape=coordinate_values.shape,
+            chunks=coordinate_values.shape,
+            dtype=coordinate_values.dtype,
+            dimension_names=(dimension_name,),
             compressors=compressors,
-            attributes=dict(coordinate_attrs),
+            attributes=dict(coordinate_attributes),
         )
-        array[:] = values
-    for variable in layout.variables:
-        group.create_array(
-            variable.name,
-            shape=(*layout.shape, *variable.shape),
-            chunks=(*layout.chunk_shape, *variable.shape),
-            dtype=variable.dtype,
-            fill_value=variable.fill_value,
-            dimension_names=(*layout.dims, *variable.dims),
+        coordinate_array[:] = coordinate_values
+    for variable_layout in result_layout.variable_layouts:
+        zarr_group.create_array(
+            variable_layout.variable_name,
+            shape=(*result_layout.sample_shape, *variable_layout.extra_shape),
+            chunks=(*result_layout.chunk_shape, *variable_layout.extra_shape),
+            dtype=variable_layout.dtype,
+            fill_value=variable_layout.fill_value,
+            dimension_names=(
+                *result_layout.sample_dimension_names,
+                *variable_layout.extra_dimension_names,
+            ),
             compressors=compressors,
-            attributes=dict(variable.attrs),
+            attributes=dict(variable_layout.variable_attributes),
         )
-    chunks = (layout.n_chunks, DIGEST_SIZE_BYTES)
-    mark_attributes = seal_attributes(
+    mark_array_shape = (result_layout.n_chunks, DIGEST_SIZE_BYTES)
+    mark_attributes = add_attribute_seal(
         {
-            VARIABLES_KEY: [variable.name for variable in layout.variables],
-            COORDINATES_KEY: {
-                name: digest_values(np.asarray(values))
-                for name, (_, values, _) in layout.coordinates.items()
+            SCAN_VARIABLES_KEY: [
+                variable_layout.variable_name for variable_layout in result_layout.variable_layouts
+            ],
+            COORDINATE_DIGESTS_KEY: {
+                coordinate_name: digest_coordinate_values(np.asarray(coordinate_values))
+                for coordinate_name, (
+                    _,
+                    coordinate_values,
+                    _,
+                ) in result_layout.result_coordinates.items()
             },
-            ATTRIBUTES_KEY: dict(group_attrs),
+            STORE_ATTRIBUTES_KEY: dict(group_attributes),
         }
     )
-    group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attributes).create_array(
-        "digest", shape=chunks, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
+    zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attributes).create_array(
+        "digest", shape=mark_array_shape, chunks=(1, DIGEST_SIZE_BYTES), dtype="u1", fill_value=0
     )
     # All metadata are written into one file in this order, because zarr's function sorts them and
     # warns.
-    names = [*layout.coordinates, *(variable.name for variable in layout.variables)]
+    array_names = [
+        *result_layout.result_coordinates,
+        *(variable_layout.variable_name for variable_layout in result_layout.variable_layouts),
+    ]
     metadata_by_name = {
-        name: json.loads((path / name / METADATA_FILE_NAME).read_text())
-        for name in (*names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
+        coordinate_name: json.loads((store_path / coordinate_name / METADATA_FILE_NAME).read_text())
+        for coordinate_name in (*array_names, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME)
     }
-    root_path = path / METADATA_FILE_NAME
-    root = json.loads(root_path.read_text())
-    root["consolidated_metadata"] = {
+    root_metadata_path = store_path / METADATA_FILE_NAME
+    root_metadata = json.loads(root_metadata_path.read_text())
+    root_metadata["consolidated_metadata"] = {
         "kind": "inline",
         "must_understand": False,
         "metadata": metadata_by_name,
     }
-    root_path.write_text(json.dumps(root, indent=2))
+    root_metadata_path.write_text(json.dumps(root_metadata, indent=2))
 
 
-def _rewrite_metadata(path: Path, layout: ResultLayout) -> None:
-    """Write the metadata of the scan's arrays as they are in a new store, which is made
-    temporarily.
-    """
-    stored_metadata = StoredMetadata(path)
-    temporary_path = path.parent / f".{path.name}.{os.urandom(8).hex()}"
+def _rewrite_store_metadata(store_path: Path, result_layout: ResultLayout) -> None:
+    """Write the metadata of the scan's arrays anew, copied from a new store that is made
+    temporarily."""
+    stored_metadata = StoredMetadata(store_path)
+    temporary_path = store_path.parent / f".{store_path.name}.{os.urandom(8).hex()}"
     try:
         temporary_path.mkdir()
-        _create_arrays(temporary_path, layout, stored_metadata.attributes)
-        stored_metadata.restore_metadata(StoredMetadata(temporary_path))
+        _create_zarr_arrays(temporary_path, result_layout, stored_metadata.store_attributes)
+        stored_metadata.restore_from_intact_store(StoredMetadata(temporary_path))
     finally:
         shutil.rmtree(temporary_path, ignore_errors=True)

@@ -1,18 +1,18 @@
 """Selection of the simplest model that is accurate for a step."""
 
 from vrw_jax.selection.ladder import (
-    SELECTION_ATTRS,
-    SELECTION_MARGINS,
+    MODEL_SELECTION_ATTRIBUTES,
+    MODEL_SELECTION_MARGINS,
     LadderStep,
     LadderWheel,
     ModelChoice,
     ModelCode,
     find_selection_reason,
-    refuse_ladder,
+    raise_if_ladder,
 )
 from vrw_jax.selection.registry import (
-    MODEL_CLASSES,
-    describe_models,
+    REGISTERED_MODEL_CLASSES,
+    describe_accepted_models,
     find_model_class,
-    list_config_names,
+    list_model_config_names,
 )

@@ -27,7 +27,7 @@ from vrw_jax.contact import (
 )
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import (
-    PAPER_START,
+    PAPER_START_STATE,
     AbstractContactStep,
     AbstractWheel,
     AdvanceResult,
@@ -36,10 +36,10 @@ from vrw_jax.models import (
     RigidWheel,
     StepResult,
     ViscoelasticWheel,
-    replace_invalid,
+    replace_invalid_inputs,
 )
 from vrw_jax.numerics import Elementwise, RealInput, Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, TextRow, describe_elements
+from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_elements
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
@@ -58,7 +58,7 @@ class ModelCode(enum.IntEnum):
     UNILATERAL = 2
 
 
-SELECTION_MARGINS: dict[str, str] = {
+MODEL_SELECTION_MARGINS: dict[str, str] = {
     name: MARGIN_MEASURES[name].violation
     for name in (
         "fore_foot_force",
@@ -71,14 +71,14 @@ SELECTION_MARGINS: dict[str, str] = {
         "landing_friction_rear",
     )
 }
-"""Margins of the assumptions that only the viscoelastic model makes, with the text of a
+"""Margins of the assumptions that only the viscoelastic model makes, by name, with the text of a
 violation."""
 
-REASON_START_NOT_EMBEDDABLE = 1 + len(SELECTION_MARGINS)
+START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(MODEL_SELECTION_MARGINS)
 """Reason code of a start that is not a section state of the viscoelastic model."""
 
 
-SELECTION_ATTRS: dict[str, dict[str, object]] = {
+MODEL_SELECTION_ATTRIBUTES: dict[str, dict[str, object]] = {
     "rung": {
         "long_name": "model that was used",
         "flag_values": [int(code) for code in ModelCode],
@@ -90,10 +90,10 @@ SELECTION_ATTRS: dict[str, dict[str, object]] = {
         "long_name": "why that model was used",
         "units": "1",
         "description": "0: all margins of the paper's wheel hold; above: the first that breaks, "
-        f"of {', '.join(SELECTION_MARGINS)}; below: minus that wheel's outcome.",
+        f"of {', '.join(MODEL_SELECTION_MARGINS)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of the variables of `model_selection` in datasets."""
+"""Attributes of the dataset variables that `model_selection` gives."""
 
 
 class ModelChoice(AbstractPrintable):
@@ -102,10 +102,10 @@ class ModelChoice(AbstractPrintable):
 
     - `model_code`: a `ModelCode`, VISCOELASTIC or UNILATERAL;
     - `reason_code`: 0 if the viscoelastic model holds. If a margin is violated, the code is 1 + the
-      index of the first such margin in `SELECTION_MARGINS`. If a leg other than Leg 1 is loaded or
-      off its stopper at the start, the code is `REASON_START_NOT_EMBEDDABLE`. If the viscoelastic
-      step does not reach a touchdown, the code is minus the outcome;
-    - `margins`: margins of `SELECTION_MARGINS`, negative if violated;
+      index of the first such margin in `MODEL_SELECTION_MARGINS`. If a leg other than Leg 1 is
+      loaded or off its stopper at the start, the code is `START_NOT_EMBEDDABLE_REASON_CODE`. If the
+      viscoelastic step does not reach a touchdown, the code is minus the outcome;
+    - `margins`: margins of `MODEL_SELECTION_MARGINS`, negative if violated;
     - `friction`: coefficient of the ground.
 
     Examples:
@@ -119,7 +119,7 @@ class ModelChoice(AbstractPrintable):
     margins: Float[Array, " n_margins"]
     friction: Scalar
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return label and text of model, explanation and margins."""
         reason_codes = np.asarray(self.reason_code)
         if reason_codes.ndim:
@@ -131,12 +131,12 @@ class ModelChoice(AbstractPrintable):
                     "by the paper's",
                 )
             ]
-        named_margins = zip(SELECTION_MARGINS, np.asarray(self.margins), strict=True)
-        margins = [
-            (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(value))
-            for n, value in named_margins
+        named_margins = zip(MODEL_SELECTION_MARGINS, np.asarray(self.margins), strict=True)
+        margin_rows = [
+            (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(margin_value))
+            for n, margin_value in named_margins
         ]
-        return [("model", type(self.model).__name__), ("reason", self.why), *margins]
+        return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
 
     def model_selection(self) -> dict[str, Array]:
         """Return the codes of model and reason, see `AbstractStep.model_selection`."""
@@ -152,38 +152,40 @@ class ModelChoice(AbstractPrintable):
     @property
     def why(self) -> Any:
         """Return the reason of the selection as one sentence; a batch has an array of sentences."""
-        return describe_elements(describe_reason, self.reason_code)
+        return describe_elements(describe_selection_reason, self.reason_code)
 
 
-def describe_reason(reason_code: int) -> str:
-    """Return a reason code of `ModelChoice` as a sentence."""
+def describe_selection_reason(reason_code: int) -> str:
+    """Return a sentence that explains a reason code of `ModelChoice`."""
     if reason_code == 0:
         return "The paper's model is valid: all its margins are positive in this step."
     if reason_code < 0:
         return f"The step of the paper's model fails: {Outcome(-reason_code).meaning}"
-    if reason_code == REASON_START_NOT_EMBEDDABLE:
+    if reason_code == START_NOT_EMBEDDABLE_REASON_CODE:
         return "The start is not the paper's: another leg is loaded or off its stopper."
-    return f"The paper's model is not valid: {list(SELECTION_MARGINS.values())[reason_code - 1]}."
+    violation_text = list(MODEL_SELECTION_MARGINS.values())[reason_code - 1]
+    return f"The paper's model is not valid: {violation_text}."
 
 
 def find_selection_reason(
-    measures: Mapping[str, Any], friction_difference: Any
+    step_measures: Mapping[str, Any], friction_difference: Any
 ) -> tuple[Array, Array]:
-    """Return `ModelChoice.reason_code` of viscoelastic steps, and their margins on the last axis.
+    """Return `ModelChoice.reason_code` of viscoelastic steps, and the steps' margins on the last
+    axis.
 
-    - `measures`: measures and outcome of these steps;
-    - `friction_difference`: friction of the ground minus the friction assumed by `measures`.
+    - `step_measures`: measures and outcomes of the steps;
+    - `friction_difference`: friction of the ground minus the friction assumed by `step_measures`.
     """
-    margins = [
-        measures[name] + (friction_difference if "friction" in name else 0.0)
-        for name in SELECTION_MARGINS
+    selection_margins = [
+        step_measures[margin_name] + (friction_difference if "friction" in margin_name else 0.0)
+        for margin_name in MODEL_SELECTION_MARGINS
     ]
-    is_violated = ~(jnp.stack(margins, -1) >= 0.0)
+    is_violated = ~(jnp.stack(selection_margins, -1) >= 0.0)
     violated_margin_code = jnp.where(jnp.any(is_violated, -1), 1 + jnp.argmax(is_violated, -1), 0)
-    outcome = jnp.asarray(measures["outcome"], violated_margin_code.dtype)
-    return jnp.where(outcome == Outcome.STEPPED, violated_margin_code, -outcome), jnp.stack(
-        margins, -1
-    )
+    step_outcome = jnp.asarray(step_measures["outcome"], violated_margin_code.dtype)
+    return jnp.where(
+        step_outcome == Outcome.STEPPED, violated_margin_code, -step_outcome
+    ), jnp.stack(selection_margins, -1)
 
 
 class LadderStep(AbstractContactStep):
@@ -266,7 +268,7 @@ class LadderWheel(AbstractWheel):
         return self.unilateral_model
 
     def split_ground(self, params: WheelParams, n_steps: int) -> None:
-        """Return None, because the ladder does not support changing slopes."""
+        """Return None, because a ladder of models does not support changing slopes."""
         return None
 
     def default_start(self, params: WheelParams) -> FullState:
@@ -288,7 +290,7 @@ class LadderWheel(AbstractWheel):
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
         """Return the selected model, and the step of the viscoelastic model."""
-        paper_model, friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
+        paper_model, ground_friction = ViscoelasticWheel(), self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
         locked_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
@@ -299,15 +301,15 @@ class LadderWheel(AbstractWheel):
             params, jnp.where(is_embeddable, paper_section_state, jnp.nan), options
         )
         reason_code, margins = find_selection_reason(
-            paper_result.measures(), friction - paper_model.friction
+            paper_result.measures(), ground_friction - paper_model.friction
         )
-        reason_code = jnp.where(is_embeddable, reason_code, REASON_START_NOT_EMBEDDABLE).astype(
-            jnp.int32
-        )
+        reason_code = jnp.where(
+            is_embeddable, reason_code, START_NOT_EMBEDDABLE_REASON_CODE
+        ).astype(jnp.int32)
         model_code = jnp.where(
             reason_code == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
         ).astype(jnp.int32)
-        return ModelChoice(model_code, reason_code, margins, friction), paper_result
+        return ModelChoice(model_code, reason_code, margins, ground_friction), paper_result
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
         choice, paper_result = self.choose_model(params, x, options)
@@ -322,7 +324,9 @@ class LadderWheel(AbstractWheel):
                 contact_result.section_state,
             ),
             durations=jnp.where(
-                uses_paper_model, _durations_by_loaded_feet(paper_result), contact_result.durations
+                uses_paper_model,
+                _sort_durations_by_loaded_feet(paper_result),
+                contact_result.durations,
             ),
             outcome=jnp.where(uses_paper_model, paper_result.outcome, contact_result.outcome),
             solver_steps=paper_result.solver_steps + contact_result.solver_steps,
@@ -336,30 +340,30 @@ class LadderWheel(AbstractWheel):
         contact_result: UnilateralStep = self.unilateral_model.take_step(
             params, jnp.where(uses_paper_model, jnp.nan, x), options
         )
-        select_result = lambda paper_value, contact_value: jnp.where(
+        select_by_model = lambda paper_value, contact_value: jnp.where(
             uses_paper_model, paper_value, contact_value
         )
         return LadderStep(
             choice=choice,
-            section_state=select_result(
+            section_state=select_by_model(
                 _embed_paper_result(uses_paper_model, params, paper_result),
                 contact_result.section_state,
             ),
-            post_impact=select_result(paper_result.post_impact, contact_result.post_impact),
-            durations=select_result(
-                _durations_by_loaded_feet(paper_result), contact_result.durations
+            post_impact=select_by_model(paper_result.post_impact, contact_result.post_impact),
+            durations=select_by_model(
+                _sort_durations_by_loaded_feet(paper_result), contact_result.durations
             ),
-            step_length=select_result(paper_result.step_length, contact_result.step_length),
-            energy_impacts=select_result(
+            step_length=select_by_model(paper_result.step_length, contact_result.step_length),
+            energy_impacts=select_by_model(
                 paper_result.energy.landing + paper_result.energy.stopper,
                 contact_result.energy_impacts,
             ),
-            energy_damping=select_result(
+            energy_damping=select_by_model(
                 paper_result.energy.damping, contact_result.energy_damping
             ),
-            energy_friction=select_result(0.0, contact_result.energy_friction),
-            slip=select_result(0.0, contact_result.slip),
-            outcome=select_result(paper_result.outcome, contact_result.outcome),
+            energy_friction=select_by_model(0.0, contact_result.energy_friction),
+            slip=select_by_model(0.0, contact_result.slip),
+            outcome=select_by_model(paper_result.outcome, contact_result.outcome),
             solver_steps=paper_result.solver_steps + contact_result.solver_steps,
         )
 
@@ -368,12 +372,13 @@ class LadderWheel(AbstractWheel):
     ) -> UnilateralTrajectory:
         """Return the motion of a step in the form of the unilateral model.
 
-        If the viscoelastic model is selected, no foot slips, and the motion is that of this model.
+        If the viscoelastic model is selected, no foot slips, and the motion is that of the
+        viscoelastic model.
         """
         choice, _ = self.choose_model(params, x, options)
         friction = jnp.where(choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction)
-        wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
-        trajectory = wheel.sample_step(params, x, options, n_samples)
+        unilateral_wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+        trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
         return dataclasses.replace(trajectory, model_selection=choice.model_selection())
 
 
@@ -382,14 +387,16 @@ def _embed_paper_result(
 ) -> FullState:
     """Return the full section state of a viscoelastic step.
 
-    If the viscoelastic model is not used, the result is the state of Table 1's start.
+    If the viscoelastic model is not used, return the state of Table 1's start.
     """
-    fallback_x = jnp.asarray(PAPER_START, paper_result.section_state.dtype)
-    params, x = replace_invalid(uses_paper_model, params, paper_result.section_state, fallback_x)
+    fallback_state = jnp.asarray(PAPER_START_STATE, paper_result.section_state.dtype)
+    params, x = replace_invalid_inputs(
+        uses_paper_model, params, paper_result.section_state, fallback_state
+    )
     return embed_section_state(params.symbols(), x)
 
 
-def _durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
+def _sort_durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
     """Return the durations with two loaded feet, with one and with none, s."""
     double_support, *single_support = paper_result.durations
     return jnp.stack(
@@ -397,13 +404,14 @@ def _durations_by_loaded_feet(paper_result: StepResult) -> Float[Array, "3"]:
     )
 
 
-def refuse_ladder(model: object, role: str) -> None:
-    """Raise `TypeError` for a ladder if a model with smoothly varying gaits is required.
+def raise_if_ladder(model: object, use_description: str) -> None:
+    """Raise a `TypeError` for a ladder if a model with smoothly varying gaits is required.
 
-    - `role`: use of the model in the message, such as "tuned".
+    - `use_description`: use of the model in the message, such as "tuned".
     """
     if isinstance(model, LadderWheel | str):
         raise TypeError(
-            f"the ladder can't be {role}, since its gaits jump where the model changes: give "
+            f"the ladder can't be {use_description}, since its gaits jump where the model changes: "
+            "give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )

@@ -4,47 +4,52 @@ from vrw_jax.contact import UnilateralWheel
 from vrw_jax.models import AbstractWheel, RigidWheel, ViscoelasticWheel
 from vrw_jax.selection.ladder import LadderWheel
 
-MODEL_CLASSES: list[type[AbstractWheel]] = [
+REGISTERED_MODEL_CLASSES: list[type[AbstractWheel]] = [
     ViscoelasticWheel,
     RigidWheel,
     UnilateralWheel,
     LadderWheel,
 ]
-"""Classes of all models, in the order in which messages list them. The first class is the
-default."""
+"""Classes of all models, in the order in which messages list them. The first class is the default
+model."""
 
 
 def find_model_class(config_name: str) -> type[AbstractWheel]:
-    """Return the class of the model with this name in a configuration.
+    """Return the class of the model that has the name `config_name` in a configuration.
 
-    Raises `KeyError` if no model has this name.
+    Raise a `KeyError` if no model has this name.
     """
-    return {model_class.capabilities.config_name: model_class for model_class in MODEL_CLASSES}[
-        config_name
-    ]
+    return {
+        model_class.capabilities.config_name: model_class
+        for model_class in REGISTERED_MODEL_CLASSES
+    }[config_name]
 
 
-def list_config_names(command: str | None = None, parameter: str | None = None) -> tuple[str, ...]:
-    """Return the names of models in a configuration.
+def list_model_config_names(
+    command: str | None = None, parameter: str | None = None
+) -> tuple[str, ...]:
+    """Return the names of models in a configuration, restricted to models that satisfy the given
+    conditions.
 
     - `command`: command that must accept the model;
     - `parameter`: parameter on which the model's motion must depend.
     """
     return tuple(
         model_class.capabilities.config_name
-        for model_class in MODEL_CLASSES
+        for model_class in REGISTERED_MODEL_CLASSES
         if (command is None or command in model_class.capabilities.commands)
         and (parameter is None or parameter in model_class.parameter_names)
     )
 
 
-def describe_models(command: str | None = None, parameter: str | None = None) -> str:
-    """Return the models of `list_config_names` as a caller writes them, such as `vrw.RigidWheel()
-    or "auto"`.
-    """
+def describe_accepted_models(command: str | None = None, parameter: str | None = None) -> str:
+    """Return the models of `list_model_config_names` as a caller writes them, such as
+    `vrw.RigidWheel() or "auto"`."""
     model_expressions = [
-        f'"{name}"' if name == "auto" else f"vrw.{find_model_class(name).__name__}()"
-        for name in list_config_names(command, parameter)
+        f'"{config_name}"'
+        if config_name == "auto"
+        else f"vrw.{find_model_class(config_name).__name__}()"
+        for config_name in list_model_config_names(command, parameter)
     ]
     return " or ".join(
         [", ".join(model_expressions[:-1]), model_expressions[-1]][not model_expressions[1:] :]

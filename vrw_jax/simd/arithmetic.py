@@ -11,409 +11,582 @@ from typing import Any
 import numpy as np
 
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.value_emitter import I32, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.value_emitter import I32, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
-FUSED_FLAGS = ("contract",)
-"""LLVM's fast-math flags with which products and sums may be rounded once instead of twice. No
-other reordering is allowed.
-"""
-RECIPROCAL_FLAGS = (*FUSED_FLAGS, "arcp")
-"""LLVM's fast-math flags with which a repeated divisor may be inverted once. They are used only in
-float64, because processors approximate the inverse in float32.
-"""
+FUSED_MULTIPLY_ADD_FLAGS = ("contract",)
+"""LLVM's fast-math flags that allow a product and a sum to be rounded once instead of twice. These
+flags allow no other reordering."""
+RECIPROCAL_DIVISION_FLAGS = (*FUSED_MULTIPLY_ADD_FLAGS, "arcp")
+"""LLVM's fast-math flags that allow the inverse of a repeated divisor to be computed once. The
+flags are used only in float64, because processors approximate the inverse in float32."""
 
-ElementwiseRule = Callable[..., Value]
+ElementwiseRule = Callable[..., LlvmValue]
 
 
-def emit_elementwise(
-    emitter: ValueEmitter,
-    name: str,
-    params: Any,
-    in_dtype: Any,
-    out_dtype: Any,
-    values: Sequence[Value],
-) -> Value:
-    """Emit the JAX primitive `name` for operands of type `in_dtype`, and return its value of type
-    `out_dtype`.
+def emit_llvm_elementwise(
+    value_emitter: ValueEmitter,
+    primitive_name: str,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    operands: Sequence[LlvmValue],
+) -> LlvmValue:
+    """Emit the JAX primitive `primitive_name` for operands of type `operand_dtype`, and return its
+    value of type `result_dtype`.
 
-    The instructions are emitted once for equal operands.
+    A repeated call with equal operands returns the first value and emits no instructions.
     """
-    key = (name, out_dtype.num, params.get("y"), *map(id, values))
-    rule = ELEMENTWISE_RULES[name]
-    return emitter.emit_once(key, lambda: rule(emitter, params, in_dtype, out_dtype, *values))
+    instruction_key = (
+        primitive_name,
+        result_dtype.num,
+        primitive_params.get("y"),
+        *map(id, operands),
+    )
+    emit_primitive = ELEMENTWISE_RULES[primitive_name]
+    return value_emitter.emit_value_once(
+        instruction_key,
+        lambda: emit_primitive(
+            value_emitter, primitive_params, operand_dtype, result_dtype, *operands
+        ),
+    )
 
 
-# Sums and products are simplified: terms known to be zero and factors known to be one are dropped.
+# The rules of sums and products drop terms known to be zero and factors known to be one.
 
 
-def _add(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-) -> Value:
-    """Emit x + y and return its value; a known zero is dropped."""
-    if _is_constant(y, 0):
-        return x
-    return y if _is_constant(x, 0) else _emit_binary(emitter, in_dtype, ("fadd", "add"), x, y)
-
-
-def _sub(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-) -> Value:
-    """Emit x - y and return its value; a known zero y is dropped."""
-    return x if _is_constant(y, 0) else _emit_binary(emitter, in_dtype, ("fsub", "sub"), x, y)
-
-
-def _mul(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-) -> Value:
-    """Emit x * y and return its value; a factor known to be zero or one needs no instruction."""
-    if _is_constant(y, 1) or _is_constant(x, 0):
+def _emit_llvm_sum(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the sum x + y and return its value; an operand known to be zero needs no instruction."""
+    if _equals_llvm_constant(y, 0):
         return x
     return (
         y
-        if _is_constant(x, 1) or _is_constant(y, 0)
-        else _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, y)
+        if _equals_llvm_constant(x, 0)
+        else _emit_binary_instruction(value_emitter, operand_dtype, ("fadd", "add"), x, y)
     )
 
 
-def _div(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-) -> Value:
-    """Emit the quotient x / y of floats and return its value."""
-    _require_float("div", in_dtype)  # An integer division by zero would stop the process.
-    if _is_constant(y, 1):
+def _emit_llvm_difference(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the difference x - y and return its value; an operand y known to be zero needs no
+    instruction."""
+    return (
+        x
+        if _equals_llvm_constant(y, 0)
+        else _emit_binary_instruction(value_emitter, operand_dtype, ("fsub", "sub"), x, y)
+    )
+
+
+def _emit_llvm_product(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the product x * y and return its value; a factor known to be zero or one needs no
+    instruction."""
+    if _equals_llvm_constant(y, 1) or _equals_llvm_constant(x, 0):
         return x
-    x, y = emitter.to_same_shape(x, y)
-    return emitter.builder.fdiv(
-        x, y, flags=RECIPROCAL_FLAGS if in_dtype == np.float64 else FUSED_FLAGS
+    return (
+        y
+        if _equals_llvm_constant(x, 1) or _equals_llvm_constant(y, 0)
+        else _emit_binary_instruction(value_emitter, operand_dtype, ("fmul", "mul"), x, y)
     )
 
 
-def _square(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
-    """Emit x * x and return its value."""
-    return _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, x)
+def _emit_llvm_quotient(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the quotient x / y of two floats and return its value."""
+    _require_float_dtype(
+        "div", operand_dtype
+    )  # An integer division by zero would stop the process.
+    if _equals_llvm_constant(y, 1):
+        return x
+    x, y = value_emitter.to_scalars_or_vectors(x, y)
+    return value_emitter.builder.fdiv(
+        x,
+        y,
+        flags=RECIPROCAL_DIVISION_FLAGS
+        if operand_dtype == np.float64
+        else FUSED_MULTIPLY_ADD_FLAGS,
+    )
 
 
-def _integer_pow(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
-) -> Value:
+def _emit_llvm_integer_power(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
     value.
     """
-    multiply = lambda x, y: _emit_binary(emitter, in_dtype, ("fmul", "mul"), x, y)
-    result, squared_value, remaining_exponent = None, x, abs(params["y"])
+    emit_product = lambda x, y: _emit_binary_instruction(
+        value_emitter, operand_dtype, ("fmul", "mul"), x, y
+    )
+    partial_power, repeated_square, remaining_exponent = None, x, abs(primitive_params["y"])
     while remaining_exponent:
         if remaining_exponent & 1:
-            result = squared_value if result is None else multiply(result, squared_value)
+            partial_power = (
+                repeated_square
+                if partial_power is None
+                else emit_product(partial_power, repeated_square)
+            )
         remaining_exponent >>= 1
-        squared_value = (
-            multiply(squared_value, squared_value) if remaining_exponent else squared_value
+        repeated_square = (
+            emit_product(repeated_square, repeated_square)
+            if remaining_exponent
+            else repeated_square
         )
-    unit_value = emitter.constant(x.type, 1)
-    result = unit_value if result is None else result
+    one_constant = value_emitter.make_llvm_constant(x.type, 1)
+    partial_power = one_constant if partial_power is None else partial_power
     return (
-        emitter.builder.fdiv(unit_value, result, flags=FUSED_FLAGS) if params["y"] < 0 else result
+        value_emitter.builder.fdiv(one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS)
+        if primitive_params["y"] < 0
+        else partial_power
     )
 
 
-def _neg(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+def _emit_llvm_negation(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+) -> LlvmValue:
     """Emit -x and return its value."""
-    return emitter.builder.fneg(x) if in_dtype.kind == "f" else emitter.builder.neg(x)
+    return (
+        value_emitter.builder.fneg(x) if operand_dtype.kind == "f" else value_emitter.builder.neg(x)
+    )
 
 
-def _abs(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+def _emit_llvm_absolute_value(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+) -> LlvmValue:
     """Emit the absolute value of `x` and return it."""
-    if in_dtype.kind == "f":
-        return _emit_intrinsic(emitter, "fabs", x)
-    is_negative = _emit_comparison(emitter, "<", in_dtype, x, emitter.constant(x.type, 0))
-    return emitter.builder.select(is_negative, emitter.builder.neg(x), x)
+    if operand_dtype.kind == "f":
+        return _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
+    is_negative_value = _emit_llvm_comparison(
+        value_emitter, "<", operand_dtype, x, value_emitter.make_llvm_constant(x.type, 0)
+    )
+    return value_emitter.builder.select(is_negative_value, value_emitter.builder.neg(x), x)
 
 
-def _not(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
-    """Emit the logical or bitwise negation of `x` and return its value."""
-    return emitter.builder.not_(x)
-
-
-def _identity(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
+def _return_operand(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+) -> LlvmValue:
     """Return the operand unchanged."""
     return x
 
 
-def _bitwise_rule(instruction_method: str) -> ElementwiseRule:
-    """Return the rule that emits the bitwise instruction of this method of llvmlite's builder."""
+def _make_bitwise_rule(builder_method_name: str) -> ElementwiseRule:
+    """Return the rule that emits a bitwise instruction with the method `builder_method_name` of
+    llvmlite's builder."""
 
-    def emit_instruction(
-        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-    ) -> Value:
-        return getattr(emitter.builder, instruction_method)(*emitter.to_same_shape(x, y))
+    def emit_llvm_bitwise(
+        value_emitter: ValueEmitter,
+        primitive_params: Any,
+        operand_dtype: Any,
+        result_dtype: Any,
+        x: LlvmValue,
+        y: LlvmValue,
+    ) -> LlvmValue:
+        return getattr(value_emitter.builder, builder_method_name)(
+            *value_emitter.to_scalars_or_vectors(x, y)
+        )
 
-    return emit_instruction
-
-
-def _comparison_rule(operator: str) -> ElementwiseRule:
-    """Return the rule that emits a comparison by this operator, such as "<"."""
-
-    def emit_comparison(
-        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-    ) -> Value:
-        return _emit_comparison(emitter, operator, in_dtype, *emitter.to_same_shape(x, y))
-
-    return emit_comparison
+    return emit_llvm_bitwise
 
 
-def _extremum_rule(operator: str) -> ElementwiseRule:
+def _make_comparison_rule(comparison_operator: str) -> ElementwiseRule:
+    """Return the rule that emits the comparison of two numbers by an operator such as "<"."""
+
+    def emit_llvm_comparison(
+        value_emitter: ValueEmitter,
+        primitive_params: Any,
+        operand_dtype: Any,
+        result_dtype: Any,
+        x: LlvmValue,
+        y: LlvmValue,
+    ) -> LlvmValue:
+        return _emit_llvm_comparison(
+            value_emitter,
+            comparison_operator,
+            operand_dtype,
+            *value_emitter.to_scalars_or_vectors(x, y),
+        )
+
+    return emit_llvm_comparison
+
+
+def _make_extremum_rule(comparison_operator: str) -> ElementwiseRule:
     """Return the rule that emits the maximum (operator ">") or the minimum ("<") of two
     operands.
     """
 
-    def emit_extremum(
-        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value, y: Value
-    ) -> Value:
-        x, y = emitter.to_same_shape(x, y)
-        selected_value = emitter.builder.select(
-            _emit_comparison(emitter, operator, in_dtype, x, y), x, y
+    def emit_llvm_extremum(
+        value_emitter: ValueEmitter,
+        primitive_params: Any,
+        operand_dtype: Any,
+        result_dtype: Any,
+        x: LlvmValue,
+        y: LlvmValue,
+    ) -> LlvmValue:
+        x, y = value_emitter.to_scalars_or_vectors(x, y)
+        selected_value = value_emitter.builder.select(
+            _emit_llvm_comparison(value_emitter, comparison_operator, operand_dtype, x, y), x, y
         )
-        if in_dtype.kind != "f":
+        if operand_dtype.kind != "f":
             return selected_value
         # The result is NaN if either operand is NaN.
-        return emitter.builder.select(
-            emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
+        return value_emitter.builder.select(
+            value_emitter.builder.fcmp_unordered("uno", x, x), x, selected_value
         )
 
-    return emit_extremum
+    return emit_llvm_extremum
 
 
-def _select_n(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, *values: Value
-) -> Value:
-    """Emit the selection of one of two cases by a condition for each lane, and return its value."""
-    condition, *cases = values
-    if all(_is_constant(case, 0) for case in cases) or cases[0] is cases[1]:
-        return cases[0]
-    if isinstance(condition.type, ir.VectorType):
-        cases = [emitter.splat(case) for case in cases]
-    false_case, true_case = emitter.to_same_shape(*cases)
-    return emitter.builder.select(condition, true_case, false_case)
+def _emit_llvm_select(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    *condition_and_cases: LlvmValue,
+) -> LlvmValue:
+    """Emit the selection, for each lane, of one of two values by a condition, and return the
+    selected value."""
+    lane_condition, *case_values = condition_and_cases
+    if (
+        all(_equals_llvm_constant(case_value, 0) for case_value in case_values)
+        or case_values[0] is case_values[1]
+    ):
+        return case_values[0]
+    if isinstance(lane_condition.type, ir.VectorType):
+        case_values = [value_emitter.to_lane_vector(case_value) for case_value in case_values]
+    false_case, true_case = value_emitter.to_scalars_or_vectors(*case_values)
+    return value_emitter.builder.select(lane_condition, true_case, false_case)
 
 
-def _convert(emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value) -> Value:
-    """Emit the conversion of `x` to the type of the result, and return its value."""
-    return convert_value(emitter, x, in_dtype, out_dtype)
-
-
-def _is_finite(
-    emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
-) -> Value:
+def _emit_llvm_finiteness_test(
+    value_emitter: ValueEmitter,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    x: LlvmValue,
+) -> LlvmValue:
     """Emit the test whether the float `x` is finite, and return its truth value."""
-    magnitude = _emit_intrinsic(emitter, "fabs", x)
-    return emitter.builder.fcmp_ordered("<", magnitude, emitter.constant(magnitude.type, np.inf))
+    magnitude = _emit_llvm_intrinsic_call(value_emitter, "fabs", x)
+    return value_emitter.builder.fcmp_ordered(
+        "<", magnitude, value_emitter.make_llvm_constant(magnitude.type, np.inf)
+    )
 
 
-def _intrinsic_rule(
-    name: str, emit_float32: Callable[[ValueEmitter, Value], Value] | None = None
+def _make_intrinsic_rule(
+    intrinsic_function_name: str,
+    emit_float32_value: Callable[[ValueEmitter, LlvmValue], LlvmValue] | None = None,
 ) -> ElementwiseRule:
-    """Return the rule that calls an LLVM intrinsic function; in float32 `emit_float32` replaces the
-    call, if given.
-    """
+    """Return the rule that calls an LLVM intrinsic function. If `emit_float32_value` is given, that
+    function emits the float32 instructions instead."""
 
-    def emit_intrinsic(
-        emitter: ValueEmitter, params: Any, in_dtype: Any, out_dtype: Any, x: Value
-    ) -> Value:
-        _require_float(name, in_dtype)
+    def emit_llvm_intrinsic(
+        value_emitter: ValueEmitter,
+        primitive_params: Any,
+        operand_dtype: Any,
+        result_dtype: Any,
+        x: LlvmValue,
+    ) -> LlvmValue:
+        _require_float_dtype(intrinsic_function_name, operand_dtype)
         return (
-            emit_float32(emitter, x)
-            if emit_float32 and in_dtype == np.float32
-            else _emit_intrinsic(emitter, name, x)
+            emit_float32_value(value_emitter, x)
+            if emit_float32_value and operand_dtype == np.float32
+            else _emit_llvm_intrinsic_call(value_emitter, intrinsic_function_name, x)
         )
 
-    return emit_intrinsic
+    return emit_llvm_intrinsic
 
 
-def _require_float(name: str, dtype: Any) -> None:
-    """Raise a NotImplementedError unless `dtype` is a float type; `name` is the primitive."""
-    if dtype.kind != "f":
-        raise NotImplementedError(f"{name} of {dtype} has no machine code: convert to floats.")
+def _require_float_dtype(primitive_name: str, operand_dtype: Any) -> None:
+    """Raise a NotImplementedError unless `operand_dtype` is a float type."""
+    if operand_dtype.kind != "f":
+        raise NotImplementedError(
+            f"{primitive_name} of {operand_dtype} has no machine code: convert to floats."
+        )
 
 
-def _emit_binary(
-    emitter: ValueEmitter, dtype: Any, opcodes: tuple[str, str], x: Value, y: Value
-) -> Value:
-    """Emit the first of two instructions for floats and the second for integers, and return its
+def _emit_binary_instruction(
+    value_emitter: ValueEmitter,
+    operand_dtype: Any,
+    float_and_integer_opcodes: tuple[str, str],
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the first of two instructions if `operand_dtype` is a float type, else the second, and
+    return the value."""
+    x, y = value_emitter.to_scalars_or_vectors(x, y)
+    return value_emitter.emit_binary_instruction(
+        f"{float_and_integer_opcodes[0]} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}"
+        if operand_dtype.kind == "f"
+        else float_and_integer_opcodes[1],
+        x,
+        y,
+    )
+
+
+def _emit_llvm_comparison(
+    value_emitter: ValueEmitter,
+    comparison_operator: str,
+    operand_dtype: Any,
+    x: LlvmValue,
+    y: LlvmValue,
+) -> LlvmValue:
+    """Emit the comparison of two numbers of type `operand_dtype`, and return its truth value."""
+    if operand_dtype.kind == "b":  # The signed value of true would be -1.
+        return value_emitter.builder.icmp_unsigned(comparison_operator, x, y)
+    if operand_dtype.kind != "f":
+        return value_emitter.builder.icmp_signed(comparison_operator, x, y)
+    compare_floats = (
+        value_emitter.builder.fcmp_unordered
+        if comparison_operator == "!="
+        else value_emitter.builder.fcmp_ordered
+    )
+    return compare_floats(comparison_operator, x, y)
+
+
+def convert_llvm_value(
+    value_emitter: ValueEmitter, llvm_value: LlvmValue, operand_dtype: Any, result_dtype: Any
+) -> LlvmValue:
+    """Emit the conversion of a value from `operand_dtype` to `result_dtype`, and return the new
     value.
     """
-    x, y = emitter.to_same_shape(x, y)
-    return emitter.emit_binary(
-        f"{opcodes[0]} {' '.join(FUSED_FLAGS)}" if dtype.kind == "f" else opcodes[1], x, y
+    builder, result_llvm_type = value_emitter.builder, LLVM_NUMBER_TYPES[result_dtype.name]
+    result_llvm_type = (
+        value_emitter.make_vector_type(result_llvm_type)
+        if isinstance(llvm_value.type, ir.VectorType)
+        else result_llvm_type
     )
-
-
-def _emit_comparison(emitter: ValueEmitter, operator: str, dtype: Any, x: Value, y: Value) -> Value:
-    """Emit the comparison of two numbers of type `dtype`, and return its truth value."""
-    if dtype.kind == "b":  # The signed value of true would be -1.
-        return emitter.builder.icmp_unsigned(operator, x, y)
-    if dtype.kind != "f":
-        return emitter.builder.icmp_signed(operator, x, y)
-    compare_floats = (
-        emitter.builder.fcmp_unordered if operator == "!=" else emitter.builder.fcmp_ordered
-    )
-    return compare_floats(operator, x, y)
-
-
-def convert_value(emitter: ValueEmitter, value: Value, in_dtype: Any, out_dtype: Any) -> Value:
-    """Emit the conversion of `value` from `in_dtype` to `out_dtype`, and return the new value."""
-    builder, target_type = emitter.builder, NUMBER_TYPES[out_dtype.name]
-    target_type = (
-        emitter.vector_type(target_type) if isinstance(value.type, ir.VectorType) else target_type
-    )
-    if in_dtype == out_dtype:
-        return value
-    if out_dtype.kind == "b":
-        return _emit_comparison(emitter, "!=", in_dtype, value, emitter.constant(value.type, 0))
-    if in_dtype.kind == out_dtype.kind == "f":
-        return (builder.fptrunc if out_dtype.itemsize < in_dtype.itemsize else builder.fpext)(
-            value, target_type
+    if operand_dtype == result_dtype:
+        return llvm_value
+    if result_dtype.kind == "b":
+        return _emit_llvm_comparison(
+            value_emitter,
+            "!=",
+            operand_dtype,
+            llvm_value,
+            value_emitter.make_llvm_constant(llvm_value.type, 0),
         )
-    if out_dtype.kind == "f":
-        return (builder.uitofp if in_dtype.kind == "b" else builder.sitofp)(value, target_type)
-    if in_dtype.kind == "f":
-        return builder.fptosi(value, target_type)
-    if in_dtype.kind == "b":
-        return builder.zext(value, target_type)
-    return (builder.trunc if out_dtype.itemsize < in_dtype.itemsize else builder.sext)(
-        value, target_type
+    if operand_dtype.kind == result_dtype.kind == "f":
+        return (
+            builder.fptrunc if result_dtype.itemsize < operand_dtype.itemsize else builder.fpext
+        )(llvm_value, result_llvm_type)
+    if result_dtype.kind == "f":
+        return (builder.uitofp if operand_dtype.kind == "b" else builder.sitofp)(
+            llvm_value, result_llvm_type
+        )
+    if operand_dtype.kind == "f":
+        return builder.fptosi(llvm_value, result_llvm_type)
+    if operand_dtype.kind == "b":
+        return builder.zext(llvm_value, result_llvm_type)
+    return (builder.trunc if result_dtype.itemsize < operand_dtype.itemsize else builder.sext)(
+        llvm_value, result_llvm_type
     )
 
 
-def _emit_intrinsic(emitter: ValueEmitter, name: str, value: Value) -> Value:
-    """Emit a call of the LLVM intrinsic function `name` for the value's type, and return its
-    result.
-    """
-    llvm_type = value.type
+def _emit_llvm_intrinsic_call(
+    value_emitter: ValueEmitter, intrinsic_function_name: str, operand: LlvmValue
+) -> LlvmValue:
+    """Emit a call of an LLVM intrinsic function, such as "sqrt", for the type of the operand, and
+    return the result of the call."""
+    llvm_type = operand.type
     is_vector = isinstance(llvm_type, ir.VectorType)
-    element_type = llvm_type.element if is_vector else llvm_type
-    n_bits = 64 if element_type == NUMBER_TYPES["float64"] else 32
-    intrinsic_name = f"llvm.{name}.{f'v{llvm_type.count}' if is_vector else ''}f{n_bits}"
-    module = emitter.builder.module
-    if intrinsic_name not in module.globals:
-        ir.Function(module, ir.FunctionType(llvm_type, [llvm_type]), intrinsic_name)
-    return emitter.builder.call(module.globals[intrinsic_name], [value])
+    llvm_element_type = llvm_type.element if is_vector else llvm_type
+    n_type_bits = 64 if llvm_element_type == LLVM_NUMBER_TYPES["float64"] else 32
+    intrinsic_name = (
+        f"llvm.{intrinsic_function_name}.{f'v{llvm_type.count}' if is_vector else ''}f{n_type_bits}"
+    )
+    llvm_module = value_emitter.builder.module
+    if intrinsic_name not in llvm_module.globals:
+        ir.Function(llvm_module, ir.FunctionType(llvm_type, [llvm_type]), intrinsic_name)
+    return value_emitter.builder.call(llvm_module.globals[intrinsic_name], [operand])
 
 
-def _emit_polynomial(emitter: ValueEmitter, x: Value, coefficients: Sequence[float]) -> Value:
-    """Emit a polynomial in `x` by Horner's scheme and return its value; coefficients begin with the
-    lowest power.
-    """
-    builder, partial_value = emitter.builder, emitter.constant(x.type, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        product = builder.fmul(partial_value, x, flags=FUSED_FLAGS)
-        partial_value = builder.fadd(
-            product, emitter.constant(x.type, coefficient), flags=FUSED_FLAGS
+def _emit_llvm_polynomial(
+    value_emitter: ValueEmitter, x: LlvmValue, polynomial_coefficients: Sequence[float]
+) -> LlvmValue:
+    """Emit a polynomial in `x` by Horner's scheme and return its value; the coefficients begin with
+    the lowest power."""
+    builder, horner_sum = (
+        value_emitter.builder,
+        value_emitter.make_llvm_constant(x.type, polynomial_coefficients[-1]),
+    )
+    for polynomial_coefficient in polynomial_coefficients[-2::-1]:
+        horner_product = builder.fmul(horner_sum, x, flags=FUSED_MULTIPLY_ADD_FLAGS)
+        horner_sum = builder.fadd(
+            horner_product,
+            value_emitter.make_llvm_constant(x.type, polynomial_coefficient),
+            flags=FUSED_MULTIPLY_ADD_FLAGS,
         )
-    return partial_value
+    return horner_sum
 
 
-def _emit_logarithm(emitter: ValueEmitter, value: Value) -> Value:
-    """Emit the natural logarithm of positive normal float32 numbers, and return it, accurate to
-    1e-5.
+def _emit_float32_logarithm(value_emitter: ValueEmitter, operand: LlvmValue) -> LlvmValue:
+    """Emit the natural logarithm of positive normal float32 numbers, accurate to 1e-5, and return
+    its value.
 
-    It replaces the library's logarithm, which takes one call per lane.
+    LLVM's logarithm would call the C library once per lane.
     """
-    builder, llvm_type = emitter.builder, value.type
-    integer_type = (
+    builder, llvm_type = value_emitter.builder, operand.type
+    llvm_integer_type = (
         ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
     )
-    bits = builder.bitcast(value, integer_type)
-    integer_constant = lambda x: emitter.constant(integer_type, x)
-    exponent = builder.sub(builder.ashr(bits, integer_constant(23)), integer_constant(127))
-    mantissa = builder.or_(
-        builder.and_(bits, integer_constant(0x7FFFFF)), integer_constant(0x3F800000)
+    float_bits = builder.bitcast(operand, llvm_integer_type)
+    make_integer_constant = lambda x: value_emitter.make_llvm_constant(llvm_integer_type, x)
+    binary_exponent = builder.sub(
+        builder.ashr(float_bits, make_integer_constant(23)), make_integer_constant(127)
     )
-    fractional_part = builder.fsub(
-        builder.bitcast(mantissa, llvm_type), emitter.constant(llvm_type, 1.0)
+    mantissa_bits = builder.or_(
+        builder.and_(float_bits, make_integer_constant(0x7FFFFF)), make_integer_constant(0x3F800000)
+    )
+    mantissa_minus_one = builder.fsub(
+        builder.bitcast(mantissa_bits, llvm_type), value_emitter.make_llvm_constant(llvm_type, 1.0)
     )
     return builder.fadd(
-        builder.fmul(builder.sitofp(exponent, llvm_type), emitter.constant(llvm_type, np.log(2.0))),
-        _emit_polynomial(emitter, fractional_part, LOGARITHM_COEFFICIENTS),
+        builder.fmul(
+            builder.sitofp(binary_exponent, llvm_type),
+            value_emitter.make_llvm_constant(llvm_type, np.log(2.0)),
+        ),
+        _emit_llvm_polynomial(value_emitter, mantissa_minus_one, LOGARITHM_COEFFICIENTS),
     )
 
 
-def _emit_exponential(emitter: ValueEmitter, value: Value) -> Value:
-    """Emit the exponential of float32 numbers between -87 and 88, and return it, accurate to a
-    relative error of 1e-6.
-    """
-    builder, llvm_type = emitter.builder, value.type
-    integer_type = (
+def _emit_float32_exponential(value_emitter: ValueEmitter, operand: LlvmValue) -> LlvmValue:
+    """Emit the exponential of float32 numbers between -87 and 88, and return its value, accurate to
+    a relative error of 1e-6."""
+    builder, llvm_type = value_emitter.builder, operand.type
+    llvm_integer_type = (
         ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
     )
-    exponent_of_two = builder.fmul(value, emitter.constant(llvm_type, 1.0 / np.log(2.0)))
-    integer_part = _emit_intrinsic(emitter, "floor", exponent_of_two)
-    fractional_power = _emit_polynomial(
-        emitter, builder.fsub(exponent_of_two, integer_part), POWER_OF_TWO_COEFFICIENTS
+    exponent_of_two = builder.fmul(
+        operand, value_emitter.make_llvm_constant(llvm_type, 1.0 / np.log(2.0))
     )
-    integer_constant = lambda x: emitter.constant(integer_type, x)
-    power_of_two = builder.shl(
-        builder.add(builder.fptosi(integer_part, integer_type), integer_constant(127)),
-        integer_constant(23),
+    integer_exponent = _emit_llvm_intrinsic_call(value_emitter, "floor", exponent_of_two)
+    fractional_power_of_two = _emit_llvm_polynomial(
+        value_emitter, builder.fsub(exponent_of_two, integer_exponent), POWER_OF_TWO_COEFFICIENTS
     )
-    return builder.fmul(fractional_power, builder.bitcast(power_of_two, llvm_type))
+    make_integer_constant = lambda x: value_emitter.make_llvm_constant(llvm_integer_type, x)
+    integer_power_of_two_bits = builder.shl(
+        builder.add(
+            builder.fptosi(integer_exponent, llvm_integer_type), make_integer_constant(127)
+        ),
+        make_integer_constant(23),
+    )
+    return builder.fmul(
+        fractional_power_of_two, builder.bitcast(integer_power_of_two_bits, llvm_type)
+    )
 
 
-def _is_constant(value: Value, number: int) -> bool:
-    """Return whether an LLVM value is a constant that equals `number` in every lane."""
-    return isinstance(value, ir.Constant) and _is_constant_everywhere(value.constant, number)
+def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
+    """Return whether an LLVM value is a constant that equals `expected_number` in every lane."""
+    return isinstance(llvm_value, ir.Constant) and _has_equal_constant_entries(
+        llvm_value.constant, expected_number
+    )
 
 
-def _is_constant_everywhere(constant: Any, number: int) -> bool:
-    """Return whether all entries of an LLVM constant equal `number`."""
-    if isinstance(constant, (list, tuple)):
-        return all(_is_constant_everywhere(entry.constant, number) for entry in constant)
-    return isinstance(constant, (int, float)) and constant == number
+def _has_equal_constant_entries(constant_content: Any, expected_number: int) -> bool:
+    """Return whether all entries of an LLVM constant, nested to any depth, equal a number."""
+    if isinstance(constant_content, (list, tuple)):
+        return all(
+            _has_equal_constant_entries(constant_entry.constant, expected_number)
+            for constant_entry in constant_content
+        )
+    return isinstance(constant_content, (int, float)) and constant_content == expected_number
 
 
-def _fit_polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[float]:
-    """Return the coefficients, lowest power first, of a polynomial fitted to `function` at
+def _fit_polynomial(
+    fitted_function: Callable[[np.ndarray], np.ndarray], polynomial_degree: int
+) -> list[float]:
+    """Return the coefficients, lowest power first, of a polynomial fitted to `fitted_function` at
     Chebyshev's points on [0, 1].
     """
-    x = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-    return list(map(float, np.polynomial.polynomial.polyfit(x, function(x), degree)))
+    x = 0.5 - 0.5 * np.cos(
+        np.pi * (np.arange(polynomial_degree + 1) + 0.5) / (polynomial_degree + 1)
+    )
+    return list(
+        map(float, np.polynomial.polynomial.polyfit(x, fitted_function(x), polynomial_degree))
+    )
 
 
 LOGARITHM_COEFFICIENTS = _fit_polynomial(np.log1p, 5)
 POWER_OF_TWO_COEFFICIENTS = _fit_polynomial(np.exp2, 5)
 
 ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
-    "abs": _abs,
-    "add": _add,
-    "add_any": _add,
-    "and": _bitwise_rule("and_"),
-    "convert_element_type": _convert,
-    "copy": _identity,
-    "cos": _intrinsic_rule("cos"),
-    "div": _div,
-    "eq": _comparison_rule("=="),
-    "exp": _intrinsic_rule("exp", _emit_exponential),
-    "floor": _intrinsic_rule("floor"),
-    "ge": _comparison_rule(">="),
-    "gt": _comparison_rule(">"),
-    "integer_pow": _integer_pow,
-    "is_finite": _is_finite,
-    "le": _comparison_rule("<="),
-    "log": _intrinsic_rule("log", _emit_logarithm),
-    "lt": _comparison_rule("<"),
-    "max": _extremum_rule(">"),
-    "min": _extremum_rule("<"),
-    "mul": _mul,
-    "ne": _comparison_rule("!="),
-    "neg": _neg,
-    "not": _not,
-    "or": _bitwise_rule("or_"),
-    "select_n": _select_n,
-    "shift_left": _bitwise_rule("shl"),
-    "shift_right_arithmetic": _bitwise_rule("ashr"),
-    "shift_right_logical": _bitwise_rule("lshr"),
-    "sin": _intrinsic_rule("sin"),
-    "sqrt": _intrinsic_rule("sqrt"),
-    "square": _square,
-    "stop_gradient": _identity,
-    "sub": _sub,
-    "xor": _bitwise_rule("xor"),
+    "abs": _emit_llvm_absolute_value,
+    "add": _emit_llvm_sum,
+    "add_any": _emit_llvm_sum,
+    "and": _make_bitwise_rule("and_"),
+    "convert_element_type": lambda value_emitter, _, operand_dtype, result_dtype, x: (
+        convert_llvm_value(value_emitter, x, operand_dtype, result_dtype)
+    ),
+    "copy": _return_operand,
+    "cos": _make_intrinsic_rule("cos"),
+    "div": _emit_llvm_quotient,
+    "eq": _make_comparison_rule("=="),
+    "exp": _make_intrinsic_rule("exp", _emit_float32_exponential),
+    "floor": _make_intrinsic_rule("floor"),
+    "ge": _make_comparison_rule(">="),
+    "gt": _make_comparison_rule(">"),
+    "integer_pow": _emit_llvm_integer_power,
+    "is_finite": _emit_llvm_finiteness_test,
+    "le": _make_comparison_rule("<="),
+    "log": _make_intrinsic_rule("log", _emit_float32_logarithm),
+    "lt": _make_comparison_rule("<"),
+    "max": _make_extremum_rule(">"),
+    "min": _make_extremum_rule("<"),
+    "mul": _emit_llvm_product,
+    "ne": _make_comparison_rule("!="),
+    "neg": _emit_llvm_negation,
+    "not": lambda value_emitter, params, operand_dtype, result_dtype, x: value_emitter.builder.not_(
+        x
+    ),
+    "or": _make_bitwise_rule("or_"),
+    "select_n": _emit_llvm_select,
+    "shift_left": _make_bitwise_rule("shl"),
+    "shift_right_arithmetic": _make_bitwise_rule("ashr"),
+    "shift_right_logical": _make_bitwise_rule("lshr"),
+    "sin": _make_intrinsic_rule("sin"),
+    "sqrt": _make_intrinsic_rule("sqrt"),
+    "square": lambda value_emitter, params, operand_dtype, result_dtype, x: (
+        _emit_binary_instruction(value_emitter, operand_dtype, ("fmul", "mul"), x, x)
+    ),
+    "stop_gradient": _return_operand,
+    "sub": _emit_llvm_difference,
+    "xor": _make_bitwise_rule("xor"),
 }

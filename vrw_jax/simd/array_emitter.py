@@ -1,14 +1,14 @@
-"""Arrays of LLVM values: entries in registers, and lazy arrays whose entries are computed on
-access.
+"""Emission of array operations: small arrays have entries in registers, and lazy arrays compute
+entries on access.
 
 A lane is one element of the batch. An array of the trace whose last axis is that of the lanes
 becomes an array of LLVM vectors without that axis. Any other array becomes one of scalars.
 
-Small arrays are divided into their entries, which live in registers: moving axes, slicing and
-stacking cost nothing. Large arrays are lazy: each entry is computed or loaded on access, in a loop
-over the index. They are stored in memory only if a loop carries them, if a long sum ends, or at an
+Small arrays are divided into entries, which live in registers, so moving axes, slicing and stacking
+cost nothing. Large arrays are lazy: each entry is computed or loaded on access, in a loop over the
+index. A lazy array is stored in memory only if a loop carries it, if a long sum ends, or at an
 `optimization_barrier` of the trace. The code therefore stays short and compiles fast. No operation
-may combine lanes, except the test whether any or all of them continue.
+may combine lanes, except the test whether any or all lanes continue.
 """
 
 import math
@@ -18,55 +18,55 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import emit_elementwise
+from vrw_jax.simd.arithmetic import emit_llvm_elementwise
 from vrw_jax.simd.lazy_arrays import (
-    ArrayValue,
     EntryIndex,
     LazyArray,
+    LlvmArray,
     MemoryArray,
-    PendingUpdate,
-    Uninitialized,
+    PendingArrayUpdate,
+    UninitializedArray,
 )
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.value_emitter import I64, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.value_emitter import I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
 LANE_AXIS_SENTINEL = 1021
-"""Length of the lane axis in the trace, by which the axis is recognized. The machine code accepts
-any number of lanes.
-"""
+"""Length of the lane axis in a trace, chosen because no other axis has this length, so that the
+length identifies the axis. The machine code accepts any number of lanes."""
 
 
 @dataclass(frozen=True)
 class RegisterLimits:
-    """Largest sizes of arrays whose entries are kept in registers.
+    """Largest sizes of arrays whose entries machine code keeps in registers.
 
-    Larger limits give longer code, which takes longer to compile.
+    Larger limits give longer code, which takes longer to compile than with smaller limits.
     """
 
-    max_unrolled: int = 8
+    max_unrolled_entries: int = 8
     """Largest number of entries of a lazy array that are computed individually."""
-    max_unrolled_terms: int = 8
+    max_unrolled_reduction_terms: int = 8
     """Largest number of terms of a sum or a reduction that are emitted one after the other, without
     a loop.
     """
-    max_registers: int = 32
+    max_register_entries: int = 32
     """Largest number of entries of an array that a loop carries in registers, and of a constant
     without a table in memory.
     """
-    max_registers_inner: int = 64
+    max_innermost_register_entries: int = 64
     """Largest number of entries that an innermost loop carries in registers."""
 
 
-DEFAULT_LIMITS = RegisterLimits()
+DEFAULT_REGISTER_LIMITS = RegisterLimits()
 
 
 class PrimitiveCall(NamedTuple):
-    """An equation of a trace with one result: a primitive, its parameters, and shapes and types."""
+    """One equation of a trace with one result: a primitive, its parameters, and the shapes and
+    types of its operands and its result."""
 
-    name: str
-    params: dict[str, Any]
-    in_avals: Sequence[Any]  # shapes and types of the operands
-    out_aval: Any  # shape and type of the result
+    primitive_name: str
+    primitive_params: dict[str, Any]
+    operand_avals: Sequence[Any]  # shapes and types of the operands
+    result_aval: Any  # shape and type of the result
 
 
 class ArrayEmitter:
@@ -75,172 +75,223 @@ class ArrayEmitter:
     """
 
     def __init__(
-        self, emitter: ValueEmitter, limits: RegisterLimits, is_in_innermost_loop: bool = False
+        self,
+        value_emitter: ValueEmitter,
+        register_limits: RegisterLimits,
+        is_in_innermost_loop: bool = False,
     ) -> None:
-        self.emitter, self.builder, self.limits = emitter, emitter.builder, limits
+        self.value_emitter, self.builder, self.register_limits = (
+            value_emitter,
+            value_emitter.builder,
+            register_limits,
+        )
         self.objects_kept_alive: list[Any] = []  # objects that are identified by `id`
         # whether the code is in an innermost loop, where constants need no table
         self.is_in_innermost_loop = is_in_innermost_loop
 
-    def entry_type_of(self, aval: Any) -> ir.Type:
+    def get_entry_type(self, aval: Any) -> ir.Type:
         """Return the LLVM type of the entries of an array: a vector if the array has lanes, else a
         scalar.
         """
-        return self.emitter.vector_type(number_type(aval)) if has_lanes(aval) else number_type(aval)
-
-    def emit_constant_array(self, value: np.ndarray, aval: Any) -> ArrayValue:
-        """Return an array of LLVM constants with the entries of `value`."""
-        if LANE_AXIS_SENTINEL in aval.shape:
-            raise lane_axis_error("A constant", aval)
-        number_type_of_entries = number_type(aval)
-        entries = make_array(
-            value.shape, [self.emitter.constant(number_type_of_entries, x) for x in value.ravel()]
+        return (
+            self.value_emitter.make_vector_type(get_llvm_number_type(aval))
+            if has_lanes(aval)
+            else get_llvm_number_type(aval)
         )
-        fits_registers = self.is_in_innermost_loop or value.size <= self.limits.max_registers
-        return entries if fits_registers else self.make_table(entries)
 
-    def get_entries(self, array: ArrayValue) -> np.ndarray:
+    def emit_constant_array(self, constant_array: np.ndarray, aval: Any) -> LlvmArray:
+        """Return an array of LLVM constants with the entries of `constant_array`."""
+        if LANE_AXIS_SENTINEL in aval.shape:
+            raise make_lane_axis_error("A constant", aval)
+        llvm_entry_type = get_llvm_number_type(aval)
+        constant_entries = make_entry_array(
+            constant_array.shape,
+            [
+                self.value_emitter.make_llvm_constant(llvm_entry_type, x)
+                for x in constant_array.ravel()
+            ],
+        )
+        fits_registers = (
+            self.is_in_innermost_loop
+            or constant_array.size <= self.register_limits.max_register_entries
+        )
+        return constant_entries if fits_registers else self.make_memory_table(constant_entries)
+
+    def get_array_entries(self, array: LlvmArray) -> np.ndarray:
         """Return all entries of an array as an array of LLVM values, in its shape."""
         if isinstance(array, np.ndarray):
             return array
-        return make_array(array.shape, [self.get_entry(array, i) for i in np.ndindex(array.shape)])
+        return make_entry_array(
+            array.shape, [self.get_array_entry(array, i) for i in np.ndindex(array.shape)]
+        )
 
-    def get_entry(self, array: ArrayValue, index: EntryIndex) -> Value:
-        """Return the entry at an index; its instructions are emitted once for each index."""
+    def get_array_entry(self, array: LlvmArray, entry_index: EntryIndex) -> LlvmValue:
+        """Return the LLVM value of the entry at an index. The instructions are emitted once for
+        each index."""
         self.objects_kept_alive.append(array)
         if isinstance(array, LazyArray):
-            key = ("entry", id(array), *(i if isinstance(i, int) else ("at", id(i)) for i in index))
-            return self.emitter.emit_once(key, lambda: array.entry_at(index))
+            entry_key = (
+                "entry",
+                id(array),
+                *(i if isinstance(i, int) else ("at", id(i)) for i in entry_index),
+            )
+            return self.value_emitter.emit_value_once(
+                entry_key, lambda: array.get_entry_at(entry_index)
+            )
         # An array with stride 0 along an axis has the same entry at all indices of the axis.
-        index_strides_lengths = zip(index, array.strides, array.shape, strict=True)
-        index = tuple(
-            0 if stride == 0 or length == 1 else i for i, stride, length in index_strides_lengths
+        indices_strides_lengths = zip(entry_index, array.strides, array.shape, strict=True)
+        entry_index = tuple(
+            0 if axis_stride == 0 or axis_length == 1 else i
+            for i, axis_stride, axis_length in indices_strides_lengths
         )
-        varying_index = tuple(i for i in index if not isinstance(i, int))
-        if not varying_index:
-            return array[index]
-        fixed_index = tuple(i if isinstance(i, int) else slice(None) for i in index)
-        table = self.emitter.emit_once(
-            ("table", id(array), str(fixed_index)), lambda: self.make_table(array[fixed_index])
+        llvm_index = tuple(i for i in entry_index if not isinstance(i, int))
+        if not llvm_index:
+            return array[entry_index]
+        integer_index = tuple(i if isinstance(i, int) else slice(None) for i in entry_index)
+        memory_table = self.value_emitter.emit_value_once(
+            ("table", id(array), str(integer_index)),
+            lambda: self.make_memory_table(array[integer_index]),
         )
-        return self.get_entry(table, varying_index)
+        return self.get_array_entry(memory_table, llvm_index)
 
-    def flatten_entries(self, arrays: Sequence[ArrayValue], avals: Sequence[Any]) -> list[Value]:
-        """Return the entries of all arrays in one list, as vectors if the array has lanes."""
-        flat_values: list[Value] = []
+    def flatten_array_entries(
+        self, arrays: Sequence[LlvmArray], avals: Sequence[Any]
+    ) -> list[LlvmValue]:
+        """Return the entries of all arrays in one list. Entries of an array with lanes are
+        vectors.
+        """
+        flat_entries: list[LlvmValue] = []
         for array, aval in zip(arrays, avals, strict=True):
             broadcast_entries = np.broadcast_to(
-                self.get_entries(array), shape_without_lanes(aval)
+                self.get_array_entries(array), get_shape_without_lanes(aval)
             ).ravel()
-            flat_values += [
-                self.emitter.splat(x) if has_lanes(aval) else x for x in broadcast_entries
+            flat_entries += [
+                self.value_emitter.to_lane_vector(x) if has_lanes(aval) else x
+                for x in broadcast_entries
             ]
-        return flat_values
+        return flat_entries
 
-    def linear_index(self, index: EntryIndex, shape: Sequence[int]) -> Value:
-        """Return the offset of an entry in memory, in entries; the last axis varies fastest."""
-        stride, constant_offset = math.prod(shape), 0
-        offset: Value = None
-        for i, length in zip(index, shape, strict=True):
-            stride //= length
+    def emit_memory_offset(self, entry_index: EntryIndex, array_shape: Sequence[int]) -> LlvmValue:
+        """Emit the offset of an entry from the start of an array in memory, counted in entries, and
+        return it. The last axis varies fastest."""
+        axis_stride, constant_offset = math.prod(array_shape), 0
+        memory_offset: LlvmValue = None
+        for i, axis_length in zip(entry_index, array_shape, strict=True):
+            axis_stride //= axis_length
             if isinstance(i, int):
-                constant_offset += i * stride
+                constant_offset += i * axis_stride
                 continue
-            term = i if stride == 1 else self.builder.mul(i, ir.Constant(I64, stride))
-            offset = term if offset is None else self.builder.add(offset, term)
-        if offset is None:
+            axis_offset = (
+                i if axis_stride == 1 else self.builder.mul(i, ir.Constant(I64, axis_stride))
+            )
+            memory_offset = (
+                axis_offset
+                if memory_offset is None
+                else self.builder.add(memory_offset, axis_offset)
+            )
+        if memory_offset is None:
             return ir.Constant(I64, constant_offset)
         return (
-            self.builder.add(offset, ir.Constant(I64, constant_offset))
+            self.builder.add(memory_offset, ir.Constant(I64, constant_offset))
             if constant_offset
-            else offset
+            else memory_offset
         )
 
-    def loop_over_indices(
+    def emit_index_loops(
         self,
-        shape: Sequence[int],
-        emit_body: Callable[[EntryIndex, list[Value]], Sequence[Value]],
-        carry: Sequence[Value] = (),
-    ) -> list[Value]:
-        """Emit nested loops over all indices of `shape`, and return the last `carry`.
+        index_shape: Sequence[int],
+        emit_body: Callable[[EntryIndex, list[LlvmValue]], Sequence[LlvmValue]],
+        loop_carry: Sequence[LlvmValue] = (),
+    ) -> list[LlvmValue]:
+        """Emit nested loops over all indices of `index_shape`, and return the last `loop_carry`.
 
-        Each iteration is `carry = emit_body(index, carry)`.
+        Each iteration is `loop_carry = emit_body(index, loop_carry)`.
         """
 
-        def emit_nested_loops(index: EntryIndex, carry: Sequence[Value]) -> Sequence[Value]:
-            if len(index) == len(shape):
-                return emit_body(index, list(carry))
-            if shape[len(index)] == 1:
-                return emit_nested_loops((*index, 0), carry)
-            emit_inner_loop = lambda i, carry: emit_nested_loops((*index, i), carry)
-            return self.loop_n_times(shape[len(index)], emit_inner_loop, carry)
+        def emit_nested_index_loops(
+            partial_index: EntryIndex, loop_carry: Sequence[LlvmValue]
+        ) -> Sequence[LlvmValue]:
+            if len(partial_index) == len(index_shape):
+                return emit_body(partial_index, list(loop_carry))
+            if index_shape[len(partial_index)] == 1:
+                return emit_nested_index_loops((*partial_index, 0), loop_carry)
+            emit_inner_loop = lambda i, loop_carry: emit_nested_index_loops(
+                (*partial_index, i), loop_carry
+            )
+            return self.emit_counted_loop(
+                index_shape[len(partial_index)], emit_inner_loop, loop_carry
+            )
 
-        return list(emit_nested_loops((), carry))
+        return list(emit_nested_index_loops((), loop_carry))
 
-    def loop_n_times(
+    def emit_counted_loop(
         self,
-        length: int,
-        emit_body: Callable[[Value, list[Value]], Sequence[Value]],
-        carry: Sequence[Value],
-    ) -> list[Value]:
-        """Emit `for i in range(length): carry = emit_body(i, carry)`, and return the last
-        `carry`.
+        n_iterations: int,
+        emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
+        initial_loop_carry: Sequence[LlvmValue],
+    ) -> list[LlvmValue]:
+        """Emit a loop of `n_iterations` iterations `carry = emit_body(i, carry)`, and return
+        the last `carry`.
         """
-        return self.loop_over_range(ir.Constant(I64, 0), ir.Constant(I64, length), emit_body, carry)
+        return self.emit_range_loop(
+            ir.Constant(I64, 0), ir.Constant(I64, n_iterations), emit_body, initial_loop_carry
+        )
 
-    def loop_over_range(
+    def emit_range_loop(
         self,
-        begin: Value,
-        end: Value,
-        emit_body: Callable[[Value, list[Value]], Sequence[Value]],
-        carry: Sequence[Value] = (),
-    ) -> list[Value]:
-        """Emit `for i in range(begin, end): carry = emit_body(i, carry)`, and return the last
-        `carry`.
+        first_iteration: LlvmValue,
+        end_iteration: LlvmValue,
+        emit_body: Callable[[LlvmValue, list[LlvmValue]], Sequence[LlvmValue]],
+        initial_loop_carry: Sequence[LlvmValue] = (),
+    ) -> list[LlvmValue]:
+        """Emit a loop over `range(first_iteration, end_iteration)` of `carry = emit_body(i,
+        carry)`, and return the last `carry`.
         """
 
-        def body(loop_values: list[Value]) -> list[Value]:
-            next_carry = emit_body(loop_values[0], loop_values[1:])
-            return [self.builder.add(loop_values[0], ir.Constant(I64, 1)), *next_carry]
+        def emit_range_body(loop_values: list[LlvmValue]) -> list[LlvmValue]:
+            next_loop_carry = emit_body(loop_values[0], loop_values[1:])
+            return [self.builder.add(loop_values[0], ir.Constant(I64, 1)), *next_loop_carry]
 
-        emit_condition = lambda loop_values: self.builder.icmp_signed("<", loop_values[0], end)
-        return self.emitter.emit_loop([begin, *carry], emit_condition, body)[1:]
+        emit_range_condition = lambda loop_values: self.builder.icmp_signed(
+            "<", loop_values[0], end_iteration
+        )
+        return self.value_emitter.emit_llvm_loop(
+            [first_iteration, *initial_loop_carry], emit_range_condition, emit_range_body
+        )[1:]
 
-    def allocate(self, shape: Sequence[int], entry_type: ir.Type) -> MemoryArray:
-        """Return an array of this shape in memory, which is allocated once, at the start of the
-        function.
-        """
+    def allocate_memory_array(self, array_shape: Sequence[int], entry_type: ir.Type) -> MemoryArray:
+        """Return an uninitialized array of this shape in memory, which is allocated once, at the
+        start of the function."""
         with self.builder.goto_entry_block():
             base_pointer = self.builder.alloca(
-                entry_type, ir.Constant(I64, max(1, math.prod(shape)))
+                entry_type, ir.Constant(I64, max(1, math.prod(array_shape)))
             )
-        return MemoryArray(self, shape, entry_type, base_pointer)
+        return MemoryArray(self, array_shape, entry_type, base_pointer)
 
-    def fill_memory(self, memory: MemoryArray, array: ArrayValue) -> None:
-        """Emit stores of all initialized entries of `array` into `memory`, which has the same
+    def store_array_into_memory(self, memory_array: MemoryArray, array: LlvmArray) -> None:
+        """Emit stores of all initialized entries of `array` into `memory_array`, which has the same
         shape.
         """
-        if isinstance(array, Uninitialized):
+        if isinstance(array, UninitializedArray):
             return
-        if isinstance(array, PendingUpdate):
-            self.fill_memory(memory, array.base_array)
-            array.store_into(memory)
+        if isinstance(array, PendingArrayUpdate):
+            self.store_array_into_memory(memory_array, array.base_array)
+            array.emit_update_stores(memory_array)
             return
         if isinstance(array, np.ndarray) and any(array.strides):
-            for index in np.ndindex(memory.shape):
-                memory.store(index, array[index])
+            for entry_index in np.ndindex(memory_array.shape):
+                memory_array.emit_entry_store(entry_index, array[entry_index])
             return
 
-        def store_entry(index: EntryIndex, _: Any) -> list[Value]:
-            memory.store(index, self.get_entry(array, index))
+        def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
+            memory_array.emit_entry_store(entry_index, self.get_array_entry(array, entry_index))
             return []
 
-        self.loop_over_indices(memory.shape, store_entry)
+        self.emit_index_loops(memory_array.shape, store_entry)
 
-    def materialize(self, array: ArrayValue) -> MemoryArray:
+    def store_in_memory(self, array: LlvmArray) -> MemoryArray:
         """Return the array with all entries computed and stored in memory, where an LLVM value can
-        index them.
-        """
+        serve as an index."""
         if isinstance(array, MemoryArray):
             return array
         if isinstance(array, LazyArray):
@@ -249,166 +300,219 @@ class ArrayEmitter:
             entry_types = [x.type for x in array.ravel()]
             entry_type = next(
                 (
-                    candidate_type
-                    for candidate_type in entry_types
-                    if isinstance(candidate_type, ir.VectorType)
+                    candidate_entry_type
+                    for candidate_entry_type in entry_types
+                    if isinstance(candidate_entry_type, ir.VectorType)
                 ),
                 entry_types[0],
             )
-        memory = self.allocate(array.shape, entry_type)
-        self.fill_memory(memory, array)
-        return memory
+        memory_array = self.allocate_memory_array(array.shape, entry_type)
+        self.store_array_into_memory(memory_array, array)
+        return memory_array
 
-    def make_table(self, array: np.ndarray) -> MemoryArray:
-        """Return the array in memory, where an LLVM value can index its entries; constants are
-        stored in the program.
-        """
+    def make_memory_table(self, array: np.ndarray) -> MemoryArray:
+        """Return the array in memory, where an LLVM value can serve as an index. Constants are
+        stored in the program."""
         if not all(isinstance(x, ir.Constant) for x in array.ravel()):
-            return self.materialize(array)
-        element_type = array.ravel()[0].type
-        table_type = ir.ArrayType(element_type, array.size)
-        module = self.builder.module
-        table = ir.GlobalVariable(module, table_type, module.get_unique_name("table"))
-        table.initializer = ir.Constant(table_type, list(array.ravel()))
-        table.global_constant, table.linkage = True, "internal"
-        return MemoryArray(self, array.shape, element_type, table)
+            return self.store_in_memory(array)
+        llvm_element_type = array.ravel()[0].type
+        llvm_table_type = ir.ArrayType(llvm_element_type, array.size)
+        llvm_module = self.builder.module
+        llvm_table = ir.GlobalVariable(
+            llvm_module, llvm_table_type, llvm_module.get_unique_name("table")
+        )
+        llvm_table.initializer = ir.Constant(llvm_table_type, list(array.ravel()))
+        llvm_table.global_constant, llvm_table.linkage = True, "internal"
+        return MemoryArray(self, array.shape, llvm_element_type, llvm_table)
 
-    def emit_elementwise(self, call: PrimitiveCall, values: Sequence[ArrayValue]) -> ArrayValue:
+    def emit_elementwise_array(
+        self, call: PrimitiveCall, operand_arrays: Sequence[LlvmArray]
+    ) -> LlvmArray:
         """Emit an elementwise primitive for arrays of values, and return the array of its
         results.
         """
-        name, params, in_avals, out_aval = call
-        shape, in_dtype = shape_without_lanes(out_aval), in_avals[0].dtype
-        if not shape and all(isinstance(x, np.ndarray) and not x.shape for x in values):
-            operands = [x.item() for x in values]  # type: ignore[union-attr]
-            return make_array(
+        primitive_name, primitive_params, operand_avals, result_aval = call
+        result_shape, operand_dtype = get_shape_without_lanes(result_aval), operand_avals[0].dtype
+        if not result_shape and all(
+            isinstance(x, np.ndarray) and not x.shape for x in operand_arrays
+        ):
+            entry_operands = [x.item() for x in operand_arrays]  # type: ignore[union-attr]
+            return make_entry_array(
                 (),
-                [emit_elementwise(self.emitter, name, params, in_dtype, out_aval.dtype, operands)],
+                [
+                    emit_llvm_elementwise(
+                        self.value_emitter,
+                        primitive_name,
+                        primitive_params,
+                        operand_dtype,
+                        result_aval.dtype,
+                        entry_operands,
+                    )
+                ],
             )
-        if any(x.shape != shape for x in values):
+        if any(x.shape != result_shape for x in operand_arrays):
             # An operand without lanes may have an extra axis, or fewer axes.
-            values = [
-                self.reshape_if_needed(x, x.shape[:-1], len(x.shape) > len(shape)) for x in values
+            operand_arrays = [
+                self.reshape_if_needed(x, x.shape[:-1], len(x.shape) > len(result_shape))
+                for x in operand_arrays
             ]
-            values = [self.broadcast_array(x, shape, range(len(x.shape))) for x in values]
-        emit_entry = lambda operands: emit_elementwise(
-            self.emitter, name, params, in_dtype, out_aval.dtype, operands
+            operand_arrays = [
+                self.broadcast_array(x, result_shape, range(len(x.shape))) for x in operand_arrays
+            ]
+        emit_result_entry = lambda entry_operands: emit_llvm_elementwise(
+            self.value_emitter,
+            primitive_name,
+            primitive_params,
+            operand_dtype,
+            result_aval.dtype,
+            entry_operands,
         )
-        if any(isinstance(x, LazyArray) for x in values):
-            entry_at = lambda index: emit_entry([self.get_entry(x, index) for x in values])
-            return LazyArray(shape, self.entry_type_of(out_aval), entry_at)
+        if any(isinstance(x, LazyArray) for x in operand_arrays):
+            emit_entry_at_index = lambda index: emit_result_entry(
+                [self.get_array_entry(x, index) for x in operand_arrays]
+            )
+            return LazyArray(result_shape, self.get_entry_type(result_aval), emit_entry_at_index)
         # Along an axis on which no operand varies, the entry is computed once and repeated.
-        is_varying_axes = (any(x.strides[axis] for x in values) for axis in range(len(shape)))  # type: ignore[union-attr]
-        varying_part = (*(slice(None if is_varying else 1) for is_varying in is_varying_axes), ...)
-        varying_operands = [x[varying_part] for x in values]  # type: ignore[index]
-        entries = zip(*(x.ravel() for x in varying_operands), strict=True)
-        results = make_array(
-            varying_operands[0].shape, [emit_entry(operands) for operands in entries]
+        varying_axis_flags = (
+            any(x.strides[axis] for x in operand_arrays)  # type: ignore[union-attr]
+            for axis in range(len(result_shape))
+        )  # type: ignore[union-attr]
+        varying_axes_index = (
+            *(slice(None if is_varying_axis else 1) for is_varying_axis in varying_axis_flags),
+            ...,
         )
-        return np.broadcast_to(results, shape)
+        varying_operands = [x[varying_axes_index] for x in operand_arrays]  # type: ignore[index]
+        operand_entries = zip(*(x.ravel() for x in varying_operands), strict=True)
+        result_entries = make_entry_array(
+            varying_operands[0].shape,
+            [emit_result_entry(entry_operands) for entry_operands in operand_entries],
+        )
+        return np.broadcast_to(result_entries, result_shape)
 
     def reshape_if_needed(
-        self, array: ArrayValue, shape: tuple[int, ...], is_needed: bool
-    ) -> ArrayValue:
-        """Return the array reshaped to `shape` if `is_needed`, else the array itself."""
-        return self.reshape_array(array, shape) if is_needed else array
+        self, array: LlvmArray, new_shape: tuple[int, ...], needs_reshape: bool
+    ) -> LlvmArray:
+        """Return the array reshaped to `new_shape` if `needs_reshape`, else the array itself."""
+        return self.reshape_array(array, new_shape) if needs_reshape else array
 
     def broadcast_array(
-        self, array: ArrayValue, shape: tuple[int, ...], axes: Sequence[int]
-    ) -> ArrayValue:
-        """Return the array broadcast to `shape`; `axes` are the positions of its axes in that
-        shape.
-        """
+        self, array: LlvmArray, broadcast_shape: tuple[int, ...], axis_positions: Sequence[int]
+    ) -> LlvmArray:
+        """Return the array broadcast to `broadcast_shape`; `axis_positions` are the positions of
+        the array's axes in that shape."""
         axis_lengths = array.shape
-        if axis_lengths == shape and tuple(axes) == tuple(range(len(shape))):
+        if axis_lengths == broadcast_shape and tuple(axis_positions) == tuple(
+            range(len(broadcast_shape))
+        ):
             return array
         if isinstance(array, np.ndarray):
-            new_shape = [1] * len(shape)
-            for axis, length in zip(axes, axis_lengths, strict=True):
-                new_shape[axis] = length
-            return np.broadcast_to(array.reshape(new_shape), shape)
+            expanded_shape = [1] * len(broadcast_shape)
+            for axis_position, axis_length in zip(axis_positions, axis_lengths, strict=True):
+                expanded_shape[axis_position] = axis_length
+            return np.broadcast_to(array.reshape(expanded_shape), broadcast_shape)
 
-        def entry_at(index: EntryIndex) -> Value:
-            pairs = zip(axes, axis_lengths, strict=True)
-            return self.get_entry(array, tuple(0 if n == 1 else index[axis] for axis, n in pairs))
+        def get_broadcast_entry(broadcast_index: EntryIndex) -> LlvmValue:
+            pairs = zip(axis_positions, axis_lengths, strict=True)
+            return self.get_array_entry(
+                array, tuple(0 if n == 1 else broadcast_index[axis] for axis, n in pairs)
+            )
 
-        return LazyArray(shape, array.entry_type, entry_at)
+        return LazyArray(broadcast_shape, array.entry_type, get_broadcast_entry)
 
-    def reshape_array(self, array: ArrayValue, shape: tuple[int, ...]) -> ArrayValue:
-        """Return the array reshaped to `shape`, with the same entries in the same order."""
-        if array.shape == shape:
+    def reshape_array(self, array: LlvmArray, new_shape: tuple[int, ...]) -> LlvmArray:
+        """Return the array reshaped to `new_shape`, with the same entries in the same order."""
+        if array.shape == new_shape:
             return array
         if isinstance(array, np.ndarray):
-            return array.reshape(shape)
+            return array.reshape(new_shape)
         if isinstance(array, MemoryArray):
             return MemoryArray(
-                self, shape, array.entry_type, array.base_pointer, array.is_overwritable
+                self, new_shape, array.entry_type, array.base_pointer, array.is_overwritable
             )
         old_shape = array.shape
 
-        def entry_at(index: EntryIndex) -> Value:
-            offset = self.linear_index(index, shape)
-            constant_offset = offset.constant if isinstance(offset, ir.Constant) else None
+        def get_reshaped_entry(reshaped_index: EntryIndex) -> LlvmValue:
+            memory_offset = self.emit_memory_offset(reshaped_index, new_shape)
+            constant_offset = (
+                memory_offset.constant if isinstance(memory_offset, ir.Constant) else None
+            )
             if constant_offset is not None:
-                return self.get_entry(
+                return self.get_array_entry(
                     array, tuple(map(int, np.unravel_index(constant_offset, old_shape)))
                 )
             old_index: list[Any] = []
-            for length in old_shape[:0:-1]:
-                axis_length = ir.Constant(I64, length)
-                old_index.append(0 if length == 1 else self.builder.urem(offset, axis_length))
-                offset = offset if length == 1 else self.builder.udiv(offset, axis_length)
-            return self.get_entry(array, (0 if old_shape[0] == 1 else offset, *old_index[::-1]))
+            for axis_length in old_shape[:0:-1]:
+                llvm_axis_length = ir.Constant(I64, axis_length)
+                old_index.append(
+                    0 if axis_length == 1 else self.builder.urem(memory_offset, llvm_axis_length)
+                )
+                memory_offset = (
+                    memory_offset
+                    if axis_length == 1
+                    else self.builder.udiv(memory_offset, llvm_axis_length)
+                )
+            return self.get_array_entry(
+                array, (0 if old_shape[0] == 1 else memory_offset, *old_index[::-1])
+            )
 
-        old_axes = [i for i, length in enumerate(old_shape) if length > 1]
-        new_axes = [i for i, length in enumerate(shape) if length > 1]
-        if [old_shape[i] for i in old_axes] == [
-            shape[i] for i in new_axes
+        long_old_axes = [i for i, length in enumerate(old_shape) if length > 1]
+        long_new_axes = [i for i, length in enumerate(new_shape) if length > 1]
+        if [old_shape[i] for i in long_old_axes] == [
+            new_shape[i] for i in long_new_axes
         ]:  # The shapes differ only by axes of length 1.
 
-            def entry_at(index: EntryIndex) -> Value:
-                index_by_axis = dict(zip(old_axes, (index[i] for i in new_axes), strict=True))
-                return self.get_entry(
+            def get_reshaped_entry(reshaped_index: EntryIndex) -> LlvmValue:
+                index_by_axis = dict(
+                    zip(long_old_axes, (reshaped_index[i] for i in long_new_axes), strict=True)
+                )
+                return self.get_array_entry(
                     array, tuple(index_by_axis.get(i, 0) for i in range(len(old_shape)))
                 )
 
-        return LazyArray(shape, array.entry_type, entry_at)
+        return LazyArray(new_shape, array.entry_type, get_reshaped_entry)
 
-    def shift_index(self, i: Any, start: int, step: int = 1) -> Any:
-        """Return the index start + step * i."""
+    def emit_affine_index(self, i: Any, index_start: int, index_step: int = 1) -> Any:
+        """Emit the index index_start + index_step * i and return it."""
         if isinstance(i, int):
-            return start + step * i
-        i = i if step == 1 else self.builder.mul(i, ir.Constant(I64, step))
-        return i if start == 0 else self.builder.add(i, ir.Constant(I64, start))
+            return index_start + index_step * i
+        i = i if index_step == 1 else self.builder.mul(i, ir.Constant(I64, index_step))
+        return i if index_start == 0 else self.builder.add(i, ir.Constant(I64, index_start))
 
-    def clamp_index(self, i: Value, last_index: int) -> Value:
+    def emit_clamped_index(self, i: LlvmValue, last_index: int) -> LlvmValue:
         """Emit the index from 0 to `last_index` that is nearest to `i`, and return it."""
-        builder, zero, end = self.builder, ir.Constant(I64, 0), ir.Constant(I64, last_index)
-        i = builder.select(builder.icmp_signed("<", i, zero), zero, i)
-        return builder.select(builder.icmp_signed(">", i, end), end, i)
+        builder, llvm_zero, llvm_last_index = (
+            self.builder,
+            ir.Constant(I64, 0),
+            ir.Constant(I64, last_index),
+        )
+        i = builder.select(builder.icmp_signed("<", i, llvm_zero), llvm_zero, i)
+        return builder.select(builder.icmp_signed(">", i, llvm_last_index), llvm_last_index, i)
 
-    def add_indices(self, index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
-        """Return the sum of two indices, axis by axis."""
+    def emit_index_sum(self, entry_index: EntryIndex, offset_index: EntryIndex) -> EntryIndex:
+        """Emit the sum of two indices, axis by axis, and return it."""
 
-        def add_index(i: Any, j: Any) -> Any:
+        def add_axis_indices(i: Any, j: Any) -> Any:
             if isinstance(j, int):
-                return self.shift_index(i, j)
-            return self.shift_index(j, i) if isinstance(i, int) else self.builder.add(i, j)
+                return self.emit_affine_index(i, j)
+            return self.emit_affine_index(j, i) if isinstance(i, int) else self.builder.add(i, j)
 
-        return tuple(add_index(i, j) for i, j in zip(index, offset_index, strict=True))
+        return tuple(add_axis_indices(i, j) for i, j in zip(entry_index, offset_index, strict=True))
 
-    def make_zero(self, entry_type: ir.Type) -> Value:
-        """Return the zero from which a sum starts; unlike a known constant zero, it is not
-        simplified away.
-        """
-        element_type = entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
-        value = ir.Constant(element_type, 0.0 if isinstance(element_type, _FLOAT_TYPES) else 0)
+    def make_llvm_zero(self, entry_type: ir.Type) -> LlvmValue:
+        """Return the LLVM value zero from which a sum starts; this zero is not dropped as a known
+        constant is."""
+        llvm_element_type = (
+            entry_type.element if isinstance(entry_type, ir.VectorType) else entry_type
+        )
+        scalar_zero = ir.Constant(
+            llvm_element_type, 0.0 if isinstance(llvm_element_type, _LLVM_FLOAT_TYPES) else 0
+        )
         if not isinstance(entry_type, ir.VectorType):
-            return value
-        return ir.Constant(entry_type, [value] * entry_type.count)
+            return scalar_zero
+        return ir.Constant(entry_type, [scalar_zero] * entry_type.count)
 
 
-_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
+_LLVM_FLOAT_TYPES = (ir.FloatType, ir.DoubleType)
 
 
 def has_lanes(aval: Any) -> bool:
@@ -416,59 +520,63 @@ def has_lanes(aval: Any) -> bool:
     return bool(aval.shape) and aval.shape[-1] == LANE_AXIS_SENTINEL
 
 
-def shape_without_lanes(aval: Any) -> tuple[int, ...]:
+def get_shape_without_lanes(aval: Any) -> tuple[int, ...]:
     """Return the shape of an array of the trace without the lane axis."""
     return aval.shape[:-1] if has_lanes(aval) else aval.shape
 
 
-def lane_axis_error(description: str, aval: Any) -> NotImplementedError:
-    """Return the error for an axis that has the length of the lane axis but is not the last one."""
+def make_lane_axis_error(array_description: str, aval: Any) -> NotImplementedError:
+    """Return the error for an axis that has the length of the lane axis but is not the last
+    axis.
+    """
     return NotImplementedError(
-        f"{description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
+        f"{array_description} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
         "the lanes', which come from arguments and stay the last; keep them there, and give other "
         "axes another length."
     )
 
 
-def lane_mixing_error(name: str) -> NotImplementedError:
-    """Return the error for the primitive `name`, which would combine lanes or move the lane
+def make_lane_mixing_error(primitive_name: str) -> NotImplementedError:
+    """Return the error for a primitive that would combine lanes or move the lane
     axis.
     """
     return NotImplementedError(
-        f"{name} moves, joins or selects lanes: do the same to each lane; only `any` and `all` "
-        "may combine them."
+        f"{primitive_name} moves, joins or selects lanes: do the same to each lane; only `any` and "
+        "`all` may combine them."
     )
 
 
-def number_type(aval: Any) -> ir.Type:
+def get_llvm_number_type(aval: Any) -> ir.Type:
     """Return the LLVM type of one entry of an array of the trace, for one lane."""
-    if aval.dtype not in _TYPE_BY_DTYPE:
+    if aval.dtype not in _LLVM_TYPE_BY_DTYPE:
         raise NotImplementedError(
             f"{aval.str_short()} has numbers that machine code does not support: convert them to "
-            f"one of {', '.join(NUMBER_TYPES)}."
+            f"one of {', '.join(LLVM_NUMBER_TYPES)}."
         )
-    return _TYPE_BY_DTYPE[aval.dtype]
+    return _LLVM_TYPE_BY_DTYPE[aval.dtype]
 
 
-_TYPE_BY_DTYPE = {
-    np.dtype(name): kind for name, kind in NUMBER_TYPES.items()
+_LLVM_TYPE_BY_DTYPE = {
+    np.dtype(name): kind for name, kind in LLVM_NUMBER_TYPES.items()
 }  # The names of dtypes are slow to compute.
 
 
-def make_array(shape: tuple[int, ...], entries: Sequence[Value]) -> np.ndarray:
+def make_entry_array(array_shape: tuple[int, ...], llvm_entries: Sequence[LlvmValue]) -> np.ndarray:
     """Return a NumPy array of this shape whose entries are the given LLVM values."""
-    array = np.empty(len(entries), object)
-    array[:] = entries
-    return array.reshape(shape)
+    entry_array = np.empty(len(llvm_entries), object)
+    entry_array[:] = llvm_entries
+    return entry_array.reshape(array_shape)
 
 
-def split_arrays(flat_values: Sequence[Value], avals: Sequence[Any]) -> list[ArrayValue]:
-    """Return the arrays whose entries `ArrayEmitter.flatten_entries` put into one list."""
-    arrays: list[ArrayValue] = []
-    begin = 0
+def split_into_entry_arrays(
+    flat_entries: Sequence[LlvmValue], avals: Sequence[Any]
+) -> list[LlvmArray]:
+    """Return the arrays whose entries `ArrayEmitter.flatten_array_entries` put into one list."""
+    entry_arrays: list[LlvmArray] = []
+    first_entry = 0
     for aval in avals:
-        shape = shape_without_lanes(aval)
-        end = begin + math.prod(shape)
-        arrays.append(make_array(shape, flat_values[begin:end]))
-        begin = end
-    return arrays
+        array_shape = get_shape_without_lanes(aval)
+        end_entry = first_entry + math.prod(array_shape)
+        entry_arrays.append(make_entry_array(array_shape, flat_entries[first_entry:end_entry]))
+        first_entry = end_entry
+    return entry_arrays

@@ -1,9 +1,10 @@
 """Cache of machine code by content: traces that give the same LLVM text share one compilation.
 
-A program is one record of the store. Its name is a digest of the text that LLVM compiles and of the
-processor. A second record, the index, is named by everything on which the function's trace depends,
-and contains the name of the program. An edit of the source that changes no trace therefore costs a
-trace, but no compilation. The name by which programs of JAX call the code does not change.
+Each program is one record of the store. The record is named by a digest of the text that LLVM
+compiles and of the processor. A second record, the index, contains the name of the program. The
+index is named by everything on which the function's trace depends. An edit of the source that
+changes no trace therefore costs a trace, but no compilation. The name by which JAX programs call
+the code does not change.
 """
 
 import contextlib
@@ -22,19 +23,25 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.simd.array_emitter import RegisterLimits
-from vrw_jax.simd.kernel import KERNEL_NAME, write_module
-from vrw_jax.simd.machine import compilation_key, compile_native, require_object
+from vrw_jax.simd.kernel import LANE_KERNEL_NAME, write_llvm_kernel
+from vrw_jax.simd.machine import (
+    compile_llvm_for_processor,
+    describe_compilation,
+    require_object_file,
+)
 
 
 @runtime_checkable
 class CodeStore(Protocol):
     """Store of code between processes: an object or a module with these two functions."""
 
-    def load_bytes(self, name: str) -> bytes | None:
-        """Return the bytes saved under `name`, or None if there are none or they are damaged."""
+    def load_bytes(self, record_name: str) -> bytes | None:
+        """Return the bytes saved under `record_name`, or None if no undamaged record has that
+        name.
+        """
 
-    def save_bytes(self, name: str, content: bytes) -> None:
-        """Save `content` under that name."""
+    def save_bytes(self, record_name: str, record_content: bytes) -> None:
+        """Save `record_content` under the name `record_name`."""
 
 
 class MachineCode(NamedTuple):
@@ -42,117 +49,148 @@ class MachineCode(NamedTuple):
     background.
     """
 
-    name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
-    result_types: tuple[
+    code_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
+    result_shapes_and_dtypes: tuple[
         tuple[tuple[int, ...], np.dtype], ...
     ]  # for each result, the lengths of all axes before the lanes and the dtype
-    object_code: Future[bytes]
+    object_code_future: Future[bytes]
 
-    def wait_for_code(self) -> bytes:
+    def wait_for_object_code(self) -> bytes:
         """Return the object code; the call blocks until LLVM has compiled it."""
-        return self.object_code.result()
+        return self.object_code_future.result()
 
 
 def get_machine_code(
-    function: Callable,
-    shapes: Any,
-    key: object,
+    lane_function: Callable,
+    argument_shapes: Any,
+    trace_key: object,
     group_width: int,
-    store: CodeStore | None,
-    limits: RegisterLimits,
+    code_store: CodeStore | None,
+    register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Return the machine code of a function, from this process, from `store`, or newly compiled.
+    """Return the machine code of a function, from this process, from `code_store`, or newly
+    compiled.
 
-    `shapes` are those of the arguments, and the code computes `group_width` lanes at a time. `key`
-    identifies everything else on which the trace depends.
+    `argument_shapes` are the shapes of the arguments, and the code computes `group_width` lanes at
+    a time. `trace_key` identifies everything else on which the trace depends.
     """
-    key_parts = (key, shapes, group_width, limits, jax.__version__, compilation_key())
-    index_name = f"lanes_index_{_digest(repr(key_parts).encode())}"
-    if index_name not in _code_by_name:
-        code_name = store.load_bytes(index_name) if store is not None else None
-        code = load_machine_code(code_name.decode("ascii", "replace"), store) if code_name else None
-        _code_by_name[index_name] = code or _trace_and_compile(
-            function, shapes, group_width, index_name, store, limits
+    index_key = (
+        trace_key,
+        argument_shapes,
+        group_width,
+        register_limits,
+        jax.__version__,
+        describe_compilation(),
+    )
+    index_record_name = f"lanes_index_{_compute_sha256_digest(repr(index_key).encode())}"
+    if index_record_name not in _machine_code_by_name:
+        encoded_code_name = (
+            code_store.load_bytes(index_record_name) if code_store is not None else None
         )
-    return _code_by_name[index_name]
+        machine_code = (
+            load_machine_code(encoded_code_name.decode("ascii", "replace"), code_store)
+            if encoded_code_name
+            else None
+        )
+        _machine_code_by_name[index_record_name] = machine_code or _trace_and_compile_function(
+            lane_function,
+            argument_shapes,
+            group_width,
+            index_record_name,
+            code_store,
+            register_limits,
+        )
+    return _machine_code_by_name[index_record_name]
 
 
-def _trace_and_compile(
-    function: Callable,
-    shapes: Any,
+def _trace_and_compile_function(
+    lane_function: Callable,
+    argument_shapes: Any,
     group_width: int,
-    index_name: str,
-    store: CodeStore | None,
-    limits: RegisterLimits,
+    index_record_name: str,
+    code_store: CodeStore | None,
+    register_limits: RegisterLimits,
 ) -> MachineCode:
-    """Trace a function and return its machine code, compiled in the background unless the cache
-    contains the same text.
-    """
-    with _tracing_lock, _pause_garbage_collection():
-        closed_jaxpr = trace_for_machine_code(function, *shapes)
-        llvm_text = write_module(closed_jaxpr, group_width, limits)
-    result_types = json.dumps(
+    """Trace a function and return its machine code. The compilation runs in the background, unless
+    the cache contains code of the same LLVM text."""
+    with _jax_tracing_lock, _pause_garbage_collection():
+        closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
+        llvm_text = write_llvm_kernel(closed_jaxpr, group_width, register_limits)
+    encoded_result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
     )
-    code_name = f"lanes_code_{_digest(f'{result_types}{compilation_key()}{llvm_text}'.encode())}"
-    code = load_machine_code(code_name, store)
-    if code is None:
-        object_code = _compiler_pool.submit(
-            _compile_and_save, llvm_text, result_types, code_name, index_name, store
+    digested_text = f"{encoded_result_types}{describe_compilation()}{llvm_text}"
+    code_name = f"lanes_code_{_compute_sha256_digest(digested_text.encode())}"
+    machine_code = load_machine_code(code_name, code_store)
+    if machine_code is None:
+        object_code_future = _llvm_compiler_pool.submit(
+            _compile_and_save_code,
+            llvm_text,
+            encoded_result_types,
+            code_name,
+            index_record_name,
+            code_store,
         )
-        code = _code_by_name[code_name] = MachineCode(
-            code_name, _parse_result_types(result_types), object_code
+        machine_code = _machine_code_by_name[code_name] = MachineCode(
+            code_name, _parse_result_shapes_and_dtypes(encoded_result_types), object_code_future
         )
-    elif store is not None:
-        store.save_bytes(index_name, code_name.encode())
-    return code
+    elif code_store is not None:
+        code_store.save_bytes(index_record_name, code_name.encode())
+    return machine_code
 
 
-def _compile_and_save(
-    llvm_text: str, result_types: str, code_name: str, index_name: str, store: CodeStore | None
+def _compile_and_save_code(
+    llvm_text: str,
+    encoded_result_types: str,
+    code_name: str,
+    index_record_name: str,
+    code_store: CodeStore | None,
 ) -> bytes:
-    """Compile LLVM text, save the object code and its index record in `store`, and return the
+    """Compile LLVM text, save the object code and its index record in `code_store`, and return the
     object code.
     """
-    code = compile_native(llvm_text)
-    if store is not None:
-        store.save_bytes(code_name, result_types.encode() + b"\n" + code)
-        store.save_bytes(index_name, code_name.encode())
-    return code
+    object_code = compile_llvm_for_processor(llvm_text)
+    if code_store is not None:
+        code_store.save_bytes(code_name, encoded_result_types.encode() + b"\n" + object_code)
+        code_store.save_bytes(index_record_name, code_name.encode())
+    return object_code
 
 
-def load_machine_code(code_name: str, store: CodeStore | None) -> MachineCode | None:
-    """Return the machine code named `code_name` from this process or from `store`; None if neither
-    has it.
-    """
-    if code_name not in _code_by_name:
-        content = store.load_bytes(code_name) if store is not None else None
-        if content is None:
+def load_machine_code(code_name: str, code_store: CodeStore | None) -> MachineCode | None:
+    """Return the machine code named `code_name` from this process or from `code_store`. Return None
+    if neither contains the code."""
+    if code_name not in _machine_code_by_name:
+        record_content = code_store.load_bytes(code_name) if code_store is not None else None
+        if record_content is None:
             return None
-        result_types, _, code = content.partition(b"\n")
+        encoded_result_types, _, object_code = record_content.partition(b"\n")
         try:
-            parsed_result_types = _parse_result_types(result_types)
-            require_object(code, KERNEL_NAME)
-        except (ValueError, TypeError) as error:  # LLVM would end the process on such a file.
+            parsed_result_types = _parse_result_shapes_and_dtypes(encoded_result_types)
+            require_object_file(object_code, LANE_KERNEL_NAME)
+        except (
+            ValueError,
+            TypeError,
+        ) as damage_error:  # LLVM would end the process on such a file.
             warnings.warn(
-                f"{code_name} holds no machine code ({error}): compiled again.", stacklevel=2
+                f"{code_name} holds no machine code ({damage_error}): compiled again.", stacklevel=2
             )
             return None
-        object_code: Future[bytes] = Future()
-        object_code.set_result(code)
-        _code_by_name[code_name] = MachineCode(code_name, parsed_result_types, object_code)
-    return _code_by_name[code_name]
+        object_code_future: Future[bytes] = Future()
+        object_code_future.set_result(object_code)
+        _machine_code_by_name[code_name] = MachineCode(
+            code_name, parsed_result_types, object_code_future
+        )
+    return _machine_code_by_name[code_name]
 
 
-def _digest(content: bytes) -> str:
-    """Return the SHA-256 digest of some bytes in hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
+def _compute_sha256_digest(digested_bytes: bytes) -> str:
+    """Return the SHA-256 digest of bytes in hexadecimal digits."""
+    return hashlib.sha256(digested_bytes).hexdigest()
 
 
-_code_by_name: dict[str, MachineCode] = {}
-"""Machine code of this process by the name of its index record and by its own name. Programs traced
-for other batch sizes share it.
-"""
+_machine_code_by_name: dict[str, MachineCode] = {}
+"""Machine code of this process by the name of its index record and by its code name. Programs
+traced for several batch sizes share the code."""
 
 
 @contextlib.contextmanager
@@ -162,48 +200,48 @@ def _pause_garbage_collection() -> Iterator[None]:
     Collections would take a sixth of the tracing time, because a trace creates many objects that
     persist.
     """
-    was_enabled = gc.isenabled()
+    was_collection_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if was_enabled:
+        if was_collection_enabled:
             gc.enable()
 
 
-_tracing_lock = RLock()
-"""Lock by which only one thread traces at a time. A thread soon proceeds to LLVM, which needs no
-lock.
-"""
+_jax_tracing_lock = RLock()
+"""Lock by which only one thread traces at a time. The later compilation by LLVM needs no lock."""
 
 
-_compiler_pool = ThreadPoolExecutor(1, "llvm")
-"""Thread that compiles in the background while Python traces. There is only one, because LLVM has
-its own lock.
-"""
+_llvm_compiler_pool = ThreadPoolExecutor(1, "llvm")
+"""Thread that compiles in the background while Python traces. One thread suffices, because LLVM's
+lock lets only one thread compile."""
 
 
-def _parse_result_types(encoded_types: str | bytes) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
-    """Return the field `result_types` of `MachineCode` from its JSON text."""
+def _parse_result_shapes_and_dtypes(
+    encoded_result_types: str | bytes,
+) -> tuple[tuple[tuple[int, ...], np.dtype], ...]:
+    """Return the field `result_shapes_and_dtypes` of `MachineCode` from its JSON text."""
     return tuple(
         (tuple(axis_lengths), np.dtype(dtype_name))
-        for axis_lengths, dtype_name in json.loads(encoded_types)
+        for axis_lengths, dtype_name in json.loads(encoded_result_types)
     )
 
 
-def trace_for_machine_code(function: Callable, *shapes: Any) -> ClosedJaxpr:
-    """Return the jaxpr of a function of arguments with these shapes, traced for machine code."""
-    context_token = _is_tracing.set(True)
+def trace_for_machine_code(lane_function: Callable, *argument_shapes: Any) -> ClosedJaxpr:
+    """Return the jaxpr of a function for arguments with these shapes. During the trace,
+    `targets_machine_code` returns True."""
+    context_token = _is_tracing_for_machine_code.set(True)
     try:  # The loops are traced in this mesh, so that JAX's trace cache finds them again.
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            return jax.make_jaxpr(function)(*shapes)
+            return jax.make_jaxpr(lane_function)(*argument_shapes)
     finally:
-        _is_tracing.reset(context_token)
+        _is_tracing_for_machine_code.reset(context_token)
 
 
-_is_tracing: ContextVar[bool] = ContextVar("_tracing", default=False)
+_is_tracing_for_machine_code: ContextVar[bool] = ContextVar("_tracing", default=False)
 
 
 def targets_machine_code() -> bool:
     """Return whether the function that is being traced will become machine code."""
-    return _is_tracing.get()
+    return _is_tracing_for_machine_code.get()

@@ -8,240 +8,339 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import convert_value
+from vrw_jax.simd.arithmetic import convert_llvm_value
 from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
+    get_shape_without_lanes,
     has_lanes,
-    lane_mixing_error,
-    shape_without_lanes,
+    make_lane_mixing_error,
 )
 from vrw_jax.simd.lazy_arrays import (
-    ArrayValue,
     EntryIndex,
     LazyArray,
+    LlvmArray,
     MemoryArray,
-    PendingUpdate,
-    TransposedView,
-    Uninitialized,
+    PendingArrayUpdate,
+    TransposedMemoryView,
+    UninitializedArray,
 )
 from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JaxprLowering
-from vrw_jax.simd.value_emitter import I64, Value
+from vrw_jax.simd.value_emitter import I64, LlvmValue
 
 
-def emit_broadcast(
-    emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, *_: Any
-) -> ArrayValue:
+def emit_broadcast_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray, *_: Any
+) -> LlvmArray:
     """Return the array repeated along new axes, of which the last may be the lane axis."""
-    shape = shape_without_lanes(call.out_aval)
-    axes = tuple(map(int, call.params["broadcast_dimensions"]))
-    array = emitter.reshape_if_needed(array, array.shape[:-1], len(array.shape) > len(shape))
-    if has_lanes(call.out_aval) and len(array.shape) == len(axes) and axes[-1:] == (len(shape),):
-        # The array is one number for each lane.
-        array = emitter.reshape_array(array, array.shape[:-1])
-    has_same_type = isinstance(array, MemoryArray) and array.entry_type == emitter.entry_type_of(
-        call.out_aval
+    result_shape = get_shape_without_lanes(primitive_call.result_aval)
+    axis_positions = tuple(map(int, primitive_call.primitive_params["broadcast_dimensions"]))
+    array = array_emitter.reshape_if_needed(
+        array, array.shape[:-1], len(array.shape) > len(result_shape)
     )
-    if has_same_type and math.prod(array.shape) == math.prod(shape):
-        return emitter.reshape_array(array, shape)
-    result = emitter.broadcast_array(array, shape, axes[: len(array.shape)])
-    if isinstance(result, LazyArray):
-        return LazyArray(shape, emitter.entry_type_of(call.out_aval), result.entry_at)
-    return result
+    if (
+        has_lanes(primitive_call.result_aval)
+        and len(array.shape) == len(axis_positions)
+        and axis_positions[-1:] == (len(result_shape),)
+    ):
+        # The array is one number for each lane.
+        array = array_emitter.reshape_array(array, array.shape[:-1])
+    has_result_type = isinstance(
+        array, MemoryArray
+    ) and array.entry_type == array_emitter.get_entry_type(primitive_call.result_aval)
+    if has_result_type and math.prod(array.shape) == math.prod(result_shape):
+        return array_emitter.reshape_array(array, result_shape)
+    broadcast_array = array_emitter.broadcast_array(
+        array, result_shape, axis_positions[: len(array.shape)]
+    )
+    if isinstance(broadcast_array, LazyArray):
+        return LazyArray(
+            result_shape,
+            array_emitter.get_entry_type(primitive_call.result_aval),
+            broadcast_array.get_entry_at,
+        )
+    return broadcast_array
 
 
-def emit_reshape(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
+def emit_reshaped_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+) -> LlvmArray:
     """Return the array in another shape, with the same entries in the same order."""
-    return emitter.reshape_array(array, shape_without_lanes(call.out_aval))
+    return array_emitter.reshape_array(array, get_shape_without_lanes(primitive_call.result_aval))
 
 
-def emit_transpose(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
+def emit_transposed_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+) -> LlvmArray:
     """Return the array with its axes in the order of the parameter `permutation`."""
-    axis_order = call.params["permutation"]
+    axis_order = primitive_call.primitive_params["permutation"]
     axis_order = axis_order[: len(array.shape)]
     if isinstance(array, np.ndarray):
         return array.transpose(axis_order)
     inverse_axis_order = np.argsort(axis_order)
-    entry_at = lambda index: emitter.get_entry(array, tuple(index[i] for i in inverse_axis_order))
-    array_class = TransposedView if isinstance(array, MemoryArray | TransposedView) else LazyArray
-    return array_class(shape_without_lanes(call.out_aval), array.entry_type, entry_at)
+    get_transposed_entry = lambda index: array_emitter.get_array_entry(
+        array, tuple(index[i] for i in inverse_axis_order)
+    )
+    array_class = (
+        TransposedMemoryView if isinstance(array, MemoryArray | TransposedMemoryView) else LazyArray
+    )
+    return array_class(
+        get_shape_without_lanes(primitive_call.result_aval), array.entry_type, get_transposed_entry
+    )
 
 
-def emit_slice(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
+def emit_static_slice(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+) -> LlvmArray:
     """Return the entries between two indices of each axis, with strides."""
-    strides = call.params["strides"] or (1,) * len(call.params["start_indices"])
-    ranges = zip(call.params["start_indices"], call.params["limit_indices"], strides, strict=True)
-    slices = [slice(*bounds) for bounds in ranges][: len(array.shape)]
+    slice_strides = primitive_call.primitive_params["strides"] or (1,) * len(
+        primitive_call.primitive_params["start_indices"]
+    )
+    starts_ends_strides = zip(
+        primitive_call.primitive_params["start_indices"],
+        primitive_call.primitive_params["limit_indices"],
+        slice_strides,
+        strict=True,
+    )
+    axis_slices = [slice(*start_end_stride) for start_end_stride in starts_ends_strides][
+        : len(array.shape)
+    ]
     if isinstance(array, np.ndarray):
-        return array[tuple(slices)]
+        return array[tuple(axis_slices)]
 
-    def entry_at(index: EntryIndex) -> Value:
-        index_strides = zip(index, slices, strict=True)
-        return emitter.get_entry(
+    def get_sliced_entry(slice_index: EntryIndex) -> LlvmValue:
+        indices_and_slices = zip(slice_index, axis_slices, strict=True)
+        return array_emitter.get_array_entry(
             array,
-            tuple(emitter.shift_index(i, stride.start, stride.step) for i, stride in index_strides),
+            tuple(
+                array_emitter.emit_affine_index(i, axis_slice.start, axis_slice.step)
+                for i, axis_slice in indices_and_slices
+            ),
         )
 
-    return LazyArray(shape_without_lanes(call.out_aval), array.entry_type, entry_at)
+    return LazyArray(
+        get_shape_without_lanes(primitive_call.result_aval), array.entry_type, get_sliced_entry
+    )
 
 
-def emit_concatenate(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
+def emit_concatenated_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *joined_arrays: LlvmArray
+) -> LlvmArray:
     """Return arrays joined along an existing axis."""
-    return _concatenate_along(emitter, call, call.params["dimension"], values)
+    return _concatenate_along_axis(
+        array_emitter, primitive_call, primitive_call.primitive_params["dimension"], joined_arrays
+    )
 
 
-def emit_stack(emitter: ArrayEmitter, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
+def emit_stacked_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *stacked_arrays: LlvmArray
+) -> LlvmArray:
     """Return arrays of one shape stacked along a new axis."""
-    axis = call.params["axis"]
+    new_axis = primitive_call.primitive_params["axis"]
     expanded_arrays = [
-        emitter.reshape_array(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values
+        array_emitter.reshape_array(x, (*x.shape[:new_axis], 1, *x.shape[new_axis:]))
+        for x in stacked_arrays
     ]
-    return _concatenate_along(emitter, call, axis, expanded_arrays)
+    return _concatenate_along_axis(array_emitter, primitive_call, new_axis, expanded_arrays)
 
 
-def emit_unstack(
-    lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
-) -> list[ArrayValue]:
+def emit_unstacked_arrays(
+    lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
     """Return the arrays, all of one shape, into which an array is split along an axis."""
-    (array,), axis, emitter = values, equation.params["axis"], lowering.emitter
-    if axis == len(array.shape):
-        raise lane_mixing_error("unstack")
+    (array,), split_axis, array_emitter = operands, equation.params["axis"], lowering.array_emitter
+    if split_axis == len(array.shape):
+        raise make_lane_mixing_error("unstack")
 
-    def take_slice(position: int) -> ArrayValue:
-        shape = (*array.shape[:axis], *array.shape[axis + 1 :])
+    def take_axis_slice(slice_position: int) -> LlvmArray:
+        slice_shape = (*array.shape[:split_axis], *array.shape[split_axis + 1 :])
         if isinstance(array, np.ndarray):
-            return array.take([position], axis).reshape(shape)
-        entry_at = lambda index: emitter.get_entry(array, (*index[:axis], position, *index[axis:]))
-        return LazyArray(shape, array.entry_type, entry_at)
+            return array.take([slice_position], split_axis).reshape(slice_shape)
+        get_slice_entry = lambda index: array_emitter.get_array_entry(
+            array, (*index[:split_axis], slice_position, *index[split_axis:])
+        )
+        return LazyArray(slice_shape, array.entry_type, get_slice_entry)
 
-    return [take_slice(position) for position in range(len(equation.outvars))]
+    return [take_axis_slice(slice_position) for slice_position in range(len(equation.outvars))]
 
 
-def _concatenate_along(
-    emitter: ArrayEmitter, call: PrimitiveCall, axis: int, values: Sequence[ArrayValue]
-) -> ArrayValue:
-    """Return arrays joined along the existing axis `axis`."""
-    shape = shape_without_lanes(call.out_aval)
-    if axis == len(shape):
-        raise lane_mixing_error(call.name)
-    if all(isinstance(x, np.ndarray) for x in values):
-        return np.concatenate(values, axis)  # type: ignore[arg-type]
-    part_offsets = [x for x in values if x.shape[axis]]
-    starts = np.cumsum([0, *(x.shape[axis] for x in part_offsets)]).tolist()
+def _concatenate_along_axis(
+    array_emitter: ArrayEmitter,
+    primitive_call: PrimitiveCall,
+    join_axis: int,
+    joined_arrays: Sequence[LlvmArray],
+) -> LlvmArray:
+    """Return arrays joined along the existing axis `join_axis`."""
+    result_shape = get_shape_without_lanes(primitive_call.result_aval)
+    if join_axis == len(result_shape):
+        raise make_lane_mixing_error(primitive_call.primitive_name)
+    if all(isinstance(x, np.ndarray) for x in joined_arrays):
+        return np.concatenate(joined_arrays, join_axis)  # type: ignore[arg-type]
+    nonempty_arrays = [x for x in joined_arrays if x.shape[join_axis]]
+    part_starts = np.cumsum([0, *(x.shape[join_axis] for x in nonempty_arrays)]).tolist()
 
-    def entry_at(index: EntryIndex) -> Value:
-        i, selected_value = index[axis], None
-        for part_array, start in zip(part_offsets, starts, strict=False):
-            local_index, last_index = emitter.shift_index(i, -start), part_array.shape[axis] - 1
+    def select_part_entry(result_index: EntryIndex) -> LlvmValue:
+        i, selected_entry = result_index[join_axis], None
+        for part_array, part_start in zip(nonempty_arrays, part_starts, strict=False):
+            index_in_part, last_index_in_part = (
+                array_emitter.emit_affine_index(i, -part_start),
+                part_array.shape[join_axis] - 1,
+            )
             if isinstance(i, int):
-                if 0 <= local_index <= last_index:
-                    return emitter.get_entry(
-                        part_array, (*index[:axis], local_index, *index[axis + 1 :])
+                if 0 <= index_in_part <= last_index_in_part:
+                    return array_emitter.get_array_entry(
+                        part_array,
+                        (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :]),
                     )
                 continue
             # Beyond the end of a part any entry is valid, because the select below discards it.
-            local_index = 0 if last_index == 0 else emitter.clamp_index(local_index, last_index)
-            value = emitter.get_entry(part_array, (*index[:axis], local_index, *index[axis + 1 :]))
-            is_inside = emitter.builder.icmp_signed(">=", i, ir.Constant(I64, start))
-            if selected_value is None:
-                selected_value = value
+            index_in_part = (
+                0
+                if last_index_in_part == 0
+                else array_emitter.emit_clamped_index(index_in_part, last_index_in_part)
+            )
+            part_entry = array_emitter.get_array_entry(
+                part_array,
+                (*result_index[:join_axis], index_in_part, *result_index[join_axis + 1 :]),
+            )
+            is_inside = array_emitter.builder.icmp_signed(">=", i, ir.Constant(I64, part_start))
+            if selected_entry is None:
+                selected_entry = part_entry
             else:
-                value, selected_value = emitter.emitter.to_same_shape(value, selected_value)
-                selected_value = emitter.builder.select(is_inside, value, selected_value)
-        return selected_value
+                part_entry, selected_entry = array_emitter.value_emitter.to_scalars_or_vectors(
+                    part_entry, selected_entry
+                )
+                selected_entry = array_emitter.builder.select(is_inside, part_entry, selected_entry)
+        return selected_entry
 
-    return LazyArray(shape, emitter.entry_type_of(call.out_aval), entry_at)
+    return LazyArray(
+        result_shape, array_emitter.get_entry_type(primitive_call.result_aval), select_part_entry
+    )
 
 
-def emit_pad(
-    emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, value: ArrayValue
-) -> ArrayValue:
-    """Return the array with entries `value` added before and after it along each axis."""
-    padding = call.params["padding_config"]
-    if any(n_before < 0 or n_after < 0 or n_between for n_before, n_after, n_between in padding):
+def emit_padded_array(
+    array_emitter: ArrayEmitter,
+    primitive_call: PrimitiveCall,
+    array: LlvmArray,
+    padding_value: LlvmArray,
+) -> LlvmArray:
+    """Return the array with entries `padding_value` added before and after it along each axis."""
+    padding_widths = primitive_call.primitive_params["padding_config"]
+    if any(
+        n_entries_before < 0 or n_entries_after < 0 or n_entries_between
+        for n_entries_before, n_entries_after, n_entries_between in padding_widths
+    ):
         raise NotImplementedError("pad takes entries away or puts some between: slice and stack.")
-    result_array = np.broadcast_to(
-        emitter.get_entries(value).reshape(()), shape_without_lanes(call.out_aval)
+    padded_array = np.broadcast_to(
+        array_emitter.get_array_entries(padding_value).reshape(()),
+        get_shape_without_lanes(primitive_call.result_aval),
     ).copy()
     interior_slices = tuple(
-        slice(n_before, n_before + n)
-        for (n_before, _, _), n in zip(padding, array.shape, strict=False)
+        slice(n_entries_before, n_entries_before + n)
+        for (n_entries_before, _, _), n in zip(padding_widths, array.shape, strict=False)
     )
-    result_array[interior_slices] = emitter.get_entries(array)
-    return result_array
+    padded_array[interior_slices] = array_emitter.get_array_entries(array)
+    return padded_array
 
 
-def emit_empty(emitter: ArrayEmitter, call: PrimitiveCall) -> ArrayValue:
+def emit_uninitialized_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall
+) -> LlvmArray:
     """Return an uninitialized array, whose entries read as zeros except in memory that loops
     carry.
     """
-    entry_type = emitter.entry_type_of(call.out_aval)
-    return Uninitialized(
-        shape_without_lanes(call.out_aval), entry_type, lambda _: emitter.make_zero(entry_type)
+    entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
+    return UninitializedArray(
+        get_shape_without_lanes(primitive_call.result_aval),
+        entry_type,
+        lambda _: array_emitter.make_llvm_zero(entry_type),
     )
 
 
-def emit_iota(emitter: ArrayEmitter, call: PrimitiveCall) -> ArrayValue:
+def emit_index_array(array_emitter: ArrayEmitter, primitive_call: PrimitiveCall) -> LlvmArray:
     """Return an array of indices along one axis, as `jax.lax.broadcasted_iota`."""
-    return emitter.emit_constant_array(
-        np.indices(call.out_aval.shape)[call.params["dimension"]], call.out_aval
+    return array_emitter.emit_constant_array(
+        np.indices(primitive_call.result_aval.shape)[primitive_call.primitive_params["dimension"]],
+        primitive_call.result_aval,
     )
 
 
 def emit_dynamic_slice(
-    emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue, *starts: ArrayValue
-) -> ArrayValue:
+    array_emitter: ArrayEmitter,
+    primitive_call: PrimitiveCall,
+    array: LlvmArray,
+    *axis_starts: LlvmArray,
+) -> LlvmArray:
     """Return the part of an array that begins at computed indices, which are the same for all
     lanes.
     """
-    start_index = _clamp_starts(
-        emitter, call.in_avals, array.shape, shape_without_lanes(call.out_aval), starts
+    start_index = _clamp_start_index(
+        array_emitter,
+        primitive_call.operand_avals,
+        array.shape,
+        get_shape_without_lanes(primitive_call.result_aval),
+        axis_starts,
     )
-    entry_at = lambda index: emitter.get_entry(array, emitter.add_indices(index, start_index))
+    get_sliced_entry = lambda index: array_emitter.get_array_entry(
+        array, array_emitter.emit_index_sum(index, start_index)
+    )
     return LazyArray(
-        shape_without_lanes(call.out_aval), emitter.entry_type_of(call.out_aval), entry_at
+        get_shape_without_lanes(primitive_call.result_aval),
+        array_emitter.get_entry_type(primitive_call.result_aval),
+        get_sliced_entry,
     )
 
 
-def emit_dynamic_update(
-    emitter: ArrayEmitter,
-    call: PrimitiveCall,
-    array: ArrayValue,
-    update: ArrayValue,
-    *starts: ArrayValue,
-) -> ArrayValue:
+def emit_dynamic_slice_update(
+    array_emitter: ArrayEmitter,
+    primitive_call: PrimitiveCall,
+    array: LlvmArray,
+    update_array: LlvmArray,
+    *axis_starts: LlvmArray,
+) -> LlvmArray:
     """Return the array with one part replaced; the part begins at computed indices, the same for
     all lanes.
     """
-    if has_lanes(call.out_aval) and not has_lanes(call.in_avals[1]):
-        raise lane_mixing_error(call.name)
-    start_index = _clamp_starts(emitter, call.in_avals[1:], array.shape, update.shape, starts)
-    has_same_type = isinstance(array, np.ndarray) and not any(array.strides)
-    needs_no_copy = has_same_type or isinstance(array, Uninitialized)
-    return PendingUpdate(
-        emitter, array if needs_no_copy else emitter.materialize(array), update, start_index
+    if has_lanes(primitive_call.result_aval) and not has_lanes(primitive_call.operand_avals[1]):
+        raise make_lane_mixing_error(primitive_call.primitive_name)
+    start_index = _clamp_start_index(
+        array_emitter,
+        primitive_call.operand_avals[1:],
+        array.shape,
+        update_array.shape,
+        axis_starts,
+    )
+    has_repeated_entry = isinstance(array, np.ndarray) and not any(array.strides)
+    needs_no_copy = has_repeated_entry or isinstance(array, UninitializedArray)
+    return PendingArrayUpdate(
+        array_emitter,
+        array if needs_no_copy else array_emitter.store_in_memory(array),
+        update_array,
+        start_index,
     )
 
 
-def _clamp_starts(
-    emitter: ArrayEmitter,
-    in_avals: Any,
+def _clamp_start_index(
+    array_emitter: ArrayEmitter,
+    operand_avals: Any,
     array_shape: EntryIndex,
     part_shape: EntryIndex,
-    starts: Sequence[ArrayValue],
+    axis_starts: Sequence[LlvmArray],
 ) -> tuple[Any, ...]:
     """Return the start index of a part, clamped so that the part lies inside the array."""
-    start_index: list[Any] = []
-    for aval, n, m, start in zip(in_avals[1:], array_shape, part_shape, starts, strict=False):
-        start_value = emitter.get_entries(start).item()
+    clamped_start_index: list[Any] = []
+    for start_aval, n, m, axis_start in zip(
+        operand_avals[1:], array_shape, part_shape, axis_starts, strict=False
+    ):
+        start_value = array_emitter.get_array_entries(axis_start).item()
         if n == m:
-            start_index.append(0)
+            clamped_start_index.append(0)
         elif isinstance(start_value, ir.Constant):
-            start_index.append(min(max(int(start_value.constant), 0), n - m))
+            clamped_start_index.append(min(max(int(start_value.constant), 0), n - m))
         else:
-            start_value = convert_value(
-                emitter.emitter, start_value, aval.dtype, np.dtype(np.int64)
+            start_value = convert_llvm_value(
+                array_emitter.value_emitter, start_value, start_aval.dtype, np.dtype(np.int64)
             )
-            start_index.append(emitter.clamp_index(start_value, n - m))
-    return tuple(start_index)
+            clamped_start_index.append(array_emitter.emit_clamped_index(start_value, n - m))
+    return tuple(clamped_start_index)

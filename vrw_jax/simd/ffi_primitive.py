@@ -10,24 +10,27 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from vrw_jax.simd.code_cache import MachineCode
-from vrw_jax.simd.ffi_handler import HANDLER_NAME
-from vrw_jax.simd.machine import LoadedCode
+from vrw_jax.simd.ffi_handler import FFI_HANDLER_NAME
+from vrw_jax.simd.machine import LoadedMachineCode
 
-LOADED_BY_NAME: dict[str, LoadedCode] = {}
-"""Loaded machine code by the name under which JAX programs call it. XLA never releases it."""
-_registry_lock = Lock()
+LOADED_CODE_BY_NAME: dict[str, LoadedMachineCode] = {}
+"""Loaded machine code by the name under which JAX programs call it. The code stays loaded, because
+XLA never releases a registered function."""
+_loaded_code_lock = Lock()
 
 
-def register_code(code: MachineCode) -> None:
+def register_machine_code(machine_code: MachineCode) -> None:
     """Load machine code, and make it callable by its name in JAX programs."""
-    object_code = code.wait_for_code()
-    with _registry_lock:
-        if code.name not in LOADED_BY_NAME:
-            loaded_code = LoadedCode(object_code)
+    object_code = machine_code.wait_for_object_code()
+    with _loaded_code_lock:
+        if machine_code.code_name not in LOADED_CODE_BY_NAME:
+            loaded_code = LoadedMachineCode(object_code)
             jax.ffi.register_ffi_target(
-                code.name, loaded_code.make_capsule(HANDLER_NAME), platform="cpu"
+                machine_code.code_name,
+                loaded_code.make_function_capsule(FFI_HANDLER_NAME),
+                platform="cpu",
             )
-            LOADED_BY_NAME[code.name] = loaded_code
+            LOADED_CODE_BY_NAME[machine_code.code_name] = loaded_code
 
 
 MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
@@ -38,41 +41,44 @@ MACHINE_CODE_PRIMITIVE.multiple_results = True
 
 
 @MACHINE_CODE_PRIMITIVE.def_abstract_eval
-def _abstract_results(
-    *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+def _make_abstract_results(
+    *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> list[Any]:
     """Return the abstract values (shapes and dtypes) of the results of a call."""
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
 
 
 @MACHINE_CODE_PRIMITIVE.def_impl
-def _call_in_program(
-    *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+def _call_machine_code(
+    *call_arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
 ) -> Any:
     """Return the results of a call outside of `jax.jit`."""
     with jax.disable_jit(False):  # Only a compiled program can call machine code.
-        return _make_program(code, tuple(result_shapes))(*arguments)
+        return _make_calling_program(code, tuple(result_shapes))(*call_arguments)
 
 
 @functools.cache
-def _make_program(
+def _make_calling_program(
     code: MachineCode, result_shapes: tuple[jax.ShapeDtypeStruct, ...]
 ) -> Callable[..., Any]:
-    """Return a compiled JAX program that only calls the machine code."""
+    """Return a compiled JAX program that only calls the machine code `code`."""
     return jax.jit(
         functools.partial(MACHINE_CODE_PRIMITIVE.bind, code=code, result_shapes=result_shapes)
     )
 
 
-def _lower_call(
-    context: Any, *arguments: Any, code: MachineCode, result_shapes: Sequence[jax.ShapeDtypeStruct]
+def _lower_machine_code_call(
+    lowering_context: Any,
+    *call_arguments: Any,
+    code: MachineCode,
+    result_shapes: Sequence[jax.ShapeDtypeStruct],
 ) -> Any:
     """Register the machine code, and return XLA's lowering of its call."""
-    register_code(code)
-    return jax.ffi.ffi_lowering(code.name)(context, *arguments)
+    register_machine_code(code)
+    return jax.ffi.ffi_lowering(code.code_name)(lowering_context, *call_arguments)
 
 
-def _raise_transform_error(*_: Any, **__: Any) -> Any:
+def _raise_unsupported_transform(*_: Any, **__: Any) -> Any:
     """Raise a NotImplementedError for a transform that machine code does not support."""
     raise NotImplementedError(
         "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
@@ -80,7 +86,7 @@ def _raise_transform_error(*_: Any, **__: Any) -> Any:
     )
 
 
-mlir.register_lowering(MACHINE_CODE_PRIMITIVE, _lower_call, platform="cpu")
+mlir.register_lowering(MACHINE_CODE_PRIMITIVE, _lower_machine_code_call, platform="cpu")
 batching.primitive_batchers[MACHINE_CODE_PRIMITIVE] = ad.primitive_jvps[MACHINE_CODE_PRIMITIVE] = (
-    _raise_transform_error
+    _raise_unsupported_transform
 )

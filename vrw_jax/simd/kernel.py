@@ -6,25 +6,27 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.simd.array_emitter import (
-    DEFAULT_LIMITS,
+    DEFAULT_REGISTER_LIMITS,
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
     RegisterLimits,
     has_lanes,
-    lane_axis_error,
+    make_lane_axis_error,
 )
-from vrw_jax.simd.ffi_handler import add_handler, read_api_version
-from vrw_jax.simd.lazy_arrays import ArrayValue, EntryIndex, LazyArray
+from vrw_jax.simd.ffi_handler import add_ffi_handler, read_ffi_api_version
+from vrw_jax.simd.lazy_arrays import EntryIndex, LazyArray, LlvmArray
 from vrw_jax.simd.llvm_library import ir
 from vrw_jax.simd.lowering import JaxprLowering
 from vrw_jax.simd.rules import PRIMITIVE_RULES
-from vrw_jax.simd.value_emitter import I1, I8, I64, NUMBER_TYPES, Value, ValueEmitter
+from vrw_jax.simd.value_emitter import I1, I8, I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
-KERNEL_NAME = "lanes"
+LANE_KERNEL_NAME = "lanes"
 
 
-def write_module(
-    closed_jaxpr: ClosedJaxpr, group_width: int, limits: RegisterLimits = DEFAULT_LIMITS
+def write_llvm_kernel(
+    closed_jaxpr: ClosedJaxpr,
+    group_width: int,
+    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> str:
     """Return the LLVM text of a function that computes a range of groups of lanes.
 
@@ -34,61 +36,75 @@ def write_module(
     the last digits.
     """
     _check_lane_axes(closed_jaxpr)
-    module = ir.Module(KERNEL_NAME)
-    pointer_type = ir.PointerType()
-    kernel = ir.Function(
-        module,
-        ir.FunctionType(ir.VoidType(), [pointer_type, pointer_type, I64, I64, I64]),
-        KERNEL_NAME,
+    llvm_module = ir.Module(LANE_KERNEL_NAME)
+    llvm_pointer_type = ir.PointerType()
+    llvm_kernel = ir.Function(
+        llvm_module,
+        ir.FunctionType(ir.VoidType(), [llvm_pointer_type, llvm_pointer_type, I64, I64, I64]),
+        LANE_KERNEL_NAME,
     )
-    kernel.attributes.add("nounwind")
-    builder = ir.IRBuilder(kernel.append_basic_block("entry"))
-    emitter = ArrayEmitter(ValueEmitter(builder, max(group_width, 2)), limits)
-    input_table, output_table, n_lanes, first_group, end_group = kernel.args
-    input_avals, output_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
+    llvm_kernel.attributes.add("nounwind")
+    builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
+    array_emitter = ArrayEmitter(ValueEmitter(builder, max(group_width, 2)), register_limits)
+    input_pointer_table, output_pointer_table, n_lanes, first_group, end_group = llvm_kernel.args
+    argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
 
-    def load_pointer(table: Value, index: int) -> Value:
-        entry_pointer = builder.gep(table, [ir.Constant(I64, index)], source_etype=pointer_type)
-        return builder.load(entry_pointer, typ=pointer_type)
+    def emit_table_pointer_load(pointer_table: LlvmValue, table_index: int) -> LlvmValue:
+        entry_pointer = builder.gep(
+            pointer_table, [ir.Constant(I64, table_index)], source_etype=llvm_pointer_type
+        )
+        return builder.load(entry_pointer, typ=llvm_pointer_type)
 
-    input_pointers = [load_pointer(input_table, i) for i in range(len(input_avals))]
-    output_pointers = [load_pointer(output_table, i) for i in range(len(output_avals))]
+    input_pointers = [
+        emit_table_pointer_load(input_pointer_table, i) for i in range(len(argument_avals))
+    ]
+    output_pointers = [
+        emit_table_pointer_load(output_pointer_table, i) for i in range(len(result_avals))
+    ]
 
-    def emit_group(group_index: Value, _: Any) -> list[Value]:
-        row_access = _LaneRowAccess(
-            emitter,
+    def emit_group_of_lanes(group_index: LlvmValue, _: Any) -> list[LlvmValue]:
+        group_access = _LaneGroupAccess(
+            array_emitter,
             group_width == 1,
             n_lanes,
             builder.mul(group_index, ir.Constant(I64, group_width)),
         )
-        values = [
-            row_access.read_argument(*pair)
-            for pair in zip(input_pointers, input_avals, strict=True)
+        argument_arrays = [
+            group_access.read_argument_array(*pointer_and_aval)
+            for pointer_and_aval in zip(input_pointers, argument_avals, strict=True)
         ]
-        results = JaxprLowering(emitter, PRIMITIVE_RULES).lower_jaxpr(closed_jaxpr, values)
-        for output_pointer, aval, value in zip(output_pointers, output_avals, results, strict=True):
-            row_access.write_result(output_pointer, aval, value)
+        result_arrays = JaxprLowering(array_emitter, PRIMITIVE_RULES).lower_jaxpr(
+            closed_jaxpr, argument_arrays
+        )
+        for output_pointer, aval, result_array in zip(
+            output_pointers, result_avals, result_arrays, strict=True
+        ):
+            group_access.write_result_array(output_pointer, aval, result_array)
         return []
 
-    emitter.loop_over_range(first_group, end_group, emit_group)
+    array_emitter.emit_range_loop(first_group, end_group, emit_group_of_lanes)
     builder.ret_void()
-    add_handler(
-        module, kernel, len(input_avals), len(output_avals), group_width, read_api_version()
+    add_ffi_handler(
+        llvm_module,
+        llvm_kernel,
+        len(argument_avals),
+        len(result_avals),
+        group_width,
+        read_ffi_api_version(),
     )
-    return str(module)
+    return str(llvm_module)
 
 
 def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
-    """Raise an error unless the lane axis is the last axis of every argument and result, and no
-    other axis.
-    """
-    for array_description, avals in (
+    """Raise a NotImplementedError unless the lane axis is the last axis of every argument and
+    result, and no other axis."""
+    for array_description, checked_avals in (
         ("An argument", closed_jaxpr.in_avals),
         ("A result", closed_jaxpr.out_avals),
     ):
-        for aval in avals:
+        for aval in checked_avals:
             if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-                raise lane_axis_error(array_description, aval)
+                raise make_lane_axis_error(array_description, aval)
     for aval in closed_jaxpr.out_avals:
         if not has_lanes(aval):
             raise NotImplementedError(
@@ -97,65 +113,95 @@ def _check_lane_axes(closed_jaxpr: ClosedJaxpr) -> None:
             )
 
 
-class _LaneRowAccess:
-    """Access of one group of lanes to the arrays of the caller, whose last axis are the lanes."""
+class _LaneGroupAccess:
+    """Access of one group of lanes to the caller's arrays, whose last axis is that of the lanes."""
 
     def __init__(
-        self, emitter: ArrayEmitter, is_single_lane: bool, n_lanes: Value, first_lane: Value
+        self,
+        array_emitter: ArrayEmitter,
+        has_single_lane: bool,
+        n_lanes: LlvmValue,
+        first_lane: LlvmValue,
     ) -> None:
-        self.emitter, self.is_single_lane = emitter, is_single_lane
+        self.array_emitter, self.has_single_lane = array_emitter, has_single_lane
         self.n_lanes, self.first_lane = n_lanes, first_lane
 
-    def read_argument(self, base_pointer: Value, aval: Any) -> ArrayValue:
-        """Return an argument as an array of LLVM values; a number without axes is the same for all
-        lanes.
-        """
-        builder = self.emitter.builder
+    def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
+        """Return an argument as an array of LLVM values. An argument without axes is the same
+        number for all lanes."""
+        builder = self.array_emitter.builder
 
-        def load_entry(index: EntryIndex) -> Value:
-            address, stored_type = self.row_address(base_pointer, aval, index)
-            value = builder.load(address, typ=stored_type, align=aval.dtype.itemsize)
+        def emit_entry_load(entry_index: EntryIndex) -> LlvmValue:
+            entry_address, llvm_stored_type = self.emit_group_address(
+                base_pointer, aval, entry_index
+            )
+            entry_value = builder.load(
+                entry_address, typ=llvm_stored_type, align=aval.dtype.itemsize
+            )
             if aval.dtype.kind == "b":
-                value = builder.icmp_signed(
-                    "!=", value, self.emitter.emitter.constant(stored_type, 0)
+                entry_value = builder.icmp_signed(
+                    "!=",
+                    entry_value,
+                    self.array_emitter.value_emitter.make_llvm_constant(llvm_stored_type, 0),
                 )
             return (
-                self.emitter.emitter.splat(value) if self.is_single_lane and aval.shape else value
+                self.array_emitter.value_emitter.to_lane_vector(entry_value)
+                if self.has_single_lane and aval.shape
+                else entry_value
             )
 
-        argument_array = LazyArray(aval.shape[:-1], self.emitter.entry_type_of(aval), load_entry)
-        fits_registers = math.prod(argument_array.shape) <= self.emitter.limits.max_registers
-        return self.emitter.get_entries(argument_array) if fits_registers else argument_array
+        argument_array = LazyArray(
+            aval.shape[:-1], self.array_emitter.get_entry_type(aval), emit_entry_load
+        )
+        fits_registers = (
+            math.prod(argument_array.shape)
+            <= self.array_emitter.register_limits.max_register_entries
+        )
+        return (
+            self.array_emitter.get_array_entries(argument_array)
+            if fits_registers
+            else argument_array
+        )
 
-    def write_result(self, base_pointer: Value, aval: Any, value: ArrayValue) -> None:
-        """Emit stores of a result of the group into the memory that begins at `base_pointer`."""
-        builder = self.emitter.builder
+    def write_result_array(
+        self, base_pointer: LlvmValue, aval: Any, result_array: LlvmArray
+    ) -> None:
+        """Emit stores of one result of a group of lanes into the memory that begins at
+        `base_pointer`."""
+        builder = self.array_emitter.builder
 
-        def store_row(index: EntryIndex, _: Any) -> list[Value]:
-            address, stored_type = self.row_address(base_pointer, aval, index)
-            stored_value = self.emitter.emitter.splat(self.emitter.get_entry(value, index))
-            if self.is_single_lane:
-                stored_value = builder.extract_element(stored_value, ir.Constant(I64, 0))
+        def emit_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
+            entry_address, llvm_stored_type = self.emit_group_address(
+                base_pointer, aval, entry_index
+            )
+            entry_value = self.array_emitter.value_emitter.to_lane_vector(
+                self.array_emitter.get_array_entry(result_array, entry_index)
+            )
+            if self.has_single_lane:
+                entry_value = builder.extract_element(entry_value, ir.Constant(I64, 0))
             if aval.dtype.kind == "b":
-                stored_value = builder.zext(stored_value, stored_type)
-            builder.store(stored_value, address, align=aval.dtype.itemsize)
+                entry_value = builder.zext(entry_value, llvm_stored_type)
+            builder.store(entry_value, entry_address, align=aval.dtype.itemsize)
             return []
 
-        self.emitter.loop_over_indices(aval.shape[:-1], store_row)
+        self.array_emitter.emit_index_loops(aval.shape[:-1], emit_entry_store)
 
-    def row_address(
-        self, base_pointer: Value, aval: Any, index: EntryIndex
-    ) -> tuple[Value, ir.Type]:
-        """Return the address of the group's lanes of one entry, and the LLVM type in which they are
-        stored.
-        """
-        builder, element_type = self.emitter.builder, NUMBER_TYPES[aval.dtype.name]
-        element_type = I8 if element_type == I1 else element_type
+    def emit_group_address(
+        self, base_pointer: LlvmValue, aval: Any, entry_index: EntryIndex
+    ) -> tuple[LlvmValue, ir.Type]:
+        """Return the address of one array entry for the first lane of the group, and the LLVM type
+        of the stored lanes."""
+        builder, llvm_element_type = self.array_emitter.builder, LLVM_NUMBER_TYPES[aval.dtype.name]
+        llvm_element_type = I8 if llvm_element_type == I1 else llvm_element_type
         if aval.shape == ():
-            return base_pointer, element_type
-        row_index = self.emitter.linear_index(index, aval.shape[:-1])
-        offset = builder.add(builder.mul(row_index, self.n_lanes), self.first_lane)
-        stored_type = (
-            element_type if self.is_single_lane else self.emitter.emitter.vector_type(element_type)
+            return base_pointer, llvm_element_type
+        entry_offset = self.array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
+        lane_offset = builder.add(builder.mul(entry_offset, self.n_lanes), self.first_lane)
+        llvm_stored_type = (
+            llvm_element_type
+            if self.has_single_lane
+            else self.array_emitter.value_emitter.make_vector_type(llvm_element_type)
         )
-        return builder.gep(base_pointer, [offset], source_etype=element_type), stored_type
+        return builder.gep(
+            base_pointer, [lane_offset], source_etype=llvm_element_type
+        ), llvm_stored_type

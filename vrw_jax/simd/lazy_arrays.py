@@ -9,75 +9,95 @@ from typing import Any
 import numpy as np
 
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.value_emitter import Value
+from vrw_jax.simd.value_emitter import LlvmValue
 
 EntryIndex = tuple[Any, ...]
 """Index of an array entry: for each axis an integer, or an LLVM value of type I64."""
 
 
 class LazyArray:
-    """A large array of type `entry_type` whose entries the function `entry_at(index)` computes or
-    loads.
+    """A large array of type `entry_type`. The function `get_entry_at(index)` computes or loads an
+    entry.
 
     If `entry_type` is a vector, an entry may also be a scalar, which is the same for all lanes.
     """
 
     def __init__(
-        self, shape: Sequence[int], entry_type: ir.Type, entry_at: Callable[[EntryIndex], Value]
+        self,
+        array_shape: Sequence[int],
+        entry_type: ir.Type,
+        get_entry_at: Callable[[EntryIndex], LlvmValue],
     ) -> None:
-        self.shape, self.entry_type, self.entry_at = tuple(shape), entry_type, entry_at
+        self.shape, self.entry_type, self.get_entry_at = (
+            tuple(array_shape),
+            entry_type,
+            get_entry_at,
+        )
 
 
-class Uninitialized(LazyArray):
+class UninitializedArray(LazyArray):
     """A large array whose entries are never read before they are overwritten."""
 
 
-class PendingUpdate(LazyArray):
+class PendingArrayUpdate(LazyArray):
     """An array in memory, or an array of one repeated number, with one part replaced."""
 
     def __init__(
-        self, emitter: Any, base_array: "ArrayValue", update: "ArrayValue", start_index: EntryIndex
+        self,
+        array_emitter: Any,
+        base_array: "LlvmArray",
+        update_array: "LlvmArray",
+        start_index: EntryIndex,
     ) -> None:
-        entry_type = update.entry_type if isinstance(update, LazyArray) else update.ravel()[0].type
-        super().__init__(base_array.shape, entry_type, self.load)
-        self.emitter, self.base_array, self.update, self.start_index = (
-            emitter,
+        entry_type = (
+            update_array.entry_type
+            if isinstance(update_array, LazyArray)
+            else update_array.ravel()[0].type
+        )
+        super().__init__(base_array.shape, entry_type, self.emit_entry_load)
+        self.array_emitter, self.base_array, self.update_array, self.start_index = (
+            array_emitter,
             base_array,
-            update,
+            update_array,
             start_index,
         )
 
-    def load(self, index: EntryIndex) -> Value:
-        """Return the entry at an index: of the update inside the replaced part, else of the base
-        array.
-        """
-        return self.emitter.get_entry(self.emitter.materialize(self), index)
-
-    def materialize_update(self) -> "PendingUpdate":
-        """Return the same update with its part computed, because the part may depend on the entries
-        that it replaces.
-        """
-        if isinstance(self.update, np.ndarray):
-            return self
-        return PendingUpdate(
-            self.emitter, self.base_array, self.emitter.materialize(self.update), self.start_index
+    def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
+        """Return the entry at an index, from the update if the index is inside the replaced part,
+        else from the base array."""
+        return self.array_emitter.get_array_entry(
+            self.array_emitter.store_in_memory(self), entry_index
         )
 
-    def store_into(self, memory: "MemoryArray") -> None:
-        """Emit stores that overwrite the part in `memory`; the update must be materialized."""
-        emitter = self.emitter
+    def store_update_in_memory(self) -> "PendingArrayUpdate":
+        """Return an equal update whose part is stored in memory, because the part may depend on the
+        entries that it replaces."""
+        if isinstance(self.update_array, np.ndarray):
+            return self
+        return PendingArrayUpdate(
+            self.array_emitter,
+            self.base_array,
+            self.array_emitter.store_in_memory(self.update_array),
+            self.start_index,
+        )
 
-        def store_updated_entry(index: EntryIndex, _: Any = None) -> list[Value]:
-            memory.store(
-                emitter.add_indices(index, self.start_index), emitter.get_entry(self.update, index)
+    def emit_update_stores(self, memory_array: "MemoryArray") -> None:
+        """Emit stores that overwrite the replaced part of `memory_array`. The update must be stored
+        in memory first."""
+        array_emitter = self.array_emitter
+
+        def store_updated_entry(update_index: EntryIndex, _: Any = None) -> list[LlvmValue]:
+            memory_array.emit_entry_store(
+                array_emitter.emit_index_sum(update_index, self.start_index),
+                array_emitter.get_array_entry(self.update_array, update_index),
             )
             return []
 
-        if isinstance(self.update, np.ndarray) and any(self.update.strides):
-            for index in np.ndindex(self.update.shape):
-                store_updated_entry(index)
+        if isinstance(self.update_array, np.ndarray) and any(self.update_array.strides):
+            for update_index in np.ndindex(self.update_array.shape):
+                store_updated_entry(update_index)
         else:
-            emitter.loop_over_indices(self.update.shape, store_updated_entry)
+            array_emitter.emit_index_loops(self.update_array.shape, store_updated_entry)
 
 
 class MemoryArray(LazyArray):
@@ -89,70 +109,78 @@ class MemoryArray(LazyArray):
 
     def __init__(
         self,
-        emitter: Any,
-        shape: Sequence[int],
+        array_emitter: Any,
+        array_shape: Sequence[int],
         entry_type: ir.Type,
-        base_pointer: Value,
+        base_pointer: LlvmValue,
         is_overwritable: bool = False,
     ) -> None:
-        super().__init__(shape, entry_type, self.load)
-        self.emitter, self.base_pointer, self.is_overwritable = (
-            emitter,
+        super().__init__(array_shape, entry_type, self.emit_entry_load)
+        self.array_emitter, self.base_pointer, self.is_overwritable = (
+            array_emitter,
             base_pointer,
             is_overwritable,
         )
 
-    def address_of(self, index: EntryIndex) -> Value:
+    def emit_entry_address(self, entry_index: EntryIndex) -> LlvmValue:
         """Return the address of the entry at an index."""
-        offset = self.emitter.linear_index(index, self.shape)
-        return self.emitter.builder.gep(self.base_pointer, [offset], source_etype=self.entry_type)
-
-    def load(self, index: EntryIndex) -> Value:
-        """Emit a load of the entry at an index, and return its value."""
-        return self.emitter.builder.load(self.address_of(index), typ=self.entry_type)
-
-    def store(self, index: EntryIndex, value: Value) -> None:
-        """Emit a store of `value` at an index."""
-        value = (
-            self.emitter.emitter.splat(value)
-            if isinstance(self.entry_type, ir.VectorType)
-            else value
+        memory_offset = self.array_emitter.emit_memory_offset(entry_index, self.shape)
+        return self.array_emitter.builder.gep(
+            self.base_pointer, [memory_offset], source_etype=self.entry_type
         )
-        self.emitter.builder.store(value, self.address_of(index))
 
-    def get_row(self, row_index: Value) -> "MemoryArray":
-        """Return the part of the array at one index of its first axis, in the same memory."""
-        later_indices = (0,) * (len(self.shape) - 1)
+    def emit_entry_load(self, entry_index: EntryIndex) -> LlvmValue:
+        """Emit a load of the entry at an index, and return its value."""
+        return self.array_emitter.builder.load(
+            self.emit_entry_address(entry_index), typ=self.entry_type
+        )
+
+    def emit_entry_store(self, entry_index: EntryIndex, stored_value: LlvmValue) -> None:
+        """Emit a store of `stored_value` at an index."""
+        stored_value = (
+            self.array_emitter.value_emitter.to_lane_vector(stored_value)
+            if isinstance(self.entry_type, ir.VectorType)
+            else stored_value
+        )
+        self.array_emitter.builder.store(stored_value, self.emit_entry_address(entry_index))
+
+    def get_subarray(self, first_axis_index: LlvmValue) -> "MemoryArray":
+        """Return the part of the array at one index of the first axis, in the same memory."""
+        zero_indices = (0,) * (len(self.shape) - 1)
         return MemoryArray(
-            self.emitter,
+            self.array_emitter,
             self.shape[1:],
             self.entry_type,
-            self.address_of((row_index, *later_indices)),
+            self.emit_entry_address((first_axis_index, *zero_indices)),
         )
 
 
-class TransposedView(LazyArray):
+class TransposedMemoryView(LazyArray):
     """A view of an array in memory with its axes in another order."""
 
-    def get_row(self, row_index: Value) -> LazyArray:
-        """Return the part of the array at one index of its first axis."""
+    def get_subarray(self, first_axis_index: LlvmValue) -> LazyArray:
+        """Return the part of the array at one index of the first axis."""
         return LazyArray(
-            self.shape[1:], self.entry_type, lambda index: self.entry_at((row_index, *index))
+            self.shape[1:],
+            self.entry_type,
+            lambda index: self.get_entry_at((first_axis_index, *index)),
         )
 
 
-ArrayValue = np.ndarray | LazyArray
+LlvmArray = np.ndarray | LazyArray
 """Array of LLVM values without the lane axis, in registers (NumPy) or lazy."""
 
 
-def as_shared(array: ArrayValue) -> ArrayValue:
-    """Return the array marked as read by other consumers too, so that its memory is not
-    overwritten.
-    """
-    if isinstance(array, PendingUpdate):
-        return PendingUpdate(
-            array.emitter, as_shared(array.base_array), array.update, array.start_index
+def mark_as_shared(array: LlvmArray) -> LlvmArray:
+    """Return the array marked as read by further consumers, so that no consumer overwrites its
+    memory."""
+    if isinstance(array, PendingArrayUpdate):
+        return PendingArrayUpdate(
+            array.array_emitter,
+            mark_as_shared(array.base_array),
+            array.update_array,
+            array.start_index,
         )
     if isinstance(array, MemoryArray) and array.is_overwritable:
-        return MemoryArray(array.emitter, array.shape, array.entry_type, array.base_pointer)
+        return MemoryArray(array.array_emitter, array.shape, array.entry_type, array.base_pointer)
     return array

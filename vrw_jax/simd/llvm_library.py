@@ -1,6 +1,5 @@
-"""The modules of llvmlite, or stand-ins if it is not installed. Without llvmlite, XLA computes
-everything.
-"""
+"""The modules of llvmlite, or stand-ins if llvmlite is not installed. Without llvmlite, XLA
+computes everything."""
 
 from typing import Any
 
@@ -8,30 +7,30 @@ try:
     import llvmlite.binding as llvm
     import llvmlite.ir as ir
 
-    has_llvm = True
+    is_llvmlite_installed = True
 except ImportError:
-    has_llvm = False
+    is_llvmlite_installed = False
 
 
-class _MissingType:
+class _MissingLlvmType:
     """Stand-in for a type of llvmlite that the emitters name and extend."""
 
     def __init__(self, *_: Any) -> None: ...
 
 
-class _MissingTypes:
-    """Stand-in for the module `llvmlite.ir`, in which any name is a type."""
+class _MissingLlvmTypes:
+    """Stand-in for the module `llvmlite.ir`, in which every name is a type."""
 
-    def __getattr__(self, name: str) -> Any:
-        return type(name, (_MissingType,), {})
+    def __getattr__(self, type_name: str) -> Any:
+        return type(type_name, (_MissingLlvmType,), {})
 
 
-class _MissingCompiler:
+class _MissingLlvmCompiler:
     """Stand-in for the module `llvmlite.binding`, whose use raises an ImportError."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, attribute_name: str) -> Any:
         raise ImportError("machine code needs llvmlite, which is not installed: pip install it.")
 
 
-if not has_llvm:
-    llvm, ir = _MissingCompiler(), _MissingTypes()
+if not is_llvmlite_installed:
+    llvm, ir = _MissingLlvmCompiler(), _MissingLlvmTypes()

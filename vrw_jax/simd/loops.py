@@ -7,259 +7,314 @@ from typing import Any
 from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
-    shape_without_lanes,
-    split_arrays,
+    get_shape_without_lanes,
+    split_into_entry_arrays,
 )
 from vrw_jax.simd.lazy_arrays import (
-    ArrayValue,
+    LlvmArray,
     MemoryArray,
-    PendingUpdate,
-    TransposedView,
-    as_shared,
+    PendingArrayUpdate,
+    TransposedMemoryView,
+    mark_as_shared,
 )
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering
-from vrw_jax.simd.value_emitter import I64, Value
+from vrw_jax.simd.lowering import CALLED_JAXPR_PARAMETERS, JaxprLowering
+from vrw_jax.simd.value_emitter import I64, LlvmValue
 
 
-def emit_while(
-    lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
-) -> list[ArrayValue]:
+def emit_while_loop(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
     """Emit a `while` loop, and return the arrays it carries after the last iteration.
 
     Each group of lanes evaluates the condition separately, so a group ends with its own slowest
     lane.
     """
-    emitter, params = lowering.emitter, equation.params
-    n_condition_constants, n_body_constants = params["cond_nconsts"], params["body_nconsts"]
+    array_emitter, equation_params = jaxpr_lowering.array_emitter, equation.params
+    n_condition_constants, n_body_constants = (
+        equation_params["cond_nconsts"],
+        equation_params["body_nconsts"],
+    )
     # The constants are shared, because each iteration reads them again.
-    constants = list(map(as_shared, values[: n_condition_constants + n_body_constants]))
-    condition_constants = constants[:n_condition_constants]
-    body_constants = constants[n_condition_constants:]
-    initial_values = values[n_condition_constants + n_body_constants :]
+    loop_constants = list(map(mark_as_shared, operands[: n_condition_constants + n_body_constants]))
+    condition_constants = loop_constants[:n_condition_constants]
+    body_constants = loop_constants[n_condition_constants:]
+    initial_values = operands[n_condition_constants + n_body_constants :]
     loop_carry = _LoopCarry(
-        emitter, params["body_jaxpr"].out_avals, emitter.limits.max_registers, initial_values
+        array_emitter,
+        equation_params["body_jaxpr"].out_avals,
+        array_emitter.register_limits.max_register_entries,
+        initial_values,
     )
 
-    def emit_condition(register_values: list[Value]) -> Value:
-        results = lowering.lower_jaxpr(
-            params["cond_jaxpr"],
-            [*condition_constants, *map(as_shared, loop_carry.to_arrays(register_values))],
+    def emit_while_condition(register_values: list[LlvmValue]) -> LlvmValue:
+        condition_results = jaxpr_lowering.lower_jaxpr(
+            equation_params["cond_jaxpr"],
+            [
+                *condition_constants,
+                *map(mark_as_shared, loop_carry.make_carried_arrays(register_values)),
+            ],
         )
-        return emitter.get_entries(results[0]).item()
+        return array_emitter.get_array_entries(condition_results[0]).item()
 
-    def emit_body(register_values: list[Value]) -> list[Value]:
-        results = lowering.lower_jaxpr(
-            params["body_jaxpr"], [*body_constants, *loop_carry.to_arrays(register_values)]
+    def emit_while_body(register_values: list[LlvmValue]) -> list[LlvmValue]:
+        body_results = jaxpr_lowering.lower_jaxpr(
+            equation_params["body_jaxpr"],
+            [*body_constants, *loop_carry.make_carried_arrays(register_values)],
         )
-        return loop_carry.get_next_registers(results)
+        return loop_carry.get_next_register_values(body_results)
 
-    initial_registers = loop_carry.store_initial(initial_values)
-    return loop_carry.to_arrays(
-        emitter.emitter.emit_loop(initial_registers, emit_condition, emit_body)
+    initial_registers = loop_carry.store_initial_arrays(initial_values)
+    return loop_carry.make_carried_arrays(
+        array_emitter.value_emitter.emit_llvm_loop(
+            initial_registers, emit_while_condition, emit_while_body
+        )
     )
 
 
-def emit_scan(lowering: JaxprLowering, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
+def emit_scan_loop(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
     """Emit a loop of known length, and return the last carried arrays and the stacked outputs.
 
     Scanned inputs and stacked outputs are in memory.
     """
-    emitter, params = lowering.emitter, equation.params
-    if "ft_in" in params:  # JAX has this parameter from release 0.11 or 0.12 on.
-        constants, loop_carry, _ = params["ft_in"].unpack()
-        n_constants, n_carry = len(constants), len(loop_carry)
+    array_emitter, equation_params = jaxpr_lowering.array_emitter, equation.params
+    if "ft_in" in equation_params:  # JAX has this parameter from release 0.11 or 0.12 on.
+        loop_constants, loop_carry, _ = equation_params["ft_in"].unpack()
+        n_loop_constants, n_carried_arrays = len(loop_constants), len(loop_carry)
     else:
-        n_constants, n_carry = params["num_consts"], params["num_carry"]
-    body_jaxpr, n_iterations = params["jaxpr"], params["length"]
-    stacked_avals = [variable.aval for variable in equation.outvars[n_carry:]]
+        n_loop_constants, n_carried_arrays = (
+            equation_params["num_consts"],
+            equation_params["num_carry"],
+        )
+    body_jaxpr, n_iterations = equation_params["jaxpr"], equation_params["length"]
+    stacked_output_avals = [
+        output_variable.aval for output_variable in equation.outvars[n_carried_arrays:]
+    ]
     if n_iterations == LANE_AXIS_SENTINEL and (
-        stacked_avals or len(values) > n_constants + n_carry
+        stacked_output_avals or len(operands) > n_loop_constants + n_carried_arrays
     ):
         raise NotImplementedError(
             f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': "
             "do the same to each lane, and give other axes another length."
         )
-    scanned_values = values[n_constants + n_carry :]
+    scanned_operands = operands[n_loop_constants + n_carried_arrays :]
     scanned_arrays = [
-        x if isinstance(x, TransposedView) else emitter.materialize(x) for x in scanned_values
+        x if isinstance(x, TransposedMemoryView) else array_emitter.store_in_memory(x)
+        for x in scanned_operands
     ]
     stacked_arrays = [
-        emitter.allocate(shape_without_lanes(aval), emitter.entry_type_of(aval))
-        for aval in stacked_avals
+        array_emitter.allocate_memory_array(
+            get_shape_without_lanes(aval), array_emitter.get_entry_type(aval)
+        )
+        for aval in stacked_output_avals
     ]
-    was_in_innermost_loop, emitter.is_in_innermost_loop = (
-        emitter.is_in_innermost_loop,
+    was_in_innermost_loop, array_emitter.is_in_innermost_loop = (
+        array_emitter.is_in_innermost_loop,
         not _contains_loop(body_jaxpr.jaxpr),
     )
-    constants = list(map(as_shared, values[:n_constants]))
-    initial_values = values[n_constants : n_constants + n_carry]
-    limits = emitter.limits
+    loop_constants = list(map(mark_as_shared, operands[:n_loop_constants]))
+    initial_values = operands[n_loop_constants : n_loop_constants + n_carried_arrays]
+    register_limits = array_emitter.register_limits
     max_registers = (
-        limits.max_registers_inner if emitter.is_in_innermost_loop else limits.max_registers
+        register_limits.max_innermost_register_entries
+        if array_emitter.is_in_innermost_loop
+        else register_limits.max_register_entries
     )
-    loop_carry = _LoopCarry(emitter, body_jaxpr.out_avals[:n_carry], max_registers, initial_values)
+    loop_carry = _LoopCarry(
+        array_emitter, body_jaxpr.out_avals[:n_carried_arrays], max_registers, initial_values
+    )
 
-    def get_slice(memory: MemoryArray | TransposedView, iteration: Value) -> ArrayValue:
-        slice_array = memory.get_row(iteration)
+    def get_scanned_slice(
+        scanned_array: MemoryArray | TransposedMemoryView, iteration: LlvmValue
+    ) -> LlvmArray:
+        scanned_slice = scanned_array.get_subarray(iteration)
         fits_registers = (
-            emitter.is_in_innermost_loop or math.prod(slice_array.shape) <= limits.max_registers
+            array_emitter.is_in_innermost_loop
+            or math.prod(scanned_slice.shape) <= register_limits.max_register_entries
         )
-        return emitter.get_entries(slice_array) if fits_registers else slice_array
+        return array_emitter.get_array_entries(scanned_slice) if fits_registers else scanned_slice
 
-    def emit_body(iteration: Value, register_values: list[Value]) -> list[Value]:
-        if params["reverse"]:
-            iteration = emitter.builder.sub(ir.Constant(I64, n_iterations - 1), iteration)
-        slices = [get_slice(memory, iteration) for memory in scanned_arrays]
-        results = lowering.lower_jaxpr(
-            body_jaxpr, [*constants, *loop_carry.to_arrays(register_values), *slices]
+    def emit_scan_body(iteration: LlvmValue, register_values: list[LlvmValue]) -> list[LlvmValue]:
+        if equation_params["reverse"]:
+            iteration = array_emitter.builder.sub(ir.Constant(I64, n_iterations - 1), iteration)
+        scanned_slices = [
+            get_scanned_slice(stacked_array, iteration) for stacked_array in scanned_arrays
+        ]
+        body_results = jaxpr_lowering.lower_jaxpr(
+            body_jaxpr,
+            [*loop_constants, *loop_carry.make_carried_arrays(register_values), *scanned_slices],
         )
-        for memory, value in zip(stacked_arrays, results[n_carry:], strict=True):
-            emitter.fill_memory(memory.get_row(iteration), value)
-        return loop_carry.get_next_registers(results[:n_carry])
+        for stacked_array, stacked_output in zip(
+            stacked_arrays, body_results[n_carried_arrays:], strict=True
+        ):
+            array_emitter.store_array_into_memory(
+                stacked_array.get_subarray(iteration), stacked_output
+            )
+        return loop_carry.get_next_register_values(body_results[:n_carried_arrays])
 
-    initial_registers = loop_carry.store_initial(initial_values)
-    final_values = loop_carry.to_arrays(
-        emitter.loop_n_times(n_iterations, emit_body, initial_registers)
+    initial_registers = loop_carry.store_initial_arrays(initial_values)
+    final_carried_arrays = loop_carry.make_carried_arrays(
+        array_emitter.emit_counted_loop(n_iterations, emit_scan_body, initial_registers)
     )
-    emitter.is_in_innermost_loop = was_in_innermost_loop
-    return [*final_values, *stacked_arrays]
+    array_emitter.is_in_innermost_loop = was_in_innermost_loop
+    return [*final_carried_arrays, *stacked_arrays]
 
 
 class _LoopCarry:
     """Arrays that a loop carries from one iteration to the next.
 
-    An array of at most `max_registers` entries is kept in registers, a larger one in memory. The
-    memory is that of the initial value if no other array uses it; otherwise it is allocated for the
-    loop.
+    An array of at most `max_register_entries` entries is kept in registers, and a larger array in
+    memory. The memory of the initial value is used if no other array uses it. Otherwise new memory
+    is allocated for the loop.
     """
 
     def __init__(
         self,
-        emitter: ArrayEmitter,
-        avals: Sequence[Any],
-        max_registers: int | float,
-        initial_values: Sequence[ArrayValue],
+        array_emitter: ArrayEmitter,
+        carried_avals: Sequence[Any],
+        max_register_entries: int | float,
+        initial_values: Sequence[LlvmArray],
     ) -> None:
-        self.emitter, self.avals = emitter, avals
-        self.memory_by_position = [
-            self.choose_memory(aval, initial_value)
-            if math.prod(shape_without_lanes(aval)) > max_registers
+        self.array_emitter, self.carried_avals = array_emitter, carried_avals
+        self.carried_memory = [
+            self.choose_carried_memory(aval, initial_value)
+            if math.prod(get_shape_without_lanes(aval)) > max_register_entries
             else None
-            for aval, initial_value in zip(avals, initial_values, strict=True)
+            for aval, initial_value in zip(carried_avals, initial_values, strict=True)
         ]
 
-    def choose_memory(self, aval: Any, initial_value: ArrayValue) -> MemoryArray:
-        """Return the memory of the initial value if it may be overwritten and has the same type,
-        else new memory.
-        """
-        entry_type = self.emitter.entry_type_of(aval)
-        initial_value = (
-            initial_value.base_array if isinstance(initial_value, PendingUpdate) else initial_value
+    def choose_carried_memory(self, carried_aval: Any, initial_array: LlvmArray) -> MemoryArray:
+        """Return the memory of the initial array if it may be overwritten and has the same type,
+        else new memory."""
+        entry_type = self.array_emitter.get_entry_type(carried_aval)
+        initial_array = (
+            initial_array.base_array
+            if isinstance(initial_array, PendingArrayUpdate)
+            else initial_array
         )
         if (
-            isinstance(initial_value, MemoryArray)
-            and initial_value.is_overwritable
-            and initial_value.entry_type == entry_type
+            isinstance(initial_array, MemoryArray)
+            and initial_array.is_overwritable
+            and initial_array.entry_type == entry_type
         ):
-            return initial_value
-        return self.emitter.allocate(shape_without_lanes(aval), entry_type)
+            return initial_array
+        return self.array_emitter.allocate_memory_array(
+            get_shape_without_lanes(carried_aval), entry_type
+        )
 
-    def to_arrays(self, register_values: Sequence[Value]) -> list[ArrayValue]:
-        """Return the carried arrays, in an iteration or after the last one, from the values in
-        registers.
+    def make_carried_arrays(self, register_values: Sequence[LlvmValue]) -> list[LlvmArray]:
+        """Return the carried arrays of one iteration from the values in registers and from
+        memory.
         """
         register_avals = [
-            aval
-            for aval, memory in zip(self.avals, self.memory_by_position, strict=True)
-            if memory is None
+            carried_aval
+            for carried_aval, memory_array in zip(
+                self.carried_avals, self.carried_memory, strict=True
+            )
+            if memory_array is None
         ]
-        register_arrays = iter(split_arrays(register_values, register_avals))
+        register_arrays = iter(split_into_entry_arrays(register_values, register_avals))
         # Each call creates new objects, because values cached for the old ones are outdated.
         return [
             next(register_arrays)
-            if memory is None
+            if memory_array is None
             else MemoryArray(
-                self.emitter,
-                memory.shape,
-                memory.entry_type,
-                memory.base_pointer,
+                self.array_emitter,
+                memory_array.shape,
+                memory_array.entry_type,
+                memory_array.base_pointer,
                 is_overwritable=True,
             )
-            for memory in self.memory_by_position
+            for memory_array in self.carried_memory
         ]
 
-    def store_initial(self, arrays: Sequence[ArrayValue]) -> list[Value]:
-        """Return the initial values of all registers, and emit stores of the arrays kept in
-        memory.
-        """
-        for array, memory in zip(arrays, self.memory_by_position, strict=True):
-            if memory is None or array is memory:
+    def store_initial_arrays(self, initial_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
+        """Return the initial values of all registers, and emit stores of the carried arrays that
+        are kept in memory."""
+        for initial_array, memory_array in zip(initial_arrays, self.carried_memory, strict=True):
+            if memory_array is None or initial_array is memory_array:
                 continue
-            if isinstance(array, PendingUpdate) and array.base_array is memory:
-                array.materialize_update().store_into(memory)
+            if (
+                isinstance(initial_array, PendingArrayUpdate)
+                and initial_array.base_array is memory_array
+            ):
+                initial_array.store_update_in_memory().emit_update_stores(memory_array)
             else:
-                self.emitter.fill_memory(memory, array)
-        return self._flatten_registers(arrays)
+                self.array_emitter.store_array_into_memory(memory_array, initial_array)
+        return self._flatten_register_entries(initial_arrays)
 
-    def get_next_registers(self, arrays: Sequence[ArrayValue]) -> list[Value]:
+    def get_next_register_values(self, next_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
         """Return the values of all registers in the next iteration, and emit stores of the arrays
-        in memory.
+        kept in memory.
 
-        New values may depend on any of the old ones, so all are computed before any is stored.
+        A new array may depend on every old one, so all new arrays are computed before any is
+        stored.
         """
-        register_values = self._flatten_registers(arrays)
-        pending_copies: list[tuple[MemoryArray, MemoryArray | PendingUpdate]] = []
-        for array, memory in zip(arrays, self.memory_by_position, strict=True):
-            if memory is None or (
-                isinstance(array, MemoryArray) and array.base_pointer is memory.base_pointer
+        register_values = self._flatten_register_entries(next_arrays)
+        pending_copies: list[tuple[MemoryArray, MemoryArray | PendingArrayUpdate]] = []
+        for next_array, memory_array in zip(next_arrays, self.carried_memory, strict=True):
+            if memory_array is None or (
+                isinstance(next_array, MemoryArray)
+                and next_array.base_pointer is memory_array.base_pointer
             ):
                 continue
             if (
-                isinstance(array, PendingUpdate)
-                and getattr(array.base_array, "base_pointer", None) is memory.base_pointer
+                isinstance(next_array, PendingArrayUpdate)
+                and getattr(next_array.base_array, "base_pointer", None)
+                is memory_array.base_pointer
             ):
-                pending_copies.append((memory, array.materialize_update()))
-            elif isinstance(array, MemoryArray) and self._has_separate_memory(array):
-                pending_copies.append((memory, array))
+                pending_copies.append((memory_array, next_array.store_update_in_memory()))
+            elif isinstance(next_array, MemoryArray) and self._uses_separate_memory(next_array):
+                pending_copies.append((memory_array, next_array))
             else:
-                copied_array = self.emitter.allocate(memory.shape, memory.entry_type)
-                self.emitter.fill_memory(copied_array, array)
-                pending_copies.append((memory, copied_array))
-        for memory, new_value in pending_copies:
-            if isinstance(new_value, PendingUpdate):
-                new_value.store_into(memory)
+                copied_array = self.array_emitter.allocate_memory_array(
+                    memory_array.shape, memory_array.entry_type
+                )
+                self.array_emitter.store_array_into_memory(copied_array, next_array)
+                pending_copies.append((memory_array, copied_array))
+        for memory_array, next_content in pending_copies:
+            if isinstance(next_content, PendingArrayUpdate):
+                next_content.emit_update_stores(memory_array)
             else:
-                self.emitter.fill_memory(memory, new_value)
+                self.array_emitter.store_array_into_memory(memory_array, next_content)
         return register_values
 
-    def _has_separate_memory(self, array: MemoryArray) -> bool:
-        """Return whether the array has memory of its own, which no carried array uses."""
-        memory_bases = [
-            memory.base_pointer for memory in self.memory_by_position if memory is not None
+    def _uses_separate_memory(self, array: MemoryArray) -> bool:
+        """Return whether no carried array uses the memory of `array`."""
+        carried_base_pointers = [
+            memory_array.base_pointer
+            for memory_array in self.carried_memory
+            if memory_array is not None
         ]
         return (
             isinstance(array.base_pointer, ir.AllocaInstr)
-            and array.base_pointer not in memory_bases
+            and array.base_pointer not in carried_base_pointers
         )
 
-    def _flatten_registers(self, arrays: Sequence[ArrayValue]) -> list[Value]:
+    def _flatten_register_entries(self, carried_arrays: Sequence[LlvmArray]) -> list[LlvmValue]:
         """Return the entries of all carried arrays that are kept in registers, in one list."""
-        array_aval_memory = zip(arrays, self.avals, self.memory_by_position, strict=True)
+        arrays_avals_memory = zip(
+            carried_arrays, self.carried_avals, self.carried_memory, strict=True
+        )
         register_arrays = [
-            (array, aval) for array, aval, memory in array_aval_memory if memory is None
+            (carried_array, carried_aval)
+            for carried_array, carried_aval, memory_array in arrays_avals_memory
+            if memory_array is None
         ]
-        return self.emitter.flatten_entries(
-            [array for array, _ in register_arrays], [aval for _, aval in register_arrays]
+        return self.array_emitter.flatten_array_entries(
+            [carried_array for carried_array, _ in register_arrays],
+            [carried_aval for _, carried_aval in register_arrays],
         )
 
 
 def _contains_loop(jaxpr: Any) -> bool:
-    """Return whether a jaxpr contains a loop at any level."""
+    """Return whether a jaxpr, or any jaxpr that it calls, contains a loop."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in ("while", "scan"):
             return True
-        inner_jaxpr = equation.params.get(JAXPR_PARAMETERS.get(equation.primitive.name, ""))
+        inner_jaxpr = equation.params.get(CALLED_JAXPR_PARAMETERS.get(equation.primitive.name, ""))
         if inner_jaxpr is not None and _contains_loop(inner_jaxpr.jaxpr):
             return True
     return False

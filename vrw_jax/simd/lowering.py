@@ -1,4 +1,4 @@
-"""Lowering of JAX traces to LLVM: equations of a trace one by one, and calls of other traces."""
+"""Lowering of JAX traces to LLVM: each equation of a trace in turn, and calls of other traces."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,22 +11,22 @@ from jax.extend.core import ClosedJaxpr, Literal
 from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
-    lane_axis_error,
-    shape_without_lanes,
-    split_arrays,
+    get_shape_without_lanes,
+    make_lane_axis_error,
+    split_into_entry_arrays,
 )
-from vrw_jax.simd.lazy_arrays import ArrayValue, as_shared
+from vrw_jax.simd.lazy_arrays import LlvmArray, mark_as_shared
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.value_emitter import Value, ValueEmitter
+from vrw_jax.simd.value_emitter import LlvmValue, ValueEmitter
 
-PrimitiveRule = Callable[["JaxprLowering", Any, list[ArrayValue]], list[ArrayValue]]
+PrimitiveRule = Callable[["JaxprLowering", Any, list[LlvmArray]], list[LlvmArray]]
 """Rule of a primitive: a function of the lowering, an equation and its operands that emits
 instructions and returns the results.
 """
 
-NOINLINE_NAME = "noinline"
+NOINLINE_FUNCTION_NAME = "noinline"
 
-JAXPR_PARAMETERS = {  # primitive, and the parameter that contains the jaxpr it calls
+CALLED_JAXPR_PARAMETERS = {  # primitive, and the parameter that contains the jaxpr it calls
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -36,10 +36,10 @@ JAXPR_PARAMETERS = {  # primitive, and the parameter that contains the jaxpr it 
 }
 
 
-LOOP_PRIMITIVES = "while", "scan"
+LOOP_PRIMITIVE_NAMES = "while", "scan"
 
 
-def noinline(function: Callable) -> Callable:
+def mark_noinline(function: Callable) -> Callable:
     """Return `function` marked so that machine code calls it as a separate function instead of
     inlining it.
     """
@@ -51,155 +51,188 @@ def noinline(function: Callable) -> Callable:
 
 
 class JaxprLowering:
-    """Lowering of traces into the LLVM function of `emitter`, by a table of rules of primitives."""
+    """Lowering of traces into the LLVM function of `array_emitter`, by a table of rules of
+    primitives.
+    """
 
     def __init__(
         self,
-        emitter: ArrayEmitter,
-        rules: Mapping[str, PrimitiveRule],
-        functions: dict[int, Any] | None = None,
+        array_emitter: ArrayEmitter,
+        primitive_rules: Mapping[str, PrimitiveRule],
+        separate_functions: dict[int, Any] | None = None,
     ) -> None:
-        self.emitter, self.rules = emitter, rules
+        self.array_emitter, self.primitive_rules = array_emitter, primitive_rules
         # Separate functions by the `id` of their trace, with the trace, whose reference keeps the
         # `id` valid.
-        self.functions = {} if functions is None else functions
+        self.separate_functions = {} if separate_functions is None else separate_functions
 
     def lower_jaxpr(
-        self, closed_jaxpr: ClosedJaxpr, values: Sequence[ArrayValue]
-    ) -> list[ArrayValue]:
+        self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]
+    ) -> list[LlvmArray]:
         """Emit all equations of a trace for these arguments, and return its results."""
-        jaxpr, emit_constants = closed_jaxpr.jaxpr, self.emitter.emit_constant_array
-        last_uses, value_by_variable = _last_uses(jaxpr), dict[Any, ArrayValue]()
+        jaxpr, emit_constant_array = closed_jaxpr.jaxpr, self.array_emitter.emit_constant_array
+        overwriting_equations, array_by_variable = (
+            _find_overwriting_equations(jaxpr),
+            dict[Any, LlvmArray](),
+        )
 
-        def assign_variables(variables: Sequence[Any], values: Sequence[ArrayValue]) -> None:
-            for variable, value in zip(variables, values, strict=True):
-                value_by_variable[variable] = (
-                    as_shared(value) if last_uses.get(variable) is None else value
+        def assign_jaxpr_variables(
+            jaxpr_variables: Sequence[Any], assigned_arrays: Sequence[LlvmArray]
+        ) -> None:
+            for jaxpr_variable, assigned_array in zip(
+                jaxpr_variables, assigned_arrays, strict=True
+            ):
+                array_by_variable[jaxpr_variable] = (
+                    mark_as_shared(assigned_array)
+                    if overwriting_equations.get(jaxpr_variable) is None
+                    else assigned_array
                 )
 
-        assign_variables(jaxpr.invars, values)
-        for variable, value in zip(jaxpr.constvars, closed_jaxpr.consts, strict=True):
-            value_by_variable[variable] = emit_constants(np.asarray(value), variable.aval)
+        assign_jaxpr_variables(jaxpr.invars, argument_arrays)
+        for jaxpr_variable, constant_value in zip(
+            jaxpr.constvars, closed_jaxpr.consts, strict=True
+        ):
+            array_by_variable[jaxpr_variable] = emit_constant_array(
+                np.asarray(constant_value), jaxpr_variable.aval
+            )
 
-        def read_atom(atom: Any, equation_index: int) -> ArrayValue:
-            if isinstance(atom, Literal):
-                return emit_constants(np.asarray(atom.val), atom.aval)
+        def read_jaxpr_atom(jaxpr_atom: Any, equation_index: int) -> LlvmArray:
+            if isinstance(jaxpr_atom, Literal):
+                return emit_constant_array(np.asarray(jaxpr_atom.val), jaxpr_atom.aval)
             return (
-                value_by_variable[atom]
-                if last_uses[atom] == equation_index
-                else as_shared(value_by_variable[atom])
+                array_by_variable[jaxpr_atom]
+                if overwriting_equations[jaxpr_atom] == equation_index
+                else mark_as_shared(array_by_variable[jaxpr_atom])
             )
 
         for equation_index, equation in enumerate(jaxpr.eqns):
-            if all(variable.aval.dtype == jax.dtypes.float0 for variable in equation.outvars):
+            if all(
+                jaxpr_variable.aval.dtype == jax.dtypes.float0
+                for jaxpr_variable in equation.outvars
+            ):
                 continue  # The derivative of an integer has no value, and no equation reads it.
-            results = self._lower_equation(
-                equation, [read_atom(x, equation_index) for x in equation.invars]
+            equation_results = self._lower_equation(
+                equation, [read_jaxpr_atom(x, equation_index) for x in equation.invars]
             )
-            assign_variables(equation.outvars, results)
-        return [read_atom(atom, len(jaxpr.eqns)) for atom in jaxpr.outvars]
+            assign_jaxpr_variables(equation.outvars, equation_results)
+        return [read_jaxpr_atom(jaxpr_atom, len(jaxpr.eqns)) for jaxpr_atom in jaxpr.outvars]
 
-    def _lower_equation(self, equation: Any, values: list[ArrayValue]) -> list[ArrayValue]:
+    def _lower_equation(self, equation: Any, operands: list[LlvmArray]) -> list[LlvmArray]:
         """Emit one equation of a trace, and return its results."""
-        name = equation.primitive.name
-        if name not in self.rules:
+        primitive_name = equation.primitive.name
+        if primitive_name not in self.primitive_rules:
             raise NotImplementedError(
-                f"{name} has no machine code: write it by primitives that `simd.list_primitives()` "
-                "lists, or give it a rule in `simd/rules.PRIMITIVE_RULES`."
+                f"{primitive_name} has no machine code: write it by primitives that "
+                "`simd.describe_supported_primitives()` lists, or give it a rule in "
+                "`simd/rules.PRIMITIVE_RULES`."
             )
-        for variable in equation.outvars:
-            if LANE_AXIS_SENTINEL in variable.aval.shape[:-1]:
-                raise lane_axis_error(f"The result of {name}", variable.aval)
-        return self.rules[name](self, equation, values)
+        for result_variable in equation.outvars:
+            if LANE_AXIS_SENTINEL in result_variable.aval.shape[:-1]:
+                raise make_lane_axis_error(f"The result of {primitive_name}", result_variable.aval)
+        return self.primitive_rules[primitive_name](self, equation, operands)
 
-    def call_function(
-        self, closed_jaxpr: ClosedJaxpr, values: Sequence[ArrayValue]
-    ) -> list[ArrayValue]:
-        """Emit a call of a trace as a separate function, which is defined on the first call, and
-        return its results.
-        """
-        builder = self.emitter.builder
-        if id(closed_jaxpr) not in self.functions:
-            self.functions[id(closed_jaxpr)] = (self._define_function(closed_jaxpr), closed_jaxpr)
-        function, _ = self.functions[id(closed_jaxpr)]
+    def emit_separate_function_call(
+        self, closed_jaxpr: ClosedJaxpr, argument_arrays: Sequence[LlvmArray]
+    ) -> list[LlvmArray]:
+        """Emit a call of a trace as a separate function, and return the results. The first call
+        defines the function."""
+        builder = self.array_emitter.builder
+        if id(closed_jaxpr) not in self.separate_functions:
+            self.separate_functions[id(closed_jaxpr)] = (
+                self._define_separate_function(closed_jaxpr),
+                closed_jaxpr,
+            )
+        llvm_function, _ = self.separate_functions[id(closed_jaxpr)]
         returned_struct = builder.call(
-            function, self.emitter.flatten_entries(values, closed_jaxpr.in_avals)
+            llvm_function,
+            self.array_emitter.flatten_array_entries(argument_arrays, closed_jaxpr.in_avals),
         )
-        results = [
+        result_entries = [
             builder.extract_value(returned_struct, i)
             for i in range(len(returned_struct.type.elements))
         ]
-        return split_arrays(results, closed_jaxpr.out_avals)
+        return split_into_entry_arrays(result_entries, closed_jaxpr.out_avals)
 
-    def _define_function(self, closed_jaxpr: ClosedJaxpr) -> ir.Function:
+    def _define_separate_function(self, closed_jaxpr: ClosedJaxpr) -> ir.Function:
         """Return a new LLVM function that computes a trace.
 
-        Its arguments are the entries of all arguments of the trace, and its result is a struct of
-        the entries of all results.
+        The function takes the entries of all arguments of the trace, and returns a struct of the
+        entries of all results.
         """
-        entry_types = lambda avals: [
-            self.emitter.entry_type_of(x)
-            for x in avals
-            for _ in range(math.prod(shape_without_lanes(x)))
+        list_entry_types = lambda array_avals: [
+            self.array_emitter.get_entry_type(x)
+            for x in array_avals
+            for _ in range(math.prod(get_shape_without_lanes(x)))
         ]
-        result_type = ir.LiteralStructType(entry_types(closed_jaxpr.out_avals))
-        module = self.emitter.builder.module
-        argument_type = ir.FunctionType(result_type, entry_types(closed_jaxpr.in_avals))
-        function = ir.Function(module, argument_type, module.get_unique_name(NOINLINE_NAME))
-        function.linkage = "internal"
-        for attribute in ("noinline", "nounwind"):
-            function.attributes.add(attribute)
-        builder = ir.IRBuilder(function.append_basic_block("entry"))
-        caller_emitter = self.emitter
-        emitter = ArrayEmitter(
-            ValueEmitter(builder, caller_emitter.emitter.width),
-            caller_emitter.limits,
+        llvm_struct_type = ir.LiteralStructType(list_entry_types(closed_jaxpr.out_avals))
+        llvm_module = self.array_emitter.builder.module
+        llvm_function_type = ir.FunctionType(
+            llvm_struct_type, list_entry_types(closed_jaxpr.in_avals)
+        )
+        llvm_function = ir.Function(
+            llvm_module, llvm_function_type, llvm_module.get_unique_name(NOINLINE_FUNCTION_NAME)
+        )
+        llvm_function.linkage = "internal"
+        for llvm_attribute in ("noinline", "nounwind"):
+            llvm_function.attributes.add(llvm_attribute)
+        builder = ir.IRBuilder(llvm_function.append_basic_block("entry"))
+        caller_emitter = self.array_emitter
+        function_emitter = ArrayEmitter(
+            ValueEmitter(builder, caller_emitter.value_emitter.n_vector_lanes),
+            caller_emitter.register_limits,
             caller_emitter.is_in_innermost_loop,
         )
-        results = JaxprLowering(emitter, self.rules, self.functions).lower_jaxpr(
-            closed_jaxpr, split_arrays(function.args, closed_jaxpr.in_avals)
+        result_arrays = JaxprLowering(
+            function_emitter, self.primitive_rules, self.separate_functions
+        ).lower_jaxpr(
+            closed_jaxpr, split_into_entry_arrays(llvm_function.args, closed_jaxpr.in_avals)
         )
-        result_struct: Value = ir.Constant(result_type, ir.Undefined)
-        for i, value in enumerate(emitter.flatten_entries(results, closed_jaxpr.out_avals)):
-            result_struct = builder.insert_value(result_struct, value, i)
+        result_struct: LlvmValue = ir.Constant(llvm_struct_type, ir.Undefined)
+        for i, result_entry in enumerate(
+            function_emitter.flatten_array_entries(result_arrays, closed_jaxpr.out_avals)
+        ):
+            result_struct = builder.insert_value(result_struct, result_entry, i)
         builder.ret(result_struct)
-        return function
+        return llvm_function
 
 
-def _last_uses(jaxpr: Any) -> dict[Any, int | None]:
-    """Return, for each variable, the index of the equation that may overwrite its memory, or None.
+def _find_overwriting_equations(jaxpr: Any) -> dict[Any, int | None]:
+    """Return, for each variable, the index of the equation that may overwrite the variable's
+    memory, or None.
 
-    That is the last equation that reads the variable, if all earlier ones are loops, which read
-    nothing after they end.
+    The equation is the last one that reads the variable, if all earlier readers are loops. A loop
+    reads nothing after its end.
     """
-    last_uses: dict[Any, int | None] = {}
-    is_loop = [equation.primitive.name in LOOP_PRIMITIVES for equation in jaxpr.eqns]
-    for equation_index, atoms in enumerate(
+    overwriting_equations: dict[Any, int | None] = {}
+    is_loop_equation = [equation.primitive.name in LOOP_PRIMITIVE_NAMES for equation in jaxpr.eqns]
+    for equation_index, read_atoms in enumerate(
         [*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars]
     ):
-        for atom in atoms:
-            if not isinstance(atom, Literal):
-                previous_equation_index = last_uses.get(atom, -1)
-                is_last_use = previous_equation_index == -1 or (
+        for jaxpr_atom in read_atoms:
+            if not isinstance(jaxpr_atom, Literal):
+                previous_equation_index = overwriting_equations.get(jaxpr_atom, -1)
+                may_overwrite = previous_equation_index == -1 or (
                     previous_equation_index not in (None, equation_index)
-                    and is_loop[previous_equation_index]
+                    and is_loop_equation[previous_equation_index]
                 )
-                last_uses[atom] = equation_index if is_last_use else None
-    return last_uses
+                overwriting_equations[jaxpr_atom] = equation_index if may_overwrite else None
+    return overwriting_equations
 
 
-def call_rule(jaxpr_parameter: str) -> PrimitiveRule:
-    """Return the rule of a primitive that calls the jaxpr in the parameter `jaxpr_parameter`."""
+def make_call_rule(jaxpr_parameter_name: str) -> PrimitiveRule:
+    """Return the rule of a primitive that calls the jaxpr in the parameter
+    `jaxpr_parameter_name`.
+    """
 
-    def emit_call(
-        lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
-    ) -> list[ArrayValue]:
-        """Emit the called trace, inline or, if it is marked by `noinline`, as a function; return
-        its results.
+    def emit_called_jaxpr(
+        jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+    ) -> list[LlvmArray]:
+        """Emit the called trace, inline or, if it is marked by `mark_noinline`, as a function;
+        return its results.
         """
-        closed_jaxpr = equation.params[jaxpr_parameter]
-        if equation.params.get("name") == NOINLINE_NAME:
-            return lowering.call_function(closed_jaxpr, values)
-        return lowering.lower_jaxpr(closed_jaxpr, values)
+        closed_jaxpr = equation.params[jaxpr_parameter_name]
+        if equation.params.get("name") == NOINLINE_FUNCTION_NAME:
+            return jaxpr_lowering.emit_separate_function_call(closed_jaxpr, operands)
+        return jaxpr_lowering.lower_jaxpr(closed_jaxpr, operands)
 
-    return emit_call
+    return emit_called_jaxpr

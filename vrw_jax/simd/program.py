@@ -1,10 +1,10 @@
 """Compilation of functions over lanes to machine code for CPUs.
 
-XLA on CPU generates a loop over all lanes for every few operations, with results in memory between
-them. Its `while` loop runs until the slowest of hundreds of lanes ends. Here the trace of the whole
-function becomes one loop over groups of a few lanes, compiled by LLVM. A group's numbers stay in
-registers, and a group ends with its own slowest lane. A later process neither traces nor compiles
-code that a store contains.
+XLA on a CPU generates a loop over all lanes for every few operations, and stores intermediate
+results in memory. XLA's `while` loop runs until the slowest of hundreds of lanes ends. Here the
+trace of the whole function becomes one loop over groups of a few lanes, compiled by LLVM. The
+numbers of a group stay in registers, and a group ends with its slowest lane. A later process
+neither traces nor compiles code that a store contains.
 """
 
 import ctypes
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.simd import fallback
-from vrw_jax.simd.array_emitter import DEFAULT_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
+from vrw_jax.simd.array_emitter import DEFAULT_REGISTER_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
 from vrw_jax.simd.code_cache import (
     CodeStore,
     MachineCode,
@@ -27,31 +27,44 @@ from vrw_jax.simd.code_cache import (
     load_machine_code,
     trace_for_machine_code,
 )
-from vrw_jax.simd.ffi_primitive import LOADED_BY_NAME, MACHINE_CODE_PRIMITIVE, register_code
-from vrw_jax.simd.kernel import KERNEL_NAME, write_module
-from vrw_jax.simd.llvm_library import has_llvm
-from vrw_jax.simd.machine import LoadedCode, compile_wasm, has_512_bit_vectors
+from vrw_jax.simd.ffi_primitive import (
+    LOADED_CODE_BY_NAME,
+    MACHINE_CODE_PRIMITIVE,
+    register_machine_code,
+)
+from vrw_jax.simd.kernel import LANE_KERNEL_NAME, write_llvm_kernel
+from vrw_jax.simd.llvm_library import is_llvmlite_installed
+from vrw_jax.simd.machine import (
+    LoadedMachineCode,
+    compile_llvm_for_webassembly,
+    has_512_bit_vectors,
+)
 
 LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
 """Number of lanes in 256 bits for each float type. A vector has 256 bits, or 512 on processors with
 such registers.
 """
 GROUPS_PER_TASK = 64
-"""Number of groups in one task of a thread, chosen because starting a task then costs little."""
+"""Number of groups of lanes in one task of a thread, chosen because the start of a task then takes
+a negligible time."""
 
 
-def is_available() -> bool:
+def is_machine_code_available() -> bool:
     """Return whether functions can be compiled to machine code in this process.
 
     Machine code needs llvmlite, the CPU as JAX's backend, and a release of JAX with which it works.
     """
-    if not has_llvm or jax.default_backend() != "cpu" or fallback.is_disabled():
+    if (
+        not is_llvmlite_installed
+        or jax.default_backend() != "cpu"
+        or fallback.is_machine_code_disabled()
+    ):
         return False
-    return fallback.is_tested_release() or _can_call_machine_code()
+    return fallback.is_tested_jax_release() or _can_xla_call_machine_code()
 
 
 @functools.cache
-def _can_call_machine_code() -> bool:
+def _can_xla_call_machine_code() -> bool:
     """Return whether XLA can call a small test program of machine code and gets the correct
     result.
     """
@@ -60,217 +73,245 @@ def _can_call_machine_code() -> bool:
     )
     with jax.ensure_compile_time_eval():
         try:
-            results = jax.jit(increment_program)(jnp.arange(3.0))
-        except Exception as error:  # XLA and LLVM may raise any exception.
-            fallback.disable(error)
+            test_results = jax.jit(increment_program)(jnp.arange(3.0))
+        except Exception as call_error:  # XLA and LLVM may raise any exception.
+            fallback.disable_machine_code(call_error)
             return False
-        if results.tolist() != [1.0, 2.0, 3.0]:
-            fallback.disable("XLA calls it in another way")
+        if test_results.tolist() != [1.0, 2.0, 3.0]:
+            fallback.disable_machine_code("XLA calls it in another way")
             return False
     return True
 
 
 def compile_lane_program(
-    function: Callable[..., tuple],
+    lane_function: Callable[..., tuple],
     scalar_dtypes: Sequence[np.dtype],
-    n_lanes_in: int,
-    dtype: np.dtype,
-    key: object,
-    store: CodeStore | None,
-    limits: RegisterLimits = DEFAULT_LIMITS,
+    n_lane_arrays: int,
+    lane_dtype: np.dtype,
+    trace_key: object,
+    code_store: CodeStore | None,
+    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return a compiled program of `function(scalars, lanes)`.
+    """Return a compiled program of `lane_function(scalars, lanes)`.
 
-    Scalars have the types `scalar_dtypes`, and arrays the float type `dtype`. The function must be
-    elementwise over lanes, except for loops that end when no lane continues. It returns a flat
-    tuple of arrays whose last axis is that of the lanes. The `repr` of `key` identifies everything
-    on which its trace depends except shapes: the values in its closure, and its source. Code is
-    saved in `store`, if given, and `limits` decides what is kept in registers.
+    Scalars have the types `scalar_dtypes`, and arrays the float type `lane_dtype`. The function
+    must be elementwise over lanes, except for loops that end when no lane continues. The function
+    returns a flat tuple of arrays whose last axis is that of the lanes. The `repr` of `trace_key`
+    identifies everything on which the trace depends except shapes: the values in the function's
+    closure, and its source. Code is saved in `code_store`, if given. `register_limits` decides
+    which arrays are kept in registers.
 
     The program takes NumPy arrays of any equal length, and returns a list of arrays. The results of
     a lane are bitwise the same whatever the other lanes are. The program uses all cores available
     to the process.
     """
     # The group has two vectors of 256 bits, so that one computes during the latency of the other.
-    group_width = 2 * LANES_PER_256_BITS[dtype]
-    shapes = (
+    group_width = 2 * LANES_PER_256_BITS[lane_dtype]
+    argument_shapes = (
         tuple(jax.ShapeDtypeStruct((), scalar_dtype) for scalar_dtype in scalar_dtypes),
-        (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), dtype),) * n_lanes_in,
+        (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), lane_dtype),) * n_lane_arrays,
     )
     try:
-        return _LaneProgram(
-            get_machine_code(function, shapes, key, group_width, store, limits), group_width
+        return _LoadedLaneProgram(
+            get_machine_code(
+                lane_function, argument_shapes, trace_key, group_width, code_store, register_limits
+            ),
+            group_width,
         )
-    except Exception as error:
-        _require_untested_release(error)
-    return _compile_with_xla(function)
+    except Exception as compilation_error:
+        _reraise_on_tested_release(compilation_error)
+    xla_program = jax.jit(lane_function)
+    return lambda scalars, lanes: [np.asarray(x) for x in xla_program(tuple(scalars), tuple(lanes))]
 
 
 def compile_wasm_object(
-    function: Callable[..., Any],
+    lane_function: Callable[..., Any],
     n_scalars: int,
     n_rows_by_array: Sequence[int],
-    name: str,
-    limits: RegisterLimits = DEFAULT_LIMITS,
+    exported_function_name: str,
+    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> bytes:
-    """Return `function(*scalars, *arrays)` as object code for WebAssembly, two lanes at a time.
+    """Return `lane_function(*scalars, *arrays)` as object code for WebAssembly, which computes two
+    lanes at a time.
 
     The arguments are float64: `n_scalars` numbers, and arrays of shapes (rows, lanes) with the
-    given numbers of rows. The compiled function `name` takes (inputs, outputs, lanes, begin, end).
-    These are tables of pointers to arguments and results, the number of lanes, and the range of
-    pairs of lanes to compute. The caller provides `sin` and `cos` if the trace uses them.
+    given numbers of rows. The compiled function takes (inputs, outputs, lanes, begin, end). The
+    first two are tables of pointers to arguments and results. The third is the number of lanes. The
+    last two are the range of pairs of lanes to compute. The caller provides `sin` and `cos` if the
+    trace uses them.
     """
-    lanes = [jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array]
-    shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lanes
-    return compile_wasm(
-        write_module(trace_for_machine_code(function, *shapes), 2, limits), KERNEL_NAME, name
+    lane_array_shapes = [
+        jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array
+    ]
+    argument_shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lane_array_shapes
+    return compile_llvm_for_webassembly(
+        write_llvm_kernel(
+            trace_for_machine_code(lane_function, *argument_shapes), 2, register_limits
+        ),
+        LANE_KERNEL_NAME,
+        exported_function_name,
     )
 
 
 def compile_lane_function(
-    function: Callable[..., Any],
-    shape_function: Callable[..., Any],
-    key: object,
-    store: CodeStore | None,
-    limits: RegisterLimits = DEFAULT_LIMITS,
+    lane_function: Callable[..., Any],
+    result_shape_function: Callable[..., Any],
+    trace_key: object,
+    code_store: CodeStore | None,
+    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
 ) -> Callable[..., Any]:
-    """Return `function`, compiled to machine code, as one call within JAX programs.
+    """Return `lane_function`, compiled to machine code, as one call within JAX programs.
 
     The arguments are trees of arrays whose last axis is that of the lanes. The first array has
-    lanes, and numbers without axes are the same for all lanes. The results form a tree, that of
-    `shape_function`, which is fast to trace. Other arguments are as in `compile_lane_program`. A
-    single lane has separate code, which computes no other lanes and gives the same bits. The call
-    has no derivatives, works on CPUs only, and uses the one core that runs the program.
+    lanes, and numbers without axes are the same for all lanes. The results form the same tree as
+    those of `result_shape_function`, which is fast to trace. The other arguments are as in
+    `compile_lane_program`. A single lane has separate code, which computes no other lanes and gives
+    the same bits. The call has no derivatives, works on CPUs only, and uses the one core that runs
+    the program.
     """
 
-    def call_machine_code(*arrays: Any) -> Any:
-        leaves, structure = jax.tree.flatten(arrays)
-        n_lanes = leaves[0].shape[-1]
-        for shape in (jnp.shape(x) for x in leaves):
-            if shape and shape[-1] != n_lanes:
+    def call_compiled_function(*argument_trees: Any) -> Any:
+        argument_leaves, argument_structure = jax.tree.flatten(argument_trees)
+        n_lanes = argument_leaves[0].shape[-1]
+        for argument_shape in (jnp.shape(x) for x in argument_leaves):
+            if argument_shape and argument_shape[-1] != n_lanes:
                 raise ValueError(
-                    f"An argument has the shape {shape}, but the first one has {n_lanes} lanes: "
-                    "give every array the same number on its last axis, or a number without axes."
+                    f"An argument has the shape {argument_shape}, but the first one has {n_lanes} "
+                    "lanes: give every array the same number on its last axis, or a number without "
+                    "axes."
                 )
-        group_width = LANES_PER_256_BITS[np.dtype(leaves[0].dtype)] * (
+        lanes_per_full_group = LANES_PER_256_BITS[np.dtype(argument_leaves[0].dtype)] * (
             2 if has_512_bit_vectors() else 1
         )
         # A single lane has separate code, because a full group would compute lanes that are not
         # needed.
-        lanes_per_group = 1 if n_lanes == 1 else group_width
+        lanes_per_group = 1 if n_lanes == 1 else lanes_per_full_group
         n_padding_lanes = -n_lanes % lanes_per_group
-        shapes = [
+        lane_argument_shapes = [
             jax.ShapeDtypeStruct(
                 (*x.shape[:-1], LANE_AXIS_SENTINEL) if jnp.ndim(x) else (), jnp.result_type(x)
             )
-            for x in leaves
+            for x in argument_leaves
         ]
-        flat_function = lambda *leaves: jax.tree.leaves(
-            function(*jax.tree.unflatten(structure, leaves))
+        flat_lane_function = lambda *argument_leaves: jax.tree.leaves(
+            lane_function(*jax.tree.unflatten(argument_structure, argument_leaves))
         )
         try:
-            code = get_machine_code(
-                flat_function, shapes, (key, str(structure)), lanes_per_group, store, limits
+            machine_code = get_machine_code(
+                flat_lane_function,
+                lane_argument_shapes,
+                (trace_key, str(argument_structure)),
+                lanes_per_group,
+                code_store,
+                register_limits,
             )
-        except Exception as error:
-            _require_untested_release(error)
-            return function(*arrays)
+        except Exception as compilation_error:
+            _reraise_on_tested_release(compilation_error)
+            return lane_function(*argument_trees)
         if n_padding_lanes:
-            pad_with_last = lambda x: jnp.concatenate(
+            pad_with_last_lane = lambda x: jnp.concatenate(
                 [x, jnp.repeat(x[..., -1:], n_padding_lanes, -1)], -1
             )
-            leaves = [pad_with_last(x) if jnp.ndim(x) else x for x in leaves]
+            argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
         padded_result_shapes = [
             jax.ShapeDtypeStruct((*leading_shape, n_lanes + n_padding_lanes), result_dtype)
-            for leading_shape, result_dtype in code.result_types
+            for leading_shape, result_dtype in machine_code.result_shapes_and_dtypes
         ]
-        results = MACHINE_CODE_PRIMITIVE.bind(
-            *leaves, code=code, result_shapes=tuple(padded_result_shapes)
+        padded_results = MACHINE_CODE_PRIMITIVE.bind(
+            *argument_leaves, code=machine_code, result_shapes=tuple(padded_result_shapes)
         )
-        result_structure = jax.tree.structure(jax.eval_shape(shape_function, *arrays))
-        return jax.tree.unflatten(result_structure, [x[..., :n_lanes] for x in results])
+        result_structure = jax.tree.structure(
+            jax.eval_shape(result_shape_function, *argument_trees)
+        )
+        return jax.tree.unflatten(result_structure, [x[..., :n_lanes] for x in padded_results])
 
-    return call_machine_code
+    return call_compiled_function
 
 
-def _require_untested_release(error: Exception) -> None:
+def _reraise_on_tested_release(compilation_error: Exception) -> None:
     """Raise the error on a tested release of JAX; on any other release, use XLA from now on."""
-    if fallback.is_tested_release():
-        raise error
-    fallback.disable(error)
+    if fallback.is_tested_jax_release():
+        raise compilation_error
+    fallback.disable_machine_code(compilation_error)
 
 
-def _compile_with_xla(function: Callable[..., tuple]) -> Callable[..., list[np.ndarray]]:
-    """Return `function(scalars, lanes)` of NumPy arrays, compiled by XLA."""
-    compiled = jax.jit(function)
-    return lambda scalars, lanes: [np.asarray(x) for x in compiled(tuple(scalars), tuple(lanes))]
-
-
-def ensure_loaded(names: Sequence[str], store: CodeStore | None) -> bool:
-    """Register the saved machine code of these names, and return whether all of it is available."""
-    for name in names:
-        code = None if name in LOADED_BY_NAME else load_machine_code(name, store)
-        if code is not None:
-            register_code(code)
-    return all(name in LOADED_BY_NAME for name in names)
-
-
-class _LaneProgram:
-    """Loaded machine code as a function of NumPy arrays."""
-
-    def __init__(self, code: MachineCode, group_width: int) -> None:
-        self.result_types, self.group_width = code.result_types, group_width
-        self._loaded_code = LoadedCode(code.wait_for_code())
-        pointer_type, count_type = ctypes.c_void_p, ctypes.c_int64
-        function_type = ctypes.CFUNCTYPE(
-            None, pointer_type, pointer_type, count_type, count_type, count_type
+def load_saved_machine_code(code_names: Sequence[str], code_store: CodeStore | None) -> bool:
+    """Register the saved machine code of these names, and return whether the code of every name is
+    available."""
+    for code_name in code_names:
+        machine_code = (
+            None if code_name in LOADED_CODE_BY_NAME else load_machine_code(code_name, code_store)
         )
-        self._run = function_type(self._loaded_code.find_address(KERNEL_NAME))
+        if machine_code is not None:
+            register_machine_code(machine_code)
+    return all(code_name in LOADED_CODE_BY_NAME for code_name in code_names)
 
-    def __call__(self, scalars: Sequence[Any], lanes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        n_lanes = len(lanes[0])
-        n_groups = -(-n_lanes // self.group_width)
-        padded_lanes = [_pad_lanes(x, n_groups * self.group_width) for x in lanes]
-        scalar_arrays = [np.asarray(x) for x in scalars]
-        results = [
-            np.empty((*shape, n_groups * self.group_width), result_dtype)
-            for shape, result_dtype in self.result_types
+
+class _LoadedLaneProgram:
+    """Loaded machine code that is called with NumPy arrays."""
+
+    def __init__(self, machine_code: MachineCode, lanes_per_group: int) -> None:
+        self.result_shapes_and_dtypes, self.lanes_per_group = (
+            machine_code.result_shapes_and_dtypes,
+            lanes_per_group,
+        )
+        self._loaded_code = LoadedMachineCode(machine_code.wait_for_object_code())
+        c_pointer_type, c_count_type = ctypes.c_void_p, ctypes.c_int64
+        c_function_type = ctypes.CFUNCTYPE(
+            None, c_pointer_type, c_pointer_type, c_count_type, c_count_type, c_count_type
+        )
+        self._run_lane_kernel = c_function_type(
+            self._loaded_code.find_function_address(LANE_KERNEL_NAME)
+        )
+
+    def __call__(
+        self, scalar_arguments: Sequence[Any], lane_arrays: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        n_lanes = len(lane_arrays[0])
+        n_groups = -(-n_lanes // self.lanes_per_group)
+        padded_lane_arrays = [
+            _pad_lane_array(x, n_groups * self.lanes_per_group) for x in lane_arrays
         ]
-        input_table = _pointer_table([*scalar_arrays, *padded_lanes])
-        output_table = _pointer_table(results)
-        n_padded_lanes = n_groups * self.group_width
-        run_groups = lambda first_group: self._run(
-            input_table,
-            output_table,
+        scalar_arrays = [np.asarray(x) for x in scalar_arguments]
+        padded_results = [
+            np.empty((*leading_shape, n_groups * self.lanes_per_group), result_dtype)
+            for leading_shape, result_dtype in self.result_shapes_and_dtypes
+        ]
+        input_pointer_table = _make_pointer_table([*scalar_arrays, *padded_lane_arrays])
+        output_pointer_table = _make_pointer_table(padded_results)
+        n_padded_lanes = n_groups * self.lanes_per_group
+        run_groups_of_task = lambda first_group: self._run_lane_kernel(
+            input_pointer_table,
+            output_pointer_table,
             n_padded_lanes,
             first_group,
             min(first_group + GROUPS_PER_TASK, n_groups),
         )
-        group_starts = range(0, n_groups, GROUPS_PER_TASK)
-        if len(group_starts) > 1 and _count_cores() > 1:
-            with ThreadPoolExecutor(_count_cores()) as pool:
-                list(pool.map(run_groups, group_starts))
+        first_groups_of_tasks = range(0, n_groups, GROUPS_PER_TASK)
+        if len(first_groups_of_tasks) > 1 and _count_available_cores() > 1:
+            with ThreadPoolExecutor(_count_available_cores()) as thread_pool:
+                list(thread_pool.map(run_groups_of_task, first_groups_of_tasks))
         else:
-            for first_group in group_starts:
-                run_groups(first_group)
-        return [x[..., :n_lanes] for x in results]
+            for first_group in first_groups_of_tasks:
+                run_groups_of_task(first_group)
+        return [x[..., :n_lanes] for x in padded_results]
 
 
-def _pad_lanes(x: np.ndarray, n_padded: int) -> np.ndarray:
-    """Return `x` as a contiguous array of `n_padded` numbers, padded with its last number."""
-    if len(x) == n_padded:
+def _pad_lane_array(x: np.ndarray, n_padded_lanes: int) -> np.ndarray:
+    """Return `x` as a contiguous array of `n_padded_lanes` numbers, padded with its last number."""
+    if len(x) == n_padded_lanes:
         return np.ascontiguousarray(x)
-    padded_array = np.full(n_padded, x[-1])
+    padded_array = np.full(n_padded_lanes, x[-1])
     padded_array[: len(x)] = x
     return padded_array
 
 
-def _pointer_table(arrays: Sequence[np.ndarray]) -> Any:
+def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
     """Return a C array of pointers to the arrays' data."""
-    return (ctypes.c_void_p * len(arrays))(*(x.ctypes.data for x in arrays))
+    return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
 
 
-def _count_cores() -> int:
+def _count_available_cores() -> int:
     """Return the number of cores available to the process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -9,138 +9,202 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.simd.arithmetic import emit_elementwise
+from vrw_jax.simd.arithmetic import emit_llvm_elementwise
 from vrw_jax.simd.array_emitter import (
     ArrayEmitter,
     PrimitiveCall,
+    get_shape_without_lanes,
     has_lanes,
-    lane_mixing_error,
-    make_array,
-    shape_without_lanes,
+    make_entry_array,
+    make_lane_mixing_error,
 )
-from vrw_jax.simd.lazy_arrays import ArrayValue, EntryIndex, LazyArray
+from vrw_jax.simd.lazy_arrays import EntryIndex, LazyArray, LlvmArray
 from vrw_jax.simd.llvm_library import ir
-from vrw_jax.simd.value_emitter import Value
+from vrw_jax.simd.value_emitter import LlvmValue
 
 
-def emit_cumsum(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
+def emit_cumulative_sum(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+) -> LlvmArray:
     """Return cumulative sums along an axis, from its start or, with `reverse`, from its end."""
-    if call.params["axis"] == len(array.shape):
-        raise lane_mixing_error(call.name)
-    terms = np.moveaxis(emitter.get_entries(array), call.params["axis"], 0)
-    dtype = call.out_aval.dtype
-    summation_order = range(len(terms))[:: -1 if call.params["reverse"] else 1]
-    add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
-    partial_sums = np.empty_like(terms)
+    if primitive_call.primitive_params["axis"] == len(array.shape):
+        raise make_lane_mixing_error(primitive_call.primitive_name)
+    summed_terms = np.moveaxis(
+        array_emitter.get_array_entries(array), primitive_call.primitive_params["axis"], 0
+    )
+    result_dtype = primitive_call.result_aval.dtype
+    summation_order = range(len(summed_terms))[
+        :: -1 if primitive_call.primitive_params["reverse"] else 1
+    ]
+    emit_sum = lambda x, y: emit_llvm_elementwise(
+        array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
+    )
+    partial_sums = np.empty_like(summed_terms)
     for position, i in enumerate(summation_order):
-        pairs = zip(
+        sum_and_term_pairs = zip(
             partial_sums[summation_order[position - 1], ...].ravel(),
-            terms[i, ...].ravel(),
+            summed_terms[i, ...].ravel(),
             strict=True,
         )
-        sums_at_index = [add_values(*pair) if position else pair[1] for pair in pairs]
-        partial_sums[i, ...] = make_array(terms.shape[1:], sums_at_index)
-    return np.moveaxis(partial_sums, 0, call.params["axis"])
+        partial_sum_entries = [
+            emit_sum(*sum_and_term) if position else sum_and_term[1]
+            for sum_and_term in sum_and_term_pairs
+        ]
+        partial_sums[i, ...] = make_entry_array(summed_terms.shape[1:], partial_sum_entries)
+    return np.moveaxis(partial_sums, 0, primitive_call.primitive_params["axis"])
 
 
-def emit_dot_general(
-    emitter: ArrayEmitter, call: PrimitiveCall, left: ArrayValue, right: ArrayValue
-) -> ArrayValue:
+def emit_array_product(
+    array_emitter: ArrayEmitter,
+    primitive_call: PrimitiveCall,
+    left_array: LlvmArray,
+    right_array: LlvmArray,
+) -> LlvmArray:
     """Return the product of two arrays, summed over one axis of each."""
-    (contracted_left, contracted_right), (batch_axes, _) = call.params["dimension_numbers"]
-    if batch_axes or len(contracted_left) != 1:
+    (contracted_left_axes, contracted_right_axes), (batch_axes, _) = (
+        primitive_call.primitive_params["dimension_numbers"]
+    )
+    if batch_axes or len(contracted_left_axes) != 1:
         raise NotImplementedError(
             "dot_general sums over one pair of axes only, without a batch: multiply and sum."
         )
-    (left_axis,), (right_axis,), dtype = contracted_left, contracted_right, call.out_aval.dtype
-    n_terms, n_left = left.shape[left_axis], len(left.shape) - 1
+    (left_axis,), (right_axis,), result_dtype = (
+        contracted_left_axes,
+        contracted_right_axes,
+        primitive_call.result_aval.dtype,
+    )
+    n_terms, n_left_axes = left_array.shape[left_axis], len(left_array.shape) - 1
 
-    def emit_term(index: EntryIndex, k: Any) -> Value:
-        left_index, right_index = index[:n_left], index[n_left:]
-        x = emitter.get_entry(left, (*left_index[:left_axis], k, *left_index[left_axis:]))
-        y = emitter.get_entry(right, (*right_index[:right_axis], k, *right_index[right_axis:]))
-        return emit_elementwise(emitter.emitter, "mul", {}, dtype, dtype, (x, y))
-
-    add_values = lambda x, y: emit_elementwise(emitter.emitter, "add", {}, dtype, dtype, (x, y))
-    shape, entry_type = shape_without_lanes(call.out_aval), emitter.entry_type_of(call.out_aval)
-    if n_terms <= emitter.limits.max_unrolled_terms or emitter.is_in_innermost_loop:
-        entry_at = lambda index: functools.reduce(
-            add_values, [emit_term(index, k) for k in range(n_terms)]
+    def emit_product_term(product_index: EntryIndex, k: Any) -> LlvmValue:
+        left_index, right_index = product_index[:n_left_axes], product_index[n_left_axes:]
+        x = array_emitter.get_array_entry(
+            left_array, (*left_index[:left_axis], k, *left_index[left_axis:])
         )
-        if isinstance(left, LazyArray) or isinstance(right, LazyArray):
-            return LazyArray(shape, entry_type, entry_at)
-        return make_array(shape, [entry_at(index) for index in np.ndindex(shape)])
-    left, right = emitter.materialize(left), emitter.materialize(right)
-    memory = emitter.allocate(shape, entry_type)
+        y = array_emitter.get_array_entry(
+            right_array, (*right_index[:right_axis], k, *right_index[right_axis:])
+        )
+        return emit_llvm_elementwise(
+            array_emitter.value_emitter, "mul", {}, result_dtype, result_dtype, (x, y)
+        )
 
-    def store_total(index: EntryIndex, _: Any) -> list[Value]:
-        add_term = lambda k, sums: [add_values(sums[0], emit_term(index, k))]
-        memory.store(
-            index, emitter.loop_n_times(n_terms, add_term, [emitter.make_zero(entry_type)])[0]
+    emit_sum = lambda x, y: emit_llvm_elementwise(
+        array_emitter.value_emitter, "add", {}, result_dtype, result_dtype, (x, y)
+    )
+    product_shape, entry_type = (
+        get_shape_without_lanes(primitive_call.result_aval),
+        array_emitter.get_entry_type(primitive_call.result_aval),
+    )
+    if (
+        n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
+        or array_emitter.is_in_innermost_loop
+    ):
+        emit_product_entry = lambda index: functools.reduce(
+            emit_sum, [emit_product_term(index, k) for k in range(n_terms)]
+        )
+        if isinstance(left_array, LazyArray) or isinstance(right_array, LazyArray):
+            return LazyArray(product_shape, entry_type, emit_product_entry)
+        return make_entry_array(
+            product_shape, [emit_product_entry(index) for index in np.ndindex(product_shape)]
+        )
+    left_array, right_array = (
+        array_emitter.store_in_memory(left_array),
+        array_emitter.store_in_memory(right_array),
+    )
+    product_memory = array_emitter.allocate_memory_array(product_shape, entry_type)
+
+    def store_product_entry(product_index: EntryIndex, _: Any) -> list[LlvmValue]:
+        add_term = lambda k, sums: [emit_sum(sums[0], emit_product_term(product_index, k))]
+        product_memory.emit_entry_store(
+            product_index,
+            array_emitter.emit_counted_loop(
+                n_terms, add_term, [array_emitter.make_llvm_zero(entry_type)]
+            )[0],
         )
         return []
 
-    emitter.loop_over_indices(shape, store_total)
-    return memory
+    array_emitter.emit_index_loops(product_shape, store_product_entry)
+    return product_memory
 
 
-def reduction_rule(name: str) -> Callable[..., ArrayValue]:
-    """Return the rule of a reduction by the elementwise primitive `name`, such as "add"."""
+def make_reduction_rule(combining_primitive: str) -> Callable[..., LlvmArray]:
+    """Return the rule of a reduction by an elementwise primitive such as "add"."""
 
-    def emit_reduction(emitter: ArrayEmitter, call: PrimitiveCall, array: ArrayValue) -> ArrayValue:
+    def emit_reduced_array(
+        array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
+    ) -> LlvmArray:
         """Reduce an array along axes, and return the result; only `any` and `all` also reduce over
         lanes.
         """
-        reduces_lanes = has_lanes(call.in_avals[0]) and not has_lanes(call.out_aval)
-        dtype = call.in_avals[0].dtype
-        if reduces_lanes and (name not in ("and", "or") or dtype.kind != "b"):
-            raise lane_mixing_error(call.name)
-        axes = tuple(axis for axis in call.params["axes"] if axis < len(array.shape))
-        combine = lambda x, y: emit_elementwise(emitter.emitter, name, {}, dtype, dtype, (x, y))
-        kept_lengths = [n for axis, n in enumerate(array.shape) if axis not in axes]
-        reduced_lengths = [array.shape[axis] for axis in axes]
+        reduces_over_lanes = has_lanes(primitive_call.operand_avals[0]) and not has_lanes(
+            primitive_call.result_aval
+        )
+        result_dtype = primitive_call.operand_avals[0].dtype
+        if reduces_over_lanes and (
+            combining_primitive not in ("and", "or") or result_dtype.kind != "b"
+        ):
+            raise make_lane_mixing_error(primitive_call.primitive_name)
+        reduced_axes = tuple(
+            axis for axis in primitive_call.primitive_params["axes"] if axis < len(array.shape)
+        )
+        emit_combination = lambda x, y: emit_llvm_elementwise(
+            array_emitter.value_emitter, combining_primitive, {}, result_dtype, result_dtype, (x, y)
+        )
+        kept_lengths = [n for axis, n in enumerate(array.shape) if axis not in reduced_axes]
+        reduced_lengths = [array.shape[axis] for axis in reduced_axes]
 
-        def combine_indices(kept_index: EntryIndex, reduced_index: EntryIndex) -> EntryIndex:
+        def merge_indices(kept_index: EntryIndex, reduced_index: EntryIndex) -> EntryIndex:
             inner_indices, outer_indices = iter(reduced_index), iter(kept_index)
             return tuple(
-                next(inner_indices if i in axes else outer_indices) for i in range(len(array.shape))
+                next(inner_indices if i in reduced_axes else outer_indices)
+                for i in range(len(array.shape))
             )
 
-        def reduce_entry(kept_index: EntryIndex) -> Value:
-            entry_at = lambda reduced_index: emitter.get_entry(
-                array, combine_indices(kept_index, reduced_index)
+        def emit_reduced_entry(kept_index: EntryIndex) -> LlvmValue:
+            get_term_at = lambda reduced_index: array_emitter.get_array_entry(
+                array, merge_indices(kept_index, reduced_index)
             )
             n_terms = math.prod(reduced_lengths)
-            if isinstance(array, np.ndarray) or n_terms <= emitter.limits.max_unrolled_terms:
-                return functools.reduce(combine, map(entry_at, np.ndindex(*reduced_lengths)))
+            if (
+                isinstance(array, np.ndarray)
+                or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
+            ):
+                return functools.reduce(
+                    emit_combination, map(get_term_at, np.ndindex(*reduced_lengths))
+                )
             # The first entry is counted twice, which changes no reduction except a sum.
-            initial_value = entry_at((0,) * len(reduced_lengths))
-            if name == "add":
-                initial_value = emitter.make_zero(array.entry_type)
+            initial_value = get_term_at((0,) * len(reduced_lengths))
+            if combining_primitive == "add":
+                initial_value = array_emitter.make_llvm_zero(array.entry_type)
             elif isinstance(array.entry_type, ir.VectorType):
-                initial_value = emitter.emitter.splat(initial_value)
-            return emitter.loop_over_indices(
+                initial_value = array_emitter.value_emitter.to_lane_vector(initial_value)
+            return array_emitter.emit_index_loops(
                 reduced_lengths,
-                lambda i, partial: [combine(partial[0], entry_at(i))],
+                lambda i, partial: [emit_combination(partial[0], get_term_at(i))],
                 [initial_value],
             )[0]
 
-        values = [reduce_entry(kept_index) for kept_index in np.ndindex(*kept_lengths)]
-        if reduces_lanes:
-            values = [_reduce_over_lanes(emitter, name, value) for value in values]
-        return make_array(tuple(kept_lengths), values)
+        reduced_entries = [
+            emit_reduced_entry(kept_index) for kept_index in np.ndindex(*kept_lengths)
+        ]
+        if reduces_over_lanes:
+            reduced_entries = [
+                _emit_any_or_all_lanes(array_emitter, combining_primitive, reduced_entry)
+                for reduced_entry in reduced_entries
+            ]
+        return make_entry_array(tuple(kept_lengths), reduced_entries)
 
-    return emit_reduction
+    return emit_reduced_array
 
 
-def _reduce_over_lanes(emitter: ArrayEmitter, name: str, value: Value) -> Value:
+def _emit_any_or_all_lanes(
+    array_emitter: ArrayEmitter, combining_primitive: str, lane_flags: LlvmValue
+) -> LlvmValue:
     """Emit the test whether any ("or") or all ("and") lanes of a group are true, and return its
-    truth value.
-    """
-    builder = emitter.builder
-    if not isinstance(value.type, ir.VectorType):
-        return value
-    lane_bits = builder.bitcast(value, ir.IntType(emitter.emitter.width))
-    if name == "or":
+    truth value."""
+    builder = array_emitter.builder
+    if not isinstance(lane_flags.type, ir.VectorType):
+        return lane_flags
+    lane_bits = builder.bitcast(lane_flags, ir.IntType(array_emitter.value_emitter.n_vector_lanes))
+    if combining_primitive == "or":
         return builder.icmp_unsigned("!=", lane_bits, ir.Constant(lane_bits.type, 0))
     return builder.icmp_unsigned("==", lane_bits, ir.Constant(lane_bits.type, -1))

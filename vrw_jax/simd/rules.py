@@ -12,92 +12,119 @@ from vrw_jax.simd import reductions as sums
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.simd.array_emitter import (
     PrimitiveCall,
+    get_llvm_number_type,
     has_lanes,
-    lane_axis_error,
-    lane_mixing_error,
-    number_type,
+    make_lane_axis_error,
+    make_lane_mixing_error,
 )
-from vrw_jax.simd.lazy_arrays import ArrayValue, LazyArray
-from vrw_jax.simd.lowering import JAXPR_PARAMETERS, JaxprLowering, PrimitiveRule, call_rule
+from vrw_jax.simd.lazy_arrays import LazyArray, LlvmArray
+from vrw_jax.simd.lowering import (
+    CALLED_JAXPR_PARAMETERS,
+    JaxprLowering,
+    PrimitiveRule,
+    make_call_rule,
+)
 
 
-def _single_result_rule(emit: Callable[..., ArrayValue]) -> PrimitiveRule:
+def _make_single_result_rule(emit_single_result: Callable[..., LlvmArray]) -> PrimitiveRule:
     """Return a rule of a primitive with one result from a function `emit(emitter, call,
     *values)`.
     """
 
-    def emit_result(
-        lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
-    ) -> list[ArrayValue]:
-        name, out_aval = equation.primitive.name, equation.outvars[0].aval
-        in_avals = [atom.aval for atom in equation.invars]
-        result_has_lanes, operand_has_lanes = has_lanes(out_aval), any(map(has_lanes, in_avals))
-        if operand_has_lanes and not result_has_lanes and name not in ("reduce_and", "reduce_or"):
-            raise lane_mixing_error(name)
-        if result_has_lanes and not operand_has_lanes and name not in ("broadcast_in_dim", "empty"):
-            raise lane_axis_error(f"The result of {name}", out_aval)
-        number_type(out_aval)  # This call raises an error for unsupported number types.
-        result = emit(
-            lowering.emitter, PrimitiveCall(name, equation.params, in_avals, out_aval), *values
+    def emit_checked_result(
+        jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+    ) -> list[LlvmArray]:
+        primitive_name, result_aval = equation.primitive.name, equation.outvars[0].aval
+        operand_avals = [atom.aval for atom in equation.invars]
+        result_has_lanes, operand_has_lanes = (
+            has_lanes(result_aval),
+            any(map(has_lanes, operand_avals)),
         )
         if (
-            isinstance(result, LazyArray)
-            and math.prod(result.shape) <= lowering.emitter.limits.max_unrolled
+            operand_has_lanes
+            and not result_has_lanes
+            and primitive_name not in ("reduce_and", "reduce_or")
         ):
-            result = lowering.emitter.get_entries(result)
-        return [result]
+            raise make_lane_mixing_error(primitive_name)
+        if (
+            result_has_lanes
+            and not operand_has_lanes
+            and primitive_name not in ("broadcast_in_dim", "empty")
+        ):
+            raise make_lane_axis_error(f"The result of {primitive_name}", result_aval)
+        get_llvm_number_type(result_aval)  # This call raises an error for unsupported number types.
+        result_array = emit_single_result(
+            jaxpr_lowering.array_emitter,
+            PrimitiveCall(primitive_name, equation.params, operand_avals, result_aval),
+            *operands,
+        )
+        if (
+            isinstance(result_array, LazyArray)
+            and math.prod(result_array.shape)
+            <= jaxpr_lowering.array_emitter.register_limits.max_unrolled_entries
+        ):
+            result_array = jaxpr_lowering.array_emitter.get_array_entries(result_array)
+        return [result_array]
 
-    emit_result.__doc__ = emit.__doc__
-    return emit_result
+    emit_checked_result.__doc__ = emit_single_result.__doc__
+    return emit_checked_result
 
 
-def _emit_elementwise_call(emitter: Any, call: PrimitiveCall, *values: ArrayValue) -> ArrayValue:
+def _emit_elementwise_result(
+    array_emitter: Any, primitive_call: PrimitiveCall, *operands: LlvmArray
+) -> LlvmArray:
     """Return the primitive applied to each entry."""
-    return emitter.emit_elementwise(call, values)
+    return array_emitter.emit_elementwise_array(primitive_call, operands)
 
 
-def _emit_barrier(
-    lowering: JaxprLowering, equation: Any, values: list[ArrayValue]
-) -> list[ArrayValue]:
+def _emit_optimization_barrier(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
     """Return the arrays, of which large lazy ones are computed and stored in memory at this
     point.
     """
-    return [lowering.emitter.materialize(x) if isinstance(x, LazyArray) else x for x in values]
+    return [
+        jaxpr_lowering.array_emitter.store_in_memory(x) if isinstance(x, LazyArray) else x
+        for x in operands
+    ]
 
 
 PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
-    **{name: _single_result_rule(_emit_elementwise_call) for name in ELEMENTWISE_RULES},
-    "broadcast_in_dim": _single_result_rule(movement.emit_broadcast),
-    "concatenate": _single_result_rule(movement.emit_concatenate),
-    "dynamic_slice": _single_result_rule(movement.emit_dynamic_slice),
-    "dynamic_update_slice": _single_result_rule(movement.emit_dynamic_update),
-    "empty": _single_result_rule(movement.emit_empty),
-    "expand_dims": _single_result_rule(movement.emit_reshape),
-    "iota": _single_result_rule(movement.emit_iota),
-    "pad": _single_result_rule(movement.emit_pad),
-    "reshape": _single_result_rule(movement.emit_reshape),
-    "slice": _single_result_rule(movement.emit_slice),
-    "squeeze": _single_result_rule(movement.emit_reshape),
-    "stack": _single_result_rule(movement.emit_stack),
-    "unstack": movement.emit_unstack,
-    "transpose": _single_result_rule(movement.emit_transpose),
-    "cumsum": _single_result_rule(sums.emit_cumsum),
-    "dot_general": _single_result_rule(sums.emit_dot_general),
-    "reduce_and": _single_result_rule(sums.reduction_rule("and")),
-    "reduce_max": _single_result_rule(sums.reduction_rule("max")),
-    "reduce_min": _single_result_rule(sums.reduction_rule("min")),
-    "reduce_or": _single_result_rule(sums.reduction_rule("or")),
-    "reduce_sum": _single_result_rule(sums.reduction_rule("add")),
-    **{name: call_rule(parameter) for name, parameter in JAXPR_PARAMETERS.items()},
-    "optimization_barrier": _emit_barrier,
-    "scan": loops.emit_scan,
-    "while": loops.emit_while,
+    **{name: _make_single_result_rule(_emit_elementwise_result) for name in ELEMENTWISE_RULES},
+    "broadcast_in_dim": _make_single_result_rule(movement.emit_broadcast_array),
+    "concatenate": _make_single_result_rule(movement.emit_concatenated_array),
+    "dynamic_slice": _make_single_result_rule(movement.emit_dynamic_slice),
+    "dynamic_update_slice": _make_single_result_rule(movement.emit_dynamic_slice_update),
+    "empty": _make_single_result_rule(movement.emit_uninitialized_array),
+    "expand_dims": _make_single_result_rule(movement.emit_reshaped_array),
+    "iota": _make_single_result_rule(movement.emit_index_array),
+    "pad": _make_single_result_rule(movement.emit_padded_array),
+    "reshape": _make_single_result_rule(movement.emit_reshaped_array),
+    "slice": _make_single_result_rule(movement.emit_static_slice),
+    "squeeze": _make_single_result_rule(movement.emit_reshaped_array),
+    "stack": _make_single_result_rule(movement.emit_stacked_array),
+    "unstack": movement.emit_unstacked_arrays,
+    "transpose": _make_single_result_rule(movement.emit_transposed_array),
+    "cumsum": _make_single_result_rule(sums.emit_cumulative_sum),
+    "dot_general": _make_single_result_rule(sums.emit_array_product),
+    "reduce_and": _make_single_result_rule(sums.make_reduction_rule("and")),
+    "reduce_max": _make_single_result_rule(sums.make_reduction_rule("max")),
+    "reduce_min": _make_single_result_rule(sums.make_reduction_rule("min")),
+    "reduce_or": _make_single_result_rule(sums.make_reduction_rule("or")),
+    "reduce_sum": _make_single_result_rule(sums.make_reduction_rule("add")),
+    **{name: make_call_rule(parameter) for name, parameter in CALLED_JAXPR_PARAMETERS.items()},
+    "optimization_barrier": _emit_optimization_barrier,
+    "scan": loops.emit_scan_loop,
+    "while": loops.emit_while_loop,
 }
 
 
-def list_primitives() -> dict[str, str]:
+def describe_supported_primitives() -> dict[str, str]:
     """Return, for each JAX primitive that has machine code, the first paragraph of its rule's
     docstring.
     """
-    first_paragraph = lambda text: " ".join(text.partition("\n\n")[0].split())
-    return {name: first_paragraph(rule.__doc__ or "") for name, rule in PRIMITIVE_RULES.items()}
+    get_first_paragraph = lambda text: " ".join(text.partition("\n\n")[0].split())
+    return {
+        primitive_name: get_first_paragraph(primitive_rule.__doc__ or "")
+        for primitive_name, primitive_rule in PRIMITIVE_RULES.items()
+    }

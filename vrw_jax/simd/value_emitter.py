@@ -9,11 +9,11 @@ from typing import Any
 
 from vrw_jax.simd.llvm_library import ir
 
-Value = Any
+LlvmValue = Any
 """An LLVM value: a scalar, or a vector with one entry per lane."""
 
 I1, I8, I32, I64 = (ir.IntType(bits) for bits in (1, 8, 32, 64))
-NUMBER_TYPES = {
+LLVM_NUMBER_TYPES = {
     "bool": I1,
     "int32": I32,
     "int64": I64,
@@ -22,17 +22,17 @@ NUMBER_TYPES = {
 }
 
 
-class BinaryInstruction:
-    """An LLVM instruction on two values of one type.
+class LlvmBinaryInstruction:
+    """An LLVM instruction with two operands of one type.
 
-    Most of a program consists of these. llvmlite's own instructions take six times as long to
-    create and to write, because they can be changed later.
+    Most of a program consists of such instructions. llvmlite's instructions can be changed later,
+    so they take six times as long to create and to write as these.
     """
 
     __slots__ = ("name", "text", "type")
 
-    def __init__(self, name: str, llvm_type: ir.Type, text: str) -> None:
-        self.name, self.type, self.text = name, llvm_type, text
+    def __init__(self, result_name: str, llvm_type: ir.Type, instruction_text: str) -> None:
+        self.name, self.type, self.text = result_name, llvm_type, instruction_text
 
     def get_reference(self) -> str:
         """Return the name by which other instructions refer to the result."""
@@ -42,7 +42,7 @@ class BinaryInstruction:
         return self.text
 
 
-class _SplatConstant(ir.Constant):
+class _LlvmSplatConstant(ir.Constant):
     """An LLVM constant that is the same for all lanes, written once in LLVM's text."""
 
     def _get_reference(self) -> str:
@@ -50,116 +50,135 @@ class _SplatConstant(ir.Constant):
 
 
 class ValueEmitter:
-    """Emitter of LLVM values into the function of `builder`; a vector has `width` lanes."""
+    """Emitter of LLVM values into the function of `builder`; a vector has `n_vector_lanes`
+    lanes.
+    """
 
-    def __init__(self, builder: ir.IRBuilder, width: int) -> None:
-        self.builder, self.width = builder, width
+    def __init__(self, builder: ir.IRBuilder, n_vector_lanes: int) -> None:
+        self.builder, self.n_vector_lanes = builder, n_vector_lanes
         # Values computed so far, by operation and operands, because traces contain many
         # repetitions.
-        self.known_values: dict[tuple, Any] = {}
-        self.recent_keys: list[
+        self.emitted_values: dict[tuple, Any] = {}
+        self.recent_value_keys: list[
             tuple
         ] = []  # Keys of the values emitted within the present inner context.
-        self.n_operations = 0
-        self.constants: dict[tuple[str, str], ir.Constant] = {}
+        self.n_emitted_instructions = 0
+        self.llvm_constants: dict[tuple[str, str], ir.Constant] = {}
 
-    def vector_type(self, number: ir.Type) -> ir.VectorType:
-        """Return the LLVM type of a vector with one number of type `number` per lane."""
-        return ir.VectorType(number, self.width)
+    def make_vector_type(self, llvm_number_type: ir.Type) -> ir.VectorType:
+        """Return the LLVM type of a vector with one number of type `llvm_number_type` per lane."""
+        return ir.VectorType(llvm_number_type, self.n_vector_lanes)
 
-    def constant(self, llvm_type: ir.Type, value: Any) -> ir.Constant:
-        """Return the LLVM constant `value` of this type, the same for all lanes."""
+    def make_llvm_constant(self, llvm_type: ir.Type, constant_value: Any) -> ir.Constant:
+        """Return an LLVM constant of the given type, the same for all lanes."""
         if isinstance(llvm_type, ir.VectorType):
-            return self.splat(self.constant(llvm_type.element, value))
-        number = int(value) if isinstance(llvm_type, ir.IntType) else float(value)
-        return self.constants.setdefault(
-            (str(llvm_type), repr(number)), ir.Constant(llvm_type, number)
+            return self.to_lane_vector(self.make_llvm_constant(llvm_type.element, constant_value))
+        python_number = (
+            int(constant_value) if isinstance(llvm_type, ir.IntType) else float(constant_value)
+        )
+        return self.llvm_constants.setdefault(
+            (str(llvm_type), repr(python_number)), ir.Constant(llvm_type, python_number)
         )
 
-    def splat(self, value: Value) -> Value:
-        """Return a scalar as a vector whose entries all equal it; a vector is returned
-        unchanged.
-        """
-        if isinstance(value.type, ir.VectorType):
-            return value
-        scalar_type = self.vector_type(value.type)
-        if isinstance(value, ir.Constant):
-            key = (str(scalar_type), str(value))
-            if key not in self.constants:
-                self.constants[key] = _SplatConstant(scalar_type, [value] * scalar_type.count)
-            return self.constants[key]
-        return self.emit_once(("spread", id(value)), lambda: self._emit_splat(value, scalar_type))
+    def to_lane_vector(self, scalar_value: LlvmValue) -> LlvmValue:
+        """Return a scalar as a vector whose entries all equal the scalar. A vector is returned
+        unchanged."""
+        if isinstance(scalar_value.type, ir.VectorType):
+            return scalar_value
+        llvm_vector_type = self.make_vector_type(scalar_value.type)
+        if isinstance(scalar_value, ir.Constant):
+            constant_key = (str(llvm_vector_type), str(scalar_value))
+            if constant_key not in self.llvm_constants:
+                self.llvm_constants[constant_key] = _LlvmSplatConstant(
+                    llvm_vector_type, [scalar_value] * llvm_vector_type.count
+                )
+            return self.llvm_constants[constant_key]
 
-    def _emit_splat(self, value: Value, scalar_type: ir.VectorType) -> Value:
-        """Emit a vector whose entries equal a scalar, and return it."""
-        undefined_vector = ir.Constant(scalar_type, ir.Undefined)
-        first_lane_set = self.builder.insert_element(undefined_vector, value, ir.Constant(I32, 0))
-        lane_order = ir.Constant(ir.VectorType(I32, scalar_type.count), [0] * scalar_type.count)
-        return self.builder.shuffle_vector(first_lane_set, undefined_vector, lane_order)
+        def emit_equal_lanes() -> LlvmValue:
+            undefined_vector = ir.Constant(llvm_vector_type, ir.Undefined)
+            vector_with_first_lane = self.builder.insert_element(
+                undefined_vector, scalar_value, ir.Constant(I32, 0)
+            )
+            zero_lane_order = ir.Constant(
+                ir.VectorType(I32, llvm_vector_type.count), [0] * llvm_vector_type.count
+            )
+            return self.builder.shuffle_vector(
+                vector_with_first_lane, undefined_vector, zero_lane_order
+            )
 
-    def emit_once(self, key: tuple, create_value: Callable[[], Any]) -> Any:
-        """Return the value stored under this key; on the first call `create_value` creates it.
+        return self.emit_value_once(("spread", id(scalar_value)), emit_equal_lanes)
+
+    def emit_value_once(self, value_key: tuple, create_llvm_value: Callable[[], Any]) -> Any:
+        """Return the value stored under `value_key`. On the first call `create_llvm_value` creates
+        the value.
 
         An object that a key identifies by `id` must live as long as this emitter.
         """
-        if key not in self.known_values:
-            self.known_values[key] = create_value()
-            self.recent_keys.append(key)
-        return self.known_values[key]
+        if value_key not in self.emitted_values:
+            self.emitted_values[value_key] = create_llvm_value()
+            self.recent_value_keys.append(value_key)
+        return self.emitted_values[value_key]
 
-    def emit_binary(self, opcode: str, x: Value, y: Value) -> BinaryInstruction:
-        """Emit an instruction on two values of the same type, and return its result, which has that
+    def emit_binary_instruction(
+        self, llvm_opcode: str, x: LlvmValue, y: LlvmValue
+    ) -> LlvmBinaryInstruction:
+        """Emit an instruction on two values of the same type, and return its result of that
         type.
         """
-        self.n_operations += 1
-        name, llvm_type = f"%o{self.n_operations}", x.type
-        text = f"{name} = {opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}"
-        instruction = BinaryInstruction(name, llvm_type, text)
+        self.n_emitted_instructions += 1
+        result_name, llvm_type = f"%o{self.n_emitted_instructions}", x.type
+        instruction_text = (
+            f"{result_name} = {llvm_opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}"
+        )
+        instruction = LlvmBinaryInstruction(result_name, llvm_type, instruction_text)
         self.builder._insert(instruction)
         return instruction
 
-    def to_same_shape(self, *values: Value) -> list[Value]:
+    def to_scalars_or_vectors(self, *llvm_values: LlvmValue) -> list[LlvmValue]:
         """Return the values as vectors if one of them is a vector, else unchanged."""
-        if any(isinstance(value.type, ir.VectorType) for value in values):
-            return [self.splat(value) for value in values]
-        return list(values)
+        if any(isinstance(llvm_value.type, ir.VectorType) for llvm_value in llvm_values):
+            return [self.to_lane_vector(llvm_value) for llvm_value in llvm_values]
+        return list(llvm_values)
 
     @contextlib.contextmanager
     def discard_inner_values(self) -> Iterator[None]:
-        """Return a context at whose end the values computed within it are discarded."""
-        outer_keys, self.recent_keys = self.recent_keys, []
+        """Return a context. At its end, the values computed within the context are discarded."""
+        outer_keys, self.recent_value_keys = self.recent_value_keys, []
         yield
-        for key in self.recent_keys:
-            del self.known_values[key]
-        self.recent_keys = outer_keys
+        for key in self.recent_value_keys:
+            del self.emitted_values[key]
+        self.recent_value_keys = outer_keys
 
-    def emit_loop(
+    def emit_llvm_loop(
         self,
-        initial_values: Sequence[Value],
-        emit_condition: Callable[[list[Value]], Value],
-        emit_body: Callable[[list[Value]], Sequence[Value]],
-    ) -> list[Value]:
-        """Emit a loop, `while emit_condition(values): values = emit_body(values)`, and return the
-        last values.
-        """
-        builder, entry_block = self.builder, self.builder.block
-        head_block, body_block, exit_block = (
+        initial_values: Sequence[LlvmValue],
+        emit_loop_condition: Callable[[list[LlvmValue]], LlvmValue],
+        emit_loop_body: Callable[[list[LlvmValue]], Sequence[LlvmValue]],
+    ) -> list[LlvmValue]:
+        """Emit the loop `while emit_loop_condition(values): values = emit_loop_body(values)`, and
+        return the last values."""
+        builder, entry_basic_block = self.builder, self.builder.block
+        head_basic_block, body_basic_block, exit_basic_block = (
             builder.append_basic_block(name) for name in ("head", "body", "after")
         )
-        builder.branch(head_block)
-        builder.position_at_end(head_block)
-        values: list[Value] = []
-        for value in initial_values:
-            phi = builder.phi(value.type)
-            phi.add_incoming(value, entry_block)
-            values.append(phi)
+        builder.branch(head_basic_block)
+        builder.position_at_end(head_basic_block)
+        loop_values: list[LlvmValue] = []
+        for initial_value in initial_values:
+            phi_instruction = builder.phi(initial_value.type)
+            phi_instruction.add_incoming(initial_value, entry_basic_block)
+            loop_values.append(phi_instruction)
         with self.discard_inner_values():
-            builder.cbranch(emit_condition(values), body_block, exit_block)
-            builder.position_at_end(body_block)
-            new_values = emit_body(values)
-            for phi, value in zip(values, new_values, strict=True):
-                new_value = self.splat(value) if isinstance(phi.type, ir.VectorType) else value
-                phi.add_incoming(new_value, builder.block)
-            builder.branch(head_block)
-        builder.position_at_end(exit_block)
-        return values
+            builder.cbranch(emit_loop_condition(loop_values), body_basic_block, exit_basic_block)
+            builder.position_at_end(body_basic_block)
+            next_values = emit_loop_body(loop_values)
+            for phi_instruction, initial_value in zip(loop_values, next_values, strict=True):
+                next_value = (
+                    self.to_lane_vector(initial_value)
+                    if isinstance(phi_instruction.type, ir.VectorType)
+                    else initial_value
+                )
+                phi_instruction.add_incoming(next_value, builder.block)
+            builder.branch(head_basic_block)
+        builder.position_at_end(exit_basic_block)
+        return loop_values

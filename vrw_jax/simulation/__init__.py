@@ -1,19 +1,19 @@
 """Simulation of one step, a walk, a trajectory, attractors and basins."""
 
 from vrw_jax.simulation.basins import (
-    POST_LANDING_NAMES,
-    PRE_TOUCHDOWN_NAMES,
+    POST_LANDING_COMPONENT_NAMES,
+    PRE_TOUCHDOWN_COMPONENT_NAMES,
     basin,
-    invert_landing,
+    invert_landing_map,
 )
-from vrw_jax.simulation.force_peaks import SAMPLED_PEAK_MEASURES, force_peaks
+from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_peaks
 from vrw_jax.simulation.stepping import (
     ModelLike,
     Walk,
     check_model,
-    check_options,
     check_section_state,
     check_single_wheel,
+    check_step_options,
     choose_model,
     paper_start,
     return_map,

@@ -1,6 +1,6 @@
 """Attractors: many starts, each walked until its motion is periodic or the wheel falls.
 
-Starts may belong to different wheels. Starts without a result after a round are gathered for the
+Starts may belong to different wheels. Starts that are undecided after a round are gathered for the
 next round, so that long transients cost little.
 """
 
@@ -29,7 +29,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 @dataclass(frozen=True)
 class AttractorOptions:
-    """Options of the tests for periodic walks. Distances are those between section states."""
+    """Options of the tests for periodic walks. All distances are between section states."""
 
     n_steps_per_round: int = 10
     """Number of steps between two tests for periodic motion."""
@@ -43,198 +43,213 @@ class AttractorOptions:
     The value is chosen because it is far above the periodicity tolerance."""
 
 
-ATTRACTOR_OPTIONS = AttractorOptions()
+DEFAULT_ATTRACTOR_OPTIONS = AttractorOptions()
 
 
-class WalkEnds(NamedTuple):
-    """Ends of walks, as numpy arrays with a leading axis over starts."""
+class PeriodicWalkEnds(NamedTuple):
+    """Ends of walks, as NumPy arrays with a leading axis over starts."""
 
     outcome: np.ndarray  # STEPPED if the wheel still walks
     period: np.ndarray  # period of the orbit, in steps; 0 if not periodic
-    n_steps: np.ndarray  # number of steps until the orbit, or until the fall
+    n_steps_to_orbit: np.ndarray  # number of steps until the orbit, or until the fall
     orbit_states: np.ndarray
     """Section states of the orbit, (start, max_period, m): the state with the lowest dtheta- first,
     NaN after the last."""
 
 
 @eqx.filter_jit
-def _walk_block(
+def _walk_round_of_block(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
-    """Return section states and outcomes of one round of steps from a block of starts, (starts,
-    steps, ...).
-    """
-    walk_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
-    walks = jax.vmap(walk_round)(params, x)
-    return walks.steps.section_state, walks.steps.outcome
+    """Return section states and outcomes of one round of steps from a block of starts, shape
+    (starts, steps, ...)."""
+    walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
+    batch_walks = jax.vmap(walk_one_round)(params, x)
+    return batch_walks.steps.section_state, batch_walks.steps.outcome
 
 
-def _walk_round_batched(
+def _walk_round_with_contact(
     model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the results of `_walk_block` with unilateral contact for any number of starts.
+    """Return section states and outcomes of one round of steps with unilateral contact, shape
+    (starts, steps, ...).
 
-    The batch kernel takes the steps.
+    The batch kernel takes the steps, for any number of starts.
     """
-    n, input_columns = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
-    x = embed_section_states(input_columns, np.asarray(x), n)
-    section_states, outcomes = list[np.ndarray](), list[np.ndarray]()
+    n_legs, parameter_rows = params.n_legs, np.asarray(jax.vmap(model.parameter_values)(params)).T
+    x = embed_section_states(parameter_rows, np.asarray(x), n_legs)
+    states_by_step, outcomes_by_step = list[np.ndarray](), list[np.ndarray]()
     for _ in range(n_steps):
-        x, _, outcome, *_ = walk_batch(input_columns, x, 1, model, options, n)
+        x, _, step_outcomes, *_ = walk_batch(parameter_rows, x, 1, model, options, n_legs)
         # A wheel that fell has no section state, so its outcome is kept.
-        outcome = outcome if not outcomes else np.where(outcomes[-1] > 0, outcomes[-1], outcome)
-        section_states.append(x)
-        outcomes.append(outcome)
-    return np.stack(section_states, 1), np.stack(outcomes, 1)
+        step_outcomes = (
+            step_outcomes
+            if not outcomes_by_step
+            else np.where(outcomes_by_step[-1] > 0, outcomes_by_step[-1], step_outcomes)
+        )
+        states_by_step.append(x)
+        outcomes_by_step.append(step_outcomes)
+    return np.stack(states_by_step, 1), np.stack(outcomes_by_step, 1)
 
 
 def walk_until_periodic(
     params: WheelParams,
-    starts: np.ndarray,
+    start_states: np.ndarray,
     model: AbstractWheel,
     options: StepOptions,
     max_steps: int,
     max_period: int,
-    attractor_options: AttractorOptions = ATTRACTOR_OPTIONS,
-) -> WalkEnds:
-    """Return the end of each walk.
+    attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS,
+) -> PeriodicWalkEnds:
+    """Return the end of the walk from each start.
 
-    - `params`: one wheel, or wheels on the leading axis of the starts;
-    - `starts`: section states, (starts, m);
+    - `params`: one wheel, or one wheel per start on the leading axis;
+    - `start_states`: section states, (starts, m);
     - `max_period`: longest period that is detected, in steps.
     """
-    n = len(starts)
-    broadcast_to_starts = lambda x: np.broadcast_to(np.asarray(x), n)
-    wheels_by_start = jax.tree.map(broadcast_to_starts, params)
+    n_starts = len(start_states)
+    repeat_over_starts = lambda x: np.broadcast_to(np.asarray(x), n_starts)
+    repeated_wheels = jax.tree.map(repeat_over_starts, params)
     n_round_steps = attractor_options.n_steps_per_round
     n_rounds = -(-max_steps // n_round_steps)
-    history = np.full((n, 1 + n_rounds * n_round_steps, starts.shape[1]), np.nan)
-    history[:, 0] = starts
-    outcome = np.full(n, int(Outcome.STEPPED))
-    period, n_steps_to_orbit = np.zeros(n, int), np.zeros(n, int)
-    unsettled_indices = np.arange(n)
-    walk_round: Callable[..., tuple]
+    state_history = np.full((n_starts, 1 + n_rounds * n_round_steps, start_states.shape[1]), np.nan)
+    state_history[:, 0] = start_states
+    walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
+    orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
+    unsettled_walks = np.arange(n_starts)
+    walk_one_round: Callable[..., tuple]
     if model.batch_kernel == "legs":
-        walk_round = functools.partial(_walk_round_batched, model, options, n_round_steps)
+        walk_one_round = functools.partial(_walk_round_with_contact, model, options, n_round_steps)
     else:
-        walk_block = functools.partial(_walk_block, model, options, n_round_steps)
-        walk_round = functools.partial(
-            map_in_batches, walk_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
+        walk_round_of_block = functools.partial(_walk_round_of_block, model, options, n_round_steps)
+        walk_one_round = functools.partial(
+            map_in_batches, walk_round_of_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,)
         )
     for k in range(n_rounds):
         round_slice = slice(1 + k * n_round_steps, 1 + (k + 1) * n_round_steps)
         round_arguments = (
-            take_rows(wheels_by_start, unsettled_indices),
-            history[unsettled_indices, k * n_round_steps],
+            take_rows(repeated_wheels, unsettled_walks),
+            state_history[unsettled_walks, k * n_round_steps],
         )
-        round_states, step_outcomes = map(np.asarray, walk_round(*round_arguments))
-        history[unsettled_indices, round_slice], outcome[unsettled_indices] = (
+        round_states, step_outcomes = map(np.asarray, walk_one_round(*round_arguments))
+        state_history[unsettled_walks, round_slice], walk_outcomes[unsettled_walks] = (
             round_states,
             step_outcomes[:, -1],
         )
-        n_steps_to_orbit[unsettled_indices] = k * n_round_steps + np.sum(
+        n_steps_to_orbit[unsettled_walks] = k * n_round_steps + np.sum(
             step_outcomes == Outcome.STEPPED, 1
         )
         n_known_steps = (k + 1) * n_round_steps
-        period[unsettled_indices] = _detect_periods(
-            history[unsettled_indices, : n_known_steps + 1],
+        orbit_periods[unsettled_walks] = _detect_walk_periods(
+            state_history[unsettled_walks, : n_known_steps + 1],
             max_period,
             attractor_options.periodicity_tolerance,
         )
-        period[outcome != Outcome.STEPPED] = 0
-        unsettled_indices = unsettled_indices[
-            (outcome[unsettled_indices] == Outcome.STEPPED) & (period[unsettled_indices] == 0)
+        orbit_periods[walk_outcomes != Outcome.STEPPED] = 0
+        unsettled_walks = unsettled_walks[
+            (walk_outcomes[unsettled_walks] == Outcome.STEPPED)
+            & (orbit_periods[unsettled_walks] == 0)
         ]
-        if not len(unsettled_indices):
+        if not len(unsettled_walks):
             break
-    orbit_states = np.full((n, max_period, starts.shape[1]), np.nan)
-    for i in np.flatnonzero(period):
-        last_states = history[i, n_steps_to_orbit[i] + 1 - period[i] : n_steps_to_orbit[i] + 1]
-        orbit_states[i, : period[i]] = np.roll(
-            last_states, -int(np.argmin(last_states[:, 1])), axis=0
+    orbit_states = np.full((n_starts, max_period, start_states.shape[1]), np.nan)
+    for i in np.flatnonzero(orbit_periods):
+        last_period_states = state_history[
+            i, n_steps_to_orbit[i] + 1 - orbit_periods[i] : n_steps_to_orbit[i] + 1
+        ]
+        orbit_states[i, : orbit_periods[i]] = np.roll(
+            last_period_states, -int(np.argmin(last_period_states[:, 1])), axis=0
         )
-        distances = np.linalg.norm(
-            history[i, : n_steps_to_orbit[i] + 1, None] - last_states[None], axis=-1
+        orbit_distances = np.linalg.norm(
+            state_history[i, : n_steps_to_orbit[i] + 1, None] - last_period_states[None], axis=-1
         ).min(1)
-        distant_steps = np.flatnonzero(distances > attractor_options.arrival_distance)
+        distant_steps = np.flatnonzero(orbit_distances > attractor_options.arrival_distance)
         n_steps_to_orbit[i] = distant_steps[-1] + 1 if len(distant_steps) else 0
-    return WalkEnds(outcome, period, n_steps_to_orbit, orbit_states)
+    return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
 
 
-def _detect_periods(history: np.ndarray, max_period: int, tolerance: float) -> np.ndarray:
-    """Return the shortest period, in steps, that the last two periods confirm; 0 without one.
+def _detect_walk_periods(
+    state_history: np.ndarray, max_period: int, periodicity_tolerance: float
+) -> np.ndarray:
+    """Return the shortest period of each walk, in steps, that its last two periods confirm; 0 if
+    there is none.
 
-    - `history`: section states, (starts, steps, m).
+    - `state_history`: section states, (starts, steps, m).
     """
-    periods = np.zeros(len(history), int)
-    n_states = history.shape[1]
-    for period in range(min(max_period, (n_states - 1) // 3), 0, -1):
-        max_change_by_entry = np.abs(
-            history[:, n_states - 2 * period :]
-            - history[:, n_states - 3 * period : n_states - period]
+    detected_periods = np.zeros(len(state_history), int)
+    n_states = state_history.shape[1]
+    for candidate_period in range(min(max_period, (n_states - 1) // 3), 0, -1):
+        entry_changes = np.abs(
+            state_history[:, n_states - 2 * candidate_period :]
+            - state_history[:, n_states - 3 * candidate_period : n_states - candidate_period]
         )
-        periods[max_change_by_entry.max((1, 2)) < tolerance] = period
-    return periods
+        detected_periods[entry_changes.max((1, 2)) < periodicity_tolerance] = candidate_period
+    return detected_periods
 
 
-class Attractors(NamedTuple):
+class DistinctOrbits(NamedTuple):
     """Distinct orbits of many starts, ordered by decreasing number of starts."""
 
-    orbit_index: np.ndarray  # index of the orbit of each start; -1 without an orbit
-    orbits: list[np.ndarray]  # section states of each orbit, (period, m)
+    orbit_indices: np.ndarray  # index of the orbit of each start; -1 without an orbit
+    orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
 
 
 def find_distinct_orbits(
-    walk_ends: WalkEnds, options: AttractorOptions = ATTRACTOR_OPTIONS
-) -> Attractors:
+    walk_ends: PeriodicWalkEnds, attractor_options: AttractorOptions = DEFAULT_ATTRACTOR_OPTIONS
+) -> DistinctOrbits:
     """Return the distinct orbits of the walks.
 
-    Orbits are compared from their state with the lowest dtheta- on.
+    Two orbits are compared state by state, beginning with the state of lowest dtheta-.
     """
-    orbit_index = np.full(len(walk_ends.period), -1)
-    orbits: list[np.ndarray] = []
+    orbit_indices = np.full(len(walk_ends.period), -1)
+    distinct_orbits: list[np.ndarray] = []
     for i in np.flatnonzero(walk_ends.period):
-        orbit = walk_ends.orbit_states[i, : walk_ends.period[i]]
-        for j, known_orbit in enumerate(orbits):
+        orbit_states = walk_ends.orbit_states[i, : walk_ends.period[i]]
+        for j, known_orbit in enumerate(distinct_orbits):
             if (
-                len(known_orbit) == len(orbit)
-                and np.abs(known_orbit - orbit).max() < options.same_orbit_distance
+                len(known_orbit) == len(orbit_states)
+                and np.abs(known_orbit - orbit_states).max() < attractor_options.same_orbit_distance
             ):
-                orbit_index[i] = j
+                orbit_indices[i] = j
                 break
         else:
-            orbit_index[i] = len(orbits)
-            orbits.append(orbit)
-    n_starts_by_orbit = [int(np.sum(orbit_index == j)) for j in range(len(orbits))]
+            orbit_indices[i] = len(distinct_orbits)
+            distinct_orbits.append(orbit_states)
+    n_starts_by_orbit = [int(np.sum(orbit_indices == j)) for j in range(len(distinct_orbits))]
     orbit_order = np.argsort(n_starts_by_orbit)[::-1]
-    orbit_rank = np.full(len(orbits) + 1, -1)
-    orbit_rank[orbit_order] = np.arange(len(orbits))
-    return Attractors(orbit_rank[orbit_index], [orbits[j] for j in orbit_order])
+    rank_by_orbit = np.full(len(distinct_orbits) + 1, -1)
+    rank_by_orbit[orbit_order] = np.arange(len(distinct_orbits))
+    return DistinctOrbits(rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_order])
 
 
 @eqx.filter_jit
-def _measure_block(
+def _measure_steps_of_block(
     model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
 ) -> dict[str, Array]:
     """Return all measures of one step from each start of a block."""
     return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
 
 
-def measure_orbits(
-    params: WheelParams, states: np.ndarray, model: AbstractWheel, options: StepOptions
+def measure_orbit_steps(
+    params: WheelParams, section_states: np.ndarray, model: AbstractWheel, options: StepOptions
 ) -> dict[str, np.ndarray]:
-    """Return all measures of one step from each of `states`, shape (n, m), by name."""
-    n = len(states)
-    repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n), params)
+    """Return all measures of one step from each of the section states, shape (n, m), by name."""
+    n_states = len(section_states)
+    repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)
     if model.batch_kernel == "legs":
-        input_columns = np.asarray(jax.vmap(model.parameter_values)(repeated_wheels)).T
+        parameter_rows = np.asarray(jax.vmap(model.parameter_values)(repeated_wheels)).T
         unilateral_model = cast(UnilateralWheel, model)
         step_results, _ = step_batch_with_jacobian(
-            input_columns, states, unilateral_model, options, params.n_legs, ()
+            parameter_rows, section_states, unilateral_model, options, params.n_legs, ()
         )
         return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
-    measure_block = functools.partial(_measure_block, model, options)
+    measure_steps_of_block = functools.partial(_measure_steps_of_block, model, options)
     return jax.tree.map(
         np.asarray,
-        map_in_batches(measure_block, (batch_sizes.ATTRACTOR_BATCH_SIZE,), repeated_wheels, states),
+        map_in_batches(
+            measure_steps_of_block,
+            (batch_sizes.ATTRACTOR_BATCH_SIZE,),
+            repeated_wheels,
+            section_states,
+        ),
     )

@@ -1,6 +1,5 @@
-"""Basins of attraction: the gait that each start of a grid reaches, or the outcome of its
-failure.
-"""
+"""Basins of attraction: for each start of a grid, the gait that a walk reaches, or the outcome of
+its failure."""
 
 from __future__ import annotations
 
@@ -14,10 +13,19 @@ import numpy as np
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, measure_attrs, provenance
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import EngineName, StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.simulation.attractors import find_distinct_orbits, measure_orbits, walk_until_periodic
-from vrw_jax.simulation.stepping import ModelLike, check_model, check_options, check_single_wheel
+from vrw_jax.simulation.attractors import (
+    find_distinct_orbits,
+    measure_orbit_steps,
+    walk_until_periodic,
+)
+from vrw_jax.simulation.stepping import (
+    ModelLike,
+    check_model,
+    check_single_wheel,
+    check_step_options,
+)
 from vrw_jax.validation import (
     check_int,
     check_not_traced,
@@ -27,17 +35,17 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 
-PRE_TOUCHDOWN_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
+PRE_TOUCHDOWN_COMPONENT_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
 """Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
 
-POST_LANDING_NAMES = ("theta_post_impact", "dtheta_post_impact")
+POST_LANDING_COMPONENT_NAMES = ("theta_post_impact", "dtheta_post_impact")
 """Names of the components of a state just after a landing on both feet, in rad, rad/s."""
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """Values of each component of a start, by name. A single number is not an axis."""
 
 
-@with_default_settings
+@with_default_jax_settings
 @raise_for_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,
@@ -90,172 +98,186 @@ def basin(
     check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
     check_single_wheel(params, "compute one basin after the other")
     model = check_model(model).fallback_model  # The fallback model is valid for any start.
-    options = check_options(options)
+    options = check_step_options(options)
     options.check_tolerances(np.dtype(params.damping.dtype))
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
-    axis_values = _parse_grid(grid)
-    component_names = tuple(axis_values)
-    axis_names = [
+    component_values = _parse_start_grid(grid)
+    component_names = tuple(component_values)
+    grid_axis_names = [
         component_name for component_name in component_names if np.ndim(grid[component_name]) > 0
     ]
-    grid_shape = tuple(len(axis_values[component_name]) for component_name in axis_names)
-    grid_coordinates = np.meshgrid(*axis_values.values(), indexing="ij")
+    grid_shape = tuple(len(component_values[component_name]) for component_name in grid_axis_names)
+    grid_coordinates = np.meshgrid(*component_values.values(), indexing="ij")
     grid_points = np.stack([m.ravel() for m in grid_coordinates], -1)
-    starts = (
+    start_states = (
         grid_points
-        if component_names == PRE_TOUCHDOWN_NAMES
-        else invert_landing(params, grid_points)
+        if component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
+        else invert_landing_map(params, grid_points)
     )
-    is_reachable = np.isfinite(starts).all(-1)
-    starts = np.where(is_reachable[:, None], starts, np.nan)
-    embed_start = functools.partial(model.embed_section, params)
-    starts = np.asarray(jax.vmap(embed_start)(jnp.asarray(starts)))
-    walk_ends = walk_until_periodic(params, starts, model, options, max_steps, max_period)
-    attractors = find_distinct_orbits(walk_ends)
+    is_reachable = np.isfinite(start_states).all(-1)
+    start_states = np.where(is_reachable[:, None], start_states, np.nan)
+    embed_start_state = functools.partial(model.embed_section, params)
+    start_states = np.asarray(jax.vmap(embed_start_state)(jnp.asarray(start_states)))
+    walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
+    distinct_orbits = find_distinct_orbits(walk_ends)
 
     walk_variables = {
         "attractor": xr.Variable(
-            axis_names,
-            attractors.orbit_index.reshape(grid_shape),
+            grid_axis_names,
+            distinct_orbits.orbit_indices.reshape(grid_shape),
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
         "outcome": xr.Variable(
-            axis_names, walk_ends.outcome.reshape(grid_shape), measure_attrs("outcome")
+            grid_axis_names, walk_ends.outcome.reshape(grid_shape), measure_attrs("outcome")
         ),
         "steps": xr.Variable(
-            axis_names,
-            walk_ends.n_steps.reshape(grid_shape),
+            grid_axis_names,
+            walk_ends.n_steps_to_orbit.reshape(grid_shape),
             {"units": "1", "long_name": "steps until the orbit is reached, or the fall"},
         ),
     }
     start_coordinates = {
         component_name: xr.Variable(
-            (component_name,) if component_name in axis_names else (),
-            axis_values[component_name]
-            if component_name in axis_names
-            else axis_values[component_name][0],
+            (component_name,) if component_name in grid_axis_names else (),
+            component_values[component_name]
+            if component_name in grid_axis_names
+            else component_values[component_name][0],
             dict(MEASURES[component_name].attrs),
         )
         for component_name in component_names
     }
-    orbit_variables = _make_orbit_variables(params, attractors.orbits, max_period, model, options)
-    attrs = {
+    orbit_variables = _make_orbit_variables(
+        params, distinct_orbits.orbit_states, max_period, model, options
+    )
+    dataset_attributes = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
-        "starts": "before touchdown" if component_names == PRE_TOUCHDOWN_NAMES else "after landing",
+        "starts": "before touchdown"
+        if component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
+        else "after landing",
     }
     return xr.Dataset(
         walk_variables | orbit_variables,
         start_coordinates,
-        attrs | provenance(params, model, options),
+        dataset_attributes | provenance(params, model, options),
     )
 
 
-def _parse_grid(grid: StartGrid) -> dict[str, np.ndarray]:
-    """Return the values of each component as an array with one axis.
+def _parse_start_grid(grid: StartGrid) -> dict[str, np.ndarray]:
+    """Return the values of each component of a start as an array with one axis.
 
-    Raises `ValueError` unless the grid contains all components of one kind, each a number or an
+    Raise a `ValueError` unless the grid contains all components of one kind, each a number or an
     axis of numbers.
     """
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    for component_names in (PRE_TOUCHDOWN_NAMES, POST_LANDING_NAMES):
+    for component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
         if set(grid) == set(component_names):
             break
     else:
         raise ValueError(
             f"the grid contains {', '.join(grid) or 'nothing'}, but it must contain all of "
-            f"{', '.join(PRE_TOUCHDOWN_NAMES)}, or all of {', '.join(POST_LANDING_NAMES)}: give "
+            f"{', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
+            f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give "
             "each a number or an axis."
         )
-    values = {
+    component_values = {
         component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
         for component_name in component_names
     }
-    for component_name, value in values.items():
-        if value.ndim > 1 or not value.size:
+    for component_name, component_array in component_values.items():
+        if component_array.ndim > 1 or not component_array.size:
             raise ValueError(
-                f"{component_name} has shape {value.shape}, but it must be a number, or a list "
+                f"{component_name} has shape {component_array.shape}, but it must be a number, or "
+                "a list "
                 "of at least one: give one axis of values."
             )
-    return {component_name: np.atleast_1d(value) for component_name, value in values.items()}
+    return {
+        component_name: np.atleast_1d(component_array)
+        for component_name, component_array in component_values.items()
+    }
 
 
-def invert_landing(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
-    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+); NaN without
-    one.
+def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> np.ndarray:
+    """Return section states with dL1- = 0 whose landing leads to (theta+, dtheta+), or NaN if there
+    is none.
 
     With dL1- = 0, the angular rates before and after the landing are proportional.
     """
     s = params.symbols()
 
-    def invert_at_point(post_landing_state: jax.Array) -> jax.Array:
-        theta, target_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
-        landing = transitions.land(
-            s, theta, jnp.ones_like(target_rate), jnp.zeros_like(target_rate)
+    def invert_for_one_state(post_landing_state: jax.Array) -> jax.Array:
+        touchdown_angle, post_landing_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
+        unit_rate_landing = transitions.land(
+            s, touchdown_angle, jnp.ones_like(post_landing_rate), jnp.zeros_like(post_landing_rate)
         )
-        dtheta = target_rate / landing.motion.dtheta
-        is_admissible = landing.keeps_rear_foot & (dtheta > 0.0)
-        return jnp.where(is_admissible, jnp.stack([theta, dtheta, 0.0 * dtheta]), jnp.nan)
+        touchdown_rate = post_landing_rate / unit_rate_landing.motion.dtheta
+        is_admissible = unit_rate_landing.keeps_rear_foot & (touchdown_rate > 0.0)
+        return jnp.where(
+            is_admissible,
+            jnp.stack([touchdown_angle, touchdown_rate, 0.0 * touchdown_rate]),
+            jnp.nan,
+        )
 
-    return np.asarray(jax.vmap(invert_at_point)(jnp.asarray(post_landing_states)))
+    return np.asarray(jax.vmap(invert_for_one_state)(jnp.asarray(post_landing_states)))
 
 
 def _make_orbit_variables(
     params: WheelParams,
-    orbits: list[np.ndarray],
+    orbit_states: list[np.ndarray],
     max_period: int,
     model: AbstractWheel,
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
     """Return the dataset variables of the orbits: states, periods, DLS fractions and minimum
-    margins.
-    """
-    n = len(orbits)
-    states = np.full((n, max_period, model.section_size(params)), np.nan)
+    margins."""
+    n_orbits = len(orbit_states)
+    padded_orbit_states = np.full((n_orbits, max_period, model.section_size(params)), np.nan)
     margin_names = MARGIN_MEASURES if model.section_size(params) == 3 else ()
-    dls_fractions, min_margins = np.zeros(n), {name: np.zeros(n) for name in margin_names}
-    for i, orbit in enumerate(orbits):
-        states[i, : len(orbit)] = orbit
-        measures = measure_orbits(params, orbit, model, options)
-        dls_fractions[i] = measures["duration_dls"].sum() / measures["period"].sum()
-        for name in margin_names:
-            min_margins[name][i] = measures[name].min()
+    dls_fractions, min_margins = (
+        np.zeros(n_orbits),
+        {margin_name: np.zeros(n_orbits) for margin_name in margin_names},
+    )
+    for i, states_of_orbit in enumerate(orbit_states):
+        padded_orbit_states[i, : len(states_of_orbit)] = states_of_orbit
+        step_measures = measure_orbit_steps(params, states_of_orbit, model, options)
+        dls_fractions[i] = step_measures["duration_dls"].sum() / step_measures["period"].sum()
+        for margin_name in margin_names:
+            min_margins[margin_name][i] = step_measures[margin_name].min()
     return {
         "orbit_state": xr.Variable(
             ("attractor_index", "orbit_step", "component"),
-            states,
+            padded_orbit_states,
             {"long_name": "section states of the orbit, lowest dtheta- first"},
         ),
         "orbit_period": xr.Variable(
             "attractor_index",
-            np.array([len(orbit) for orbit in orbits], int),
+            np.array([len(states_of_orbit) for states_of_orbit in orbit_states], int),
             {"units": "1", "long_name": "steps until the orbit repeats"},
         ),
         "orbit_dls_fraction": xr.Variable(
             "attractor_index", dls_fractions, dict(MEASURES["dls_fraction"].attrs)
         ),
         **{
-            f"orbit_{name}": xr.Variable(
-                "attractor_index", values, dict(MARGIN_MEASURES[name].attrs)
+            f"orbit_{margin_name}": xr.Variable(
+                "attractor_index", orbit_margins, dict(MARGIN_MEASURES[margin_name].attrs)
             )
-            for name, values in min_margins.items()
+            for margin_name, orbit_margins in min_margins.items()
         },
     }
 
 
-def compute_end_fractions(basins: xr.Dataset) -> dict[str, float]:
-    """Return the fraction of starts for each end: "attractor 0", ..., "unsettled", or an outcome's
-    name.
-    """
-    attractors = basins.attractor.values.ravel()
+def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
+    """Return the fraction of starts for each kind of end: "attractor 0", ..., "unsettled", or the
+    name of an outcome."""
+    attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()
     end_names = [
         f"attractor {a}"
         if a >= 0
         else ("unsettled" if c == Outcome.STEPPED else Outcome(int(c)).name)
-        for a, c in zip(attractors, outcome_codes, strict=True)
+        for a, c in zip(attractor_indices, outcome_codes, strict=True)
     ]
     return {
         end_name: end_names.count(end_name) / len(end_names) for end_name in sorted(set(end_names))

@@ -13,21 +13,23 @@ from vrw_jax.validation import check_type
 
 
 @dataclass(frozen=True)
-class PeakOptions:
-    """Numbers of the search for peaks in a sampled walk."""
+class ForcePeakOptions:
+    """Options of the search for force peaks in a sampled walk."""
 
     spline_degree: int = 7
     """Degree of the spline through the samples of an interval, chosen because its error with the
     default number of samples is that of the solver."""
-    min_height_fraction: float = 1e-7
+    min_extremum_height_fraction: float = 1e-7
     """Least rise and fall beside an extremum, as a fraction of the largest force. It is chosen
     above the errors of the solver, which would be extrema of a force that is constant."""
 
 
-PEAK_OPTIONS = PeakOptions()
+FORCE_PEAK_OPTIONS = ForcePeakOptions()
 
-SAMPLED_PEAK_MEASURES = tuple(name for name in FORCE_PEAK_MEASURES if name != "landing_impulse")
-"""Measures of the force between impacts."""
+SAMPLED_FORCE_PEAK_MEASURES = tuple(
+    name for name in FORCE_PEAK_MEASURES if name != "landing_impulse"
+)
+"""Measures of the normal force between impacts."""
 
 
 def force_peaks(walk: xr.Dataset) -> xr.Dataset:
@@ -41,9 +43,8 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     Args:
         walk: a trajectory with at least 9 samples per phase.
 
-    Returns:
-        A dataset of the force measures over `step`. Over `extremum` it has `force`, `force_time`,
-        `force_step` and `is_maximum` of each extremum of the fore foot's force.
+    Returns: A dataset of the force measures over `step_index`. Over `extremum` it has `force`,
+    `force_time`, `force_step` and `is_maximum` of each extremum of the fore foot's force.
 
     Raises:
         TypeError, ValueError: an invalid argument, described in one sentence.
@@ -57,120 +58,177 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     """
     check_type("walk", walk, xr.Dataset, "give the result of vrw.simulate")
     if "lambda_2" in walk:
-        fore, rear = walk.lambda_2.values, walk.lambda_4.values
-        total = fore + rear
+        fore_force, rear = walk.lambda_2.values, walk.lambda_4.values
+        total_force = fore_force + rear
     elif "normal" in walk:
-        fore, total = walk.normal.values[:, 0], walk.normal.values.sum(1)
+        fore_force, total_force = walk.normal.values[:, 0], walk.normal.values.sum(1)
     else:
         raise ValueError(
             f"walk holds {', '.join(map(str, walk)) or 'nothing'}, but no normal force of the "
             "feet: give the result of vrw.simulate."
         )
-    intervals = _split_intervals(walk.time.values, walk.step.values)
-    least, n_samples = PEAK_OPTIONS.spline_degree + 2, max(map(len, intervals))
-    if n_samples < least:
+    sample_times = walk.time.values
+    # The time of an event is listed twice, up to round-off.
+    roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
+    is_interval_end = (np.diff(sample_times) <= roundoff) | (np.diff(walk.step.values) != 0)
+    interval_starts = np.flatnonzero(is_interval_end) + 1
+    sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
+    min_samples_per_phase, n_samples = (
+        FORCE_PEAK_OPTIONS.spline_degree + 2,
+        max(map(len, sampled_intervals)),
+    )
+    if n_samples < min_samples_per_phase:
         raise ValueError(
             f"the phases of the walk have {n_samples} samples, but its peaks need at least "
-            f"{least}: give simulate(..., n_samples={least}) or more."
+            f"{min_samples_per_phase}: give simulate(..., n_samples={min_samples_per_phase}) or "
+            "more."
         )
-    steps, step_of_sample = np.unique(walk.step.values), walk.step.values
+    step_indices, sample_steps = np.unique(walk.step.values), walk.step.values
     intervals_by_step = [
-        [rows for rows in intervals if len(rows) == n_samples and step_of_sample[rows[0]] == step]
-        for step in steps
+        [
+            sample_indices
+            for sample_indices in sampled_intervals
+            if len(sample_indices) == n_samples and sample_steps[sample_indices[0]] == step_index
+        ]
+        for step_index in step_indices
     ]
     fore_extrema, total_extrema = (
-        [_find_extrema(walk.time.values, force, intervals) for intervals in intervals_by_step]
-        for force in (fore, total)
+        [
+            _find_force_extrema(walk.time.values, force, sampled_intervals)
+            for sampled_intervals in intervals_by_step
+        ]
+        for force in (fore_force, total_force)
     )
-    values = [
-        _summarize(fore, total) for fore, total in zip(fore_extrema, total_extrema, strict=True)
+    measures_by_step = [
+        _summarize_force_extrema(fore_force, total_force)
+        for fore_force, total_force in zip(fore_extrema, total_extrema, strict=True)
     ]
-    data = {
-        name: ("step", np.array([row[name] for row in values]), measure_attrs(name))
-        for name in SAMPLED_PEAK_MEASURES
+    dataset_variables = {
+        measure_name: (
+            "step",
+            np.array([step_measures[measure_name] for step_measures in measures_by_step]),
+            measure_attrs(measure_name),
+        )
+        for measure_name in SAMPLED_FORCE_PEAK_MEASURES
     }
-    joined = [np.concatenate(parts) for parts in zip(*fore_extrema, strict=True)]
-    extrema = _Extrema(*joined)
-    step_of_extremum = np.repeat(steps, [len(part.time) for part in fore_extrema])
-    data |= {
-        "force": ("extremum", extrema.force, measure_attrs("lambda_2")),
-        "force_time": ("extremum", extrema.time, measure_attrs("time")),
-        "force_step": ("extremum", step_of_extremum, measure_attrs("step")),
-        "is_maximum": ("extremum", extrema.is_maximum, {"long_name": "whether a maximum"}),
+    joined_extrema = [np.concatenate(step_parts) for step_parts in zip(*fore_extrema, strict=True)]
+    all_extrema = _ForceExtrema(*joined_extrema)
+    extremum_steps = np.repeat(
+        step_indices, [len(step_extrema.time) for step_extrema in fore_extrema]
+    )
+    dataset_variables |= {
+        "force": ("extremum", all_extrema.force, measure_attrs("lambda_2")),
+        "force_time": ("extremum", all_extrema.time, measure_attrs("time")),
+        "force_step": ("extremum", extremum_steps, measure_attrs("step")),
+        "is_maximum": ("extremum", all_extrema.is_maximum, {"long_name": "whether a maximum"}),
     }
-    return xr.Dataset(data, {"step": steps}, dict(walk.attrs))
+    return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
 
 
-class _Extrema(NamedTuple):
+class _ForceExtrema(NamedTuple):
     """Extrema of a force in one step, in the order of time."""
 
     time: np.ndarray  # s
     force: np.ndarray  # N
     is_maximum: np.ndarray
-    later_rate: np.ndarray  # largest maximum of the rate after the first peak, N/s; one number
+    max_rate_after_first_peak: (
+        np.ndarray
+    )  # largest maximum of the rate after the first peak, N/s; one number
 
 
-def _split_intervals(time: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
-    """Return the indices of the samples of each interval between two events.
-
-    The time of an event is listed twice, up to round-off.
-    """
-    roundoff = 4.0 * np.finfo(float).eps * np.max(time)
-    is_first = np.flatnonzero((np.diff(time) <= roundoff) | (np.diff(step) != 0)) + 1
-    return np.split(np.arange(len(time)), is_first)
-
-
-def _find_extrema(time: np.ndarray, force: np.ndarray, intervals: list[np.ndarray]) -> _Extrema:
-    """Return the extrema of a force in the intervals of one step."""
+def _find_force_extrema(
+    sample_times: np.ndarray, sampled_forces: np.ndarray, interval_indices: list[np.ndarray]
+) -> _ForceExtrema:
+    """Return the extrema of a force between the events of one step."""
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 
-    times, values, flags, rate_times, rates = [], [], [], [], []
-    min_height = PEAK_OPTIONS.min_height_fraction * np.max(np.abs(force))
-    for interval in intervals:
-        if np.ptp(force[interval]) < min_height:
+    times_by_interval, forces_by_interval, maximum_flags, rate_maximum_times, rate_maxima = (
+        [],
+        [],
+        [],
+        [],
+        [],
+    )
+    min_extremum_height = FORCE_PEAK_OPTIONS.min_extremum_height_fraction * np.max(
+        np.abs(sampled_forces)
+    )
+    for sample_indices in interval_indices:
+        if np.ptp(sampled_forces[sample_indices]) < min_extremum_height:
             continue
-        interval_time = time[interval]
-        start, length = interval_time[0], np.ptp(interval_time)
-        fractions = (interval_time - start) / length
-        spline = make_interp_spline(fractions, force[interval], PEAK_OPTIONS.spline_degree)
-        is_inside = lambda roots: roots[(roots > 0.0) & (roots < 1.0)]
-        roots = is_inside(PPoly.from_spline(spline.derivative(1)).roots())
-        boundaries = spline(np.concatenate([[0.0], roots, [1.0]]))
-        heights = np.abs(np.diff(boundaries))
-        roots = roots[np.minimum(heights[:-1], heights[1:]) > min_height]
-        times.append(start + length * roots)
-        values.append(spline(roots))
-        flags.append(spline(roots, 2) < 0.0)
-        rate_roots = is_inside(PPoly.from_spline(spline.derivative(2)).roots())
-        rate_roots = rate_roots[spline(rate_roots, 3) < 0.0]
-        rate_times.append(start + length * rate_roots)
-        rates.append(spline(rate_roots, 1) / length)
-    join = lambda parts: np.concatenate([np.zeros(0), *parts])
-    extremum_times, is_maximum = join(times), join(flags).astype(bool)
-    first_peak = np.min(extremum_times[is_maximum], initial=np.inf)
-    later_rates = join(rates)[join(rate_times) > first_peak]
-    later_rate = np.array([np.max(later_rates)]) if later_rates.size else np.array([np.nan])
-    return _Extrema(extremum_times, join(values), is_maximum, later_rate)
+        interval_times = sample_times[sample_indices]
+        interval_start, interval_duration = interval_times[0], np.ptp(interval_times)
+        time_fractions = (interval_times - interval_start) / interval_duration
+        force_spline = make_interp_spline(
+            time_fractions, sampled_forces[sample_indices], FORCE_PEAK_OPTIONS.spline_degree
+        )
+        select_inside_interval = lambda extremum_fractions: extremum_fractions[
+            (extremum_fractions > 0.0) & (extremum_fractions < 1.0)
+        ]
+        extremum_fractions = select_inside_interval(
+            PPoly.from_spline(force_spline.derivative(1)).roots()
+        )
+        boundary_forces = force_spline(np.concatenate([[0.0], extremum_fractions, [1.0]]))
+        extremum_heights = np.abs(np.diff(boundary_forces))
+        extremum_fractions = extremum_fractions[
+            np.minimum(extremum_heights[:-1], extremum_heights[1:]) > min_extremum_height
+        ]
+        times_by_interval.append(interval_start + interval_duration * extremum_fractions)
+        forces_by_interval.append(force_spline(extremum_fractions))
+        maximum_flags.append(force_spline(extremum_fractions, 2) < 0.0)
+        rate_maximum_fractions = select_inside_interval(
+            PPoly.from_spline(force_spline.derivative(2)).roots()
+        )
+        rate_maximum_fractions = rate_maximum_fractions[
+            force_spline(rate_maximum_fractions, 3) < 0.0
+        ]
+        rate_maximum_times.append(interval_start + interval_duration * rate_maximum_fractions)
+        rate_maxima.append(force_spline(rate_maximum_fractions, 1) / interval_duration)
+    concatenate_parts = lambda interval_parts: np.concatenate([np.zeros(0), *interval_parts])
+    sorted_extremum_times, are_maxima = (
+        concatenate_parts(times_by_interval),
+        concatenate_parts(maximum_flags).astype(bool),
+    )
+    first_peak_time = np.min(sorted_extremum_times[are_maxima], initial=np.inf)
+    rates_after_first_peak = concatenate_parts(rate_maxima)[
+        concatenate_parts(rate_maximum_times) > first_peak_time
+    ]
+    max_rate_after_first_peak = (
+        np.array([np.max(rates_after_first_peak)])
+        if rates_after_first_peak.size
+        else np.array([np.nan])
+    )
+    return _ForceExtrema(
+        sorted_extremum_times,
+        concatenate_parts(forces_by_interval),
+        are_maxima,
+        max_rate_after_first_peak,
+    )
 
 
-def _summarize(fore: _Extrema, total: _Extrema) -> dict[str, Any]:
-    """Return the measures of one step from the extrema of its forces."""
-    depth = 0.0
-    for i in np.flatnonzero(~fore.is_maximum):
-        before, after = (
-            part[flags]
-            for part, flags in (
-                (fore.force[:i], fore.is_maximum[:i]),
-                (fore.force[i:], fore.is_maximum[i:]),
+def _summarize_force_extrema(
+    fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
+) -> dict[str, Any]:
+    """Return the force measures of one step, from the extrema of its fore force and its total
+    force."""
+    trough_depth = 0.0
+    for i in np.flatnonzero(~fore_extrema.is_maximum):
+        earlier_peak_forces, later_peak_forces = (
+            extremum_forces[maximum_flags]
+            for extremum_forces, maximum_flags in (
+                (fore_extrema.force[:i], fore_extrema.is_maximum[:i]),
+                (fore_extrema.force[i:], fore_extrema.is_maximum[i:]),
             )
         )
-        if before.size and after.size:
-            depth = max(depth, min(before.max(), after.max()) - fore.force[i])
+        if earlier_peak_forces.size and later_peak_forces.size:
+            trough_depth = max(
+                trough_depth,
+                min(earlier_peak_forces.max(), later_peak_forces.max()) - fore_extrema.force[i],
+            )
     return {
-        "n_force_peaks": int(np.sum(fore.is_maximum)),
-        "peak_force": np.max(fore.force[fore.is_maximum], initial=0.0),
-        "force_trough_depth": depth,
-        "second_peak_rate": fore.later_rate[0],
-        "n_total_force_peaks": int(np.sum(total.is_maximum)),
-        "peak_total_force": np.max(total.force[total.is_maximum], initial=0.0),
+        "n_force_peaks": int(np.sum(fore_extrema.is_maximum)),
+        "peak_force": np.max(fore_extrema.force[fore_extrema.is_maximum], initial=0.0),
+        "force_trough_depth": trough_depth,
+        "second_peak_rate": fore_extrema.max_rate_after_first_peak[0],
+        "n_total_force_peaks": int(np.sum(total_extrema.is_maximum)),
+        "peak_total_force": np.max(total_extrema.force[total_extrema.is_maximum], initial=0.0),
     }

@@ -21,31 +21,31 @@ from vrw_jax.models import (
     AbstractWheel,
     AdvanceResult,
     SectionState,
-    StepGround,
+    StepGroundValues,
     StepResult,
     ViscoelasticWheel,
 )
 from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.printing import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.runtime import with_default_settings
-from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_models
+from vrw_jax.runtime import with_default_jax_settings
+from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_accepted_models
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
 
-SectionLike = Array | np.ndarray | Sequence[float]
+SectionStateLike = Array | np.ndarray | Sequence[float]
 """Section state as a caller gives it; `validate_arguments` converts it to an array."""
 ModelLike = AbstractWheel | Literal["auto"]
 """Model as a caller gives it; "auto" means `LadderWheel()`, the simplest valid model."""
 
 
-@with_default_settings
+@with_default_jax_settings
 def paper_start() -> SectionState:
     """Return a section state (theta-, dtheta-, dL1-) in the basin of the gait of Table 1.
 
@@ -60,10 +60,10 @@ def paper_start() -> SectionState:
 
 
 def check_model(model: ModelLike | None, allows_arrays: bool = False) -> AbstractWheel:
-    """Return the model of an argument: by default the paper's, for "auto" a `LadderWheel`.
+    """Return the model of an argument: the paper's model for None, and a `LadderWheel` for "auto".
 
-    Raises `TypeError` if the argument is no model. Raises `ValueError` if its friction is an array
-    although `allows_arrays` is False.
+    Raise a `TypeError` if the argument is no model. Raise a `ValueError` if its friction is an
+    array although `allows_arrays` is False.
     """
     if model is None:
         return _make_default_model()
@@ -72,7 +72,7 @@ def check_model(model: ModelLike | None, allows_arrays: bool = False) -> Abstrac
     if not isinstance(model, AbstractWheel):
         raise TypeError(
             f"model is {format_value(model)}, but a model of the wheel is needed: give "
-            f"{describe_models()}."
+            f"{describe_accepted_models()}."
         )
     if not allows_arrays and (shape := jnp.shape(getattr(model, "friction", 0.0))):
         raise ValueError(
@@ -87,43 +87,42 @@ _make_default_model = functools.cache(ViscoelasticWheel)
 
 
 def check_single_wheel(params: Any, remedy: str) -> None:
-    """Raise `TypeError` or `ValueError` unless `params` is a single wheel.
+    """Raise a `TypeError` or a `ValueError` unless `params` is a single wheel.
 
-    - `remedy`: end of the message.
+    - `remedy`: end of the error message.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     WheelParams.require_single(params, remedy)  # An unbound call is much faster.
 
 
-def check_options(options: StepOptions | None) -> StepOptions:
-    """Return the options, by default `StepOptions()`.
+def check_step_options(options: StepOptions | None) -> StepOptions:
+    """Return the options of steps, by default `StepOptions()`.
 
-    Raises `TypeError` if the argument has another type.
+    Raise a `TypeError` if the argument has another type.
     """
     if options is not None:
         check_type(
             "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
         )
         StepOptions.require_scalars(options)  # An unbound call is faster: binding takes 0.1 ms.
-    return _make_default_options(jnp.result_type(float)) if options is None else options
+    return _make_default_step_options(jnp.result_type(float)) if options is None else options
 
 
 @functools.cache
-def _make_default_options(dtype: np.dtype) -> StepOptions:
-    """Return the default options for a floating type, made once and concrete even under a trace."""
+def _make_default_step_options(dtype: np.dtype) -> StepOptions:
+    """Return the default options for a floating type. They are made once, and are concrete even
+    inside `jit`."""
     with jax.ensure_compile_time_eval():
         return StepOptions()
 
 
 def check_section_state(
-    x: Any, description: str = "the section state", converter: Callable = check_reals
+    x: Any, argument_description: str = "the section state", convert_state: Callable = check_reals
 ) -> Any:
-    """Return the section state as converted by `converter`.
-
-    Raises an error if the argument is invalid.
-    """
-    return converter(
-        description,
+    """Return the section state, converted by `convert_state`. Raise an error if the argument is no
+    section state."""
+    return convert_state(
+        argument_description,
         x,
         "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
         "cycle.section_state",
@@ -139,10 +138,13 @@ def validate_arguments(
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
     """Return wheel, section state, model and options, all of one floating type.
 
-    Raises `TypeError` or `ValueError` if an argument is invalid.
+    Raise a `TypeError` or a `ValueError` if an argument is invalid.
     """
     check_single_wheel(params, "map over batches of parameters with jax.vmap, or use vrw.scan")
-    model, options = check_model(model), StepOptions.with_engine(check_options(options), engine)
+    model, options = (
+        check_model(model),
+        StepOptions.with_engine(check_step_options(options), engine),
+    )
     state = check_section_state(x)
     section_size = model.section_size(params)
     if state.shape == (3,) and section_size != 3:
@@ -158,22 +160,27 @@ def validate_arguments(
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
     StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
-    dtype = jnp.result_type(state, params.damping)
-    StepOptions.check_tolerances(options, dtype)
+    common_dtype = jnp.result_type(state, params.damping)
+    StepOptions.check_tolerances(options, common_dtype)
 
-    def convert_dtype(tree: Any) -> Any:
-        """Return the tree with all leaves of the common floating type."""
-        if all(leaf.dtype == dtype for leaf in jax.tree.leaves(tree)):
-            return tree
-        return jax.tree.map(lambda leaf: leaf.astype(dtype), tree)
+    def convert_to_common_dtype(array_tree: Any) -> Any:
+        """Return the tree with all leaves converted to the common floating type."""
+        if all(leaf.dtype == common_dtype for leaf in jax.tree.leaves(array_tree)):
+            return array_tree
+        return jax.tree.map(lambda leaf: leaf.astype(common_dtype), array_tree)
 
-    return convert_dtype(params), convert_dtype(state), model, convert_dtype(options)
+    return (
+        convert_to_common_dtype(params),
+        convert_to_common_dtype(state),
+        model,
+        convert_to_common_dtype(options),
+    )
 
 
 @overload
 def step(  # type: ignore[overload-overlap]
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     *,
     model: UnilateralWheel,
     options: StepOptions | None = None,
@@ -184,7 +191,7 @@ def step(  # type: ignore[overload-overlap]
 @overload
 def step(  # type: ignore[overload-overlap]
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     *,
     model: LadderWheel | Literal["auto"],
     options: StepOptions | None = None,
@@ -195,7 +202,7 @@ def step(  # type: ignore[overload-overlap]
 @overload
 def step(
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     *,
     model: AbstractWheel | None = None,
     options: StepOptions | None = None,
@@ -203,10 +210,10 @@ def step(
 ) -> StepResult: ...
 
 
-@with_default_settings
+@with_default_jax_settings
 def step(
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
@@ -237,23 +244,25 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
-    model, params, ground = read_ground(params, model, 1)
+    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
-    if ground is not None:
-        model, params = model.with_ground(params, _first_ground(ground, state.dtype))
+    if stepwise_ground is not None:
+        model, params = model.with_ground(
+            params, _get_first_step_ground(stepwise_ground, state.dtype)
+        )
     return model.take_step(params, state, options)
 
 
-@with_default_settings
+@with_default_jax_settings
 def return_map(
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     engine: EngineName = "auto",
 ) -> Array:
-    """Return the section state one step later; all zeros (no section state) if the step failed.
+    """Return the section state one step later, or zeros if the step failed.
 
     No margins are computed. The map is differentiable in forward and reverse mode, to any order.
 
@@ -278,10 +287,12 @@ def return_map(
         >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
         (3, 3)
     """
-    model, params, ground = read_ground(params, model, 1)
+    model, params, stepwise_ground = split_stepwise_ground(params, model, 1)
     params, state, model, options = validate_arguments(params, x, model, options, engine)
-    if ground is not None:
-        model, params = model.with_ground(params, _first_ground(ground, state.dtype))
+    if stepwise_ground is not None:
+        model, params = model.with_ground(
+            params, _get_first_step_ground(stepwise_ground, state.dtype)
+        )
     return model.advance(params, state, options).section_state
 
 
@@ -315,14 +326,14 @@ class Walk(AbstractPrintable):
         """Return how the walk ended, as a sentence; a batch has an array of sentences."""
         return describe_ending(self.outcome, Outcome)
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts of outcome, steps, start, last state and time."""
-        outcome = np.asarray(self.outcome)
-        if outcome.ndim:
-            return [("walks", format_outcome_counts(outcome, Outcome))]
+        walk_outcome = np.asarray(self.outcome)
+        if walk_outcome.ndim:
+            return [("walks", format_outcome_counts(walk_outcome, Outcome))]
         last_index = max(int(self.n_stepped) - 1, 0)
         return [
-            ("outcome", Outcome(int(outcome)).meaning),
+            ("outcome", Outcome(int(walk_outcome)).meaning),
             ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
             ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
             ("last section state", format_numbers(self.steps.section_state[last_index])),
@@ -331,21 +342,24 @@ class Walk(AbstractPrintable):
 
 
 @eqx.filter_jit
-def _scan_steps(
+def _walk_by_scan(
     model: AbstractWheel,
     params: WheelParams,
     x: Array,
     options: StepOptions,
     n_steps: int,
-    ground_per_step: StepGround | None,
+    stepwise_ground: StepGroundValues | None,
 ) -> Walk:
     """Return a walk of `n_steps` steps; the steps after a failure repeat its outcome."""
 
-    def advance_walk(carry: tuple, ground: StepGround | None) -> tuple:
-        """Return the next carry and the results of one step, which is not taken after a failure."""
-        x, outcome = carry
+    def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:
+        """Return the state and the outcome after one step, and the results of this step. No step is
+        taken after a failure."""
+        x, outcome = state_and_outcome
         is_unfinished = outcome == Outcome.STEPPED
-        model_and_params = (model, params) if ground is None else model.with_ground(params, ground)
+        model_and_params = (
+            (model, params) if step_ground is None else model.with_ground(params, step_ground)
+        )
         step_result = model_and_params[0].advance(
             model_and_params[1], jnp.where(is_unfinished, x, jnp.nan), options
         )
@@ -358,16 +372,18 @@ def _scan_steps(
         )
         return (step_result.section_state, outcome), step_result
 
-    carry = (x, jnp.int32(Outcome.STEPPED))
-    steps: AdvanceResult
-    _, steps = lax.scan(advance_walk, carry, ground_per_step, length=n_steps)
-    return Walk(x, steps, jnp.sum(steps.outcome == Outcome.STEPPED))
+    initial_state_and_outcome = (x, jnp.int32(Outcome.STEPPED))
+    step_results: AdvanceResult
+    _, step_results = lax.scan(
+        advance_one_step, initial_state_and_outcome, stepwise_ground, length=n_steps
+    )
+    return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
 
-@with_default_settings
+@with_default_jax_settings
 def walk(
     params: WheelParams,
-    x: SectionLike,
+    x: SectionStateLike,
     n_steps: int,
     *,
     model: ModelLike | None = None,
@@ -406,41 +422,43 @@ def walk(
         (5, (5, 3))
     """
     n_steps = check_int("n_steps", n_steps)
-    checked_model, params, ground_per_step = read_ground(params, model, n_steps)
+    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
     params, state, checked_model, options = validate_arguments(
         params, x, checked_model, options, engine
     )
-    if ground_per_step is not None:
-        ground_per_step = tuple(
-            ground_values.astype(state.dtype) for ground_values in ground_per_step
+    if stepwise_ground is not None:
+        stepwise_ground = tuple(
+            ground_values.astype(state.dtype) for ground_values in stepwise_ground
         )
-    return _scan_steps(checked_model, params, state, options, n_steps, ground_per_step)
+    return _walk_by_scan(checked_model, params, state, options, n_steps, stepwise_ground)
 
 
-def read_ground(
+def split_stepwise_ground(
     params: Any, model: ModelLike | None, n_steps: int
-) -> tuple[AbstractWheel, Any, StepGround | None]:
+) -> tuple[AbstractWheel, Any, StepGroundValues | None]:
     """Return model and wheel on the ground of the first step, and the ground of each step.
 
-    On flat ground, the last result is None and model and wheel are unchanged.
+    On flat ground, return None as the ground, and model and wheel unchanged.
     """
     checked_model = check_model(model, allows_arrays=True)
     if not isinstance(params, WheelParams):
         return checked_model, params, None
-    ground_per_step = checked_model.split_ground(params, n_steps)
-    if ground_per_step is None:
+    stepwise_ground = checked_model.split_ground(params, n_steps)
+    if stepwise_ground is None:
         return checked_model, params, None
     first_model, _ = checked_model.with_ground(
-        params, tuple(ground_values[0] for ground_values in ground_per_step)
+        params, tuple(ground_values[0] for ground_values in stepwise_ground)
     )
     first_slope = jnp.reshape(params.slope, -1)[0]
     first_wheel = eqx.tree_at(lambda wheel: wheel.slope, params, first_slope)
-    return first_model, first_wheel, ground_per_step
+    return first_model, first_wheel, stepwise_ground
 
 
-def _first_ground(ground_per_step: StepGround, dtype: Any) -> StepGround:
-    """Return the ground of the first step."""
-    return tuple(ground_values[0].astype(dtype) for ground_values in ground_per_step)
+def _get_first_step_ground(
+    stepwise_ground: StepGroundValues, ground_dtype: Any
+) -> StepGroundValues:
+    """Return the ground of the first step, converted to a floating type."""
+    return tuple(ground_values[0].astype(ground_dtype) for ground_values in stepwise_ground)
 
 
 def walk_toward_gait(
@@ -448,15 +466,16 @@ def walk_toward_gait(
 ) -> Walk:
     """Return a walk toward an attracting gait from the default start of the model.
 
-    - `n_steps`: number of steps. The search that follows needs only a state near the gait.
+    - `n_steps`: number of steps, which need not reach the gait, because a search from the last
+      state follows.
     """
     return walk(params, model.default_start(params), n_steps, model=model, options=options)
 
 
-@with_default_settings
+@with_default_jax_settings
 def choose_model(
     params: WheelParams,
-    start: SectionLike,
+    start: SectionStateLike,
     *,
     friction: float | Array = 0.7,
     options: StepOptions | None = None,

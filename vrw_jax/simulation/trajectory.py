@@ -28,16 +28,16 @@ from vrw_jax.contact import (
     unpack_state,
 )
 from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_variables, provenance
-from vrw_jax.models import AbstractWheel, Trajectory, complete_slopes, split_slopes
+from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, split_slopes
 from vrw_jax.numerics import EngineName, StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import SELECTION_ATTRS
+from vrw_jax.selection import MODEL_SELECTION_ATTRIBUTES
 from vrw_jax.simulation.stepping import (
     ModelLike,
-    SectionLike,
+    SectionStateLike,
     check_single_wheel,
-    read_ground,
+    split_stepwise_ground,
     validate_arguments,
 )
 from vrw_jax.validation import check_int, check_not_traced
@@ -52,10 +52,10 @@ from vrw_jax.wheel import (
 )
 
 
-@with_default_settings
+@with_default_jax_settings
 def simulate(
     params: WheelParams,
-    x: SectionLike | None = None,
+    x: SectionStateLike | None = None,
     n_steps: int = 10,
     *,
     model: ModelLike | None = None,
@@ -68,7 +68,7 @@ def simulate(
     Without `x` the walk begins at the default start of the model, near the gait of Table 1. Uneven
     ground is given as in `vrw.walk`. Positions are then in the frame of line 0. Angles and forces
     of a step are in the frame of the line under both feet of its double support. The attribute
-    `slopes` holds the slopes of the lines.
+    `line_slopes` holds the slopes of the lines.
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
@@ -99,211 +99,250 @@ def simulate(
     """
     check_not_traced("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
-    params_with_lines = params
-    checked_model, params, ground_per_step = read_ground(params, model, n_steps)
+    params_with_all_slopes = params
+    checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
     check_single_wheel(params, "simulate one at a time")
     start_state = checked_model.default_start(params) if x is None else x
     params, x, model, options = validate_arguments(
         params, start_state, checked_model, options, engine
     )
-    make_spec = make_contact_spec if model.reports_contacts else make_phase_spec
-    s, model_and_wheel_by_step, ground_lines = (
+    specify_trajectory = (
+        specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
+    )
+    s, models_and_wheels, ground_lines = (
         jax.tree.map(float, params).symbols(),
         [(model, params)],
         None,
     )
-    if ground_per_step is not None:
-        ground_rows = zip(
-            *(step_ground.astype(x.dtype) for step_ground in ground_per_step), strict=True
+    if stepwise_ground is not None:
+        ground_of_steps = zip(
+            *(step_ground.astype(x.dtype) for step_ground in stepwise_ground), strict=True
         )
-        model_and_wheel_by_step = [
-            model.with_ground(params, step_ground) for step_ground in ground_rows
+        models_and_wheels = [
+            model.with_ground(params, step_ground) for step_ground in ground_of_steps
         ]
-        slopes = params_with_lines.slope
-        slopes = slopes if slopes.ndim else jnp.full(n_steps, slopes)
-        slopes = complete_slopes(slopes, n_steps)
-        ground_lines = GroundLines(np.asarray(slopes, float), float(s.Mt * s.g))
-    trajectory_spec = make_spec(model_and_wheel_by_step, options, n_samples)
-    sampled_walk = sample_walk(
+        line_slopes = params_with_all_slopes.slope
+        line_slopes = line_slopes if line_slopes.ndim else jnp.full(n_steps, line_slopes)
+        line_slopes = complete_line_slopes(line_slopes, n_steps)
+        ground_lines = UnevenGroundLines(np.asarray(line_slopes, float), float(s.Mt * s.g))
+    trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
+    sampled_walk = sample_walk_steps(
         trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
     )
-    walk_columns = sampled_walk.columns
-    variables = make_variables(
-        {name: walk_columns[name] for name in trajectory_spec.variable_names}, "time"
+    sampled_columns = sampled_walk.sampled_columns
+    dataset_variables = make_variables(
+        {
+            variable_name: sampled_columns[variable_name]
+            for variable_name in trajectory_spec.variable_names
+        },
+        "time",
     )
-    for name in filter(walk_columns.__contains__, SELECTION_ATTRS):
-        variables[name] = xr.Variable("time", walk_columns[name], SELECTION_ATTRS[name])
-    attrs = {
+    for variable_name in filter(sampled_columns.__contains__, MODEL_SELECTION_ATTRIBUTES):
+        dataset_variables[variable_name] = xr.Variable(
+            "time", sampled_columns[variable_name], MODEL_SELECTION_ATTRIBUTES[variable_name]
+        )
+    walk_attributes = {
         "title": f"Walk of the {type(model).__name__}",
         "n_steps": sampled_walk.n_stepped,
         "outcome": sampled_walk.outcome.name,
         "outcome_meaning": sampled_walk.outcome.meaning,
         "start": np.asarray(x).tolist(),
     }
-    provenance_attrs = trajectory_spec.attrs | provenance(params, model, options)
+    provenance_attributes = trajectory_spec.dataset_attributes | provenance(params, model, options)
     if ground_lines is not None:
-        provenance_attrs |= {"frame": UNEVEN_GROUND_FRAME, "slopes": ground_lines.slopes.tolist()}
-        del provenance_attrs["parameter_slope"]
-    coordinates = {name: variables.pop(name) for name in ("step", "phase") if name in variables}
+        provenance_attributes |= {
+            "frame": UNEVEN_GROUND_FRAME_TEXT,
+            "slopes": ground_lines.line_slopes.tolist(),
+        }
+        del provenance_attributes["parameter_slope"]
+    step_and_phase_coordinates = {
+        variable_name: dataset_variables.pop(variable_name)
+        for variable_name in ("step", "phase")
+        if variable_name in dataset_variables
+    }
     return xr.Dataset(
-        variables, trajectory_spec.coordinates | coordinates, attrs | provenance_attrs
+        dataset_variables,
+        trajectory_spec.extra_coordinates | step_and_phase_coordinates,
+        walk_attributes | provenance_attributes,
     )
 
 
 class SampledStep(NamedTuple):
     """Samples of one step, in each interval between two events."""
 
-    columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
+    sampled_columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
     durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
     outcome: Outcome
     next_section_state: Array  # section state at the end of the step
     period: float  # s
     step_length: float  # distance of the landings along the step's line, m
-    normal_rise: float  # the same normal to that line, m; 0 on flat ground
+    landing_normal_offset: float  # the same normal to that line, m; 0 on flat ground
 
 
-class TrajectorySpec(NamedTuple):
-    """Specification of a trajectory: the sampling function of a model, and the variables."""
+class TrajectorySpecification(NamedTuple):
+    """Description of how a trajectory is sampled: the sampling function of a model, and the
+    variables."""
 
     sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
     variable_names: tuple[str, ...]  # names of the measures over time
     slope_position_names: tuple[str, ...]  # names of the positions along the slope
-    coordinates: dict[str, Any]  # coordinates besides the variables
-    attrs: dict[str, object]
+    extra_coordinates: dict[str, Any]  # coordinates besides the variables
+    dataset_attributes: dict[str, object]
 
 
 class SampledWalk(NamedTuple):
-    """Samples of a walk, with the outcome of its last step."""
+    """Samples of a walk, and the outcome of its last step."""
 
-    columns: dict[str, np.ndarray]  # (time, ...), with `step`; empty if no interval occurred
+    sampled_columns: dict[
+        str, np.ndarray
+    ]  # (time, ...), with `step`; empty if no interval occurred
     n_stepped: int
     outcome: Outcome
 
 
 HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
-"""Energies that are measured relative to the height of the first foot of the walk."""
+"""Energies that depend on the height of the reference point, which is the first foot of the
+walk.
+"""
 
 
-UNEVEN_GROUND_FRAME = (
+UNEVEN_GROUND_FRAME_TEXT = (
     "positions: x downhill along line 0, z normal to it, first foot at the origin; angles and "
     "forces: along and normal to the line under both feet of the step's double support"
 )
-"""Attribute `frame` of a trajectory on uneven ground."""
+"""Text of the attribute `frame` of a trajectory on uneven ground."""
 
 
-class GroundLines(NamedTuple):
-    """Lines of uneven ground, with the weight of the wheel."""
+class UnevenGroundLines(NamedTuple):
+    """Slopes of the lines of uneven ground, and the weight of the wheel."""
 
-    slopes: np.ndarray  # rad
-    weight: float  # N
+    line_slopes: np.ndarray  # rad
+    wheel_weight: float  # N
 
     def convert_to_walk_frame(
         self,
-        columns: dict[str, np.ndarray],
+        step_columns: dict[str, np.ndarray],
         position_names: Sequence[str],
         k: int,
         foothold: np.ndarray,
     ) -> None:
-        """Convert positions (m) and energies (J) of step k, in place, from its frame to that of
-        line 0.
+        """Convert positions (m) and energies (J) of step k in place, from the frame of the step's
+        line to that of line 0.
 
-        - `position_names`: columns that are positions along the slope;
+        - `position_names`: names of the columns that are positions along the slope;
         - `foothold`: position of the first foot of step k in the frame of line 0, m.
         """
-        for name in position_names:
-            normal_name = f"{name[:-1]}z"
-            x, z = self.rotate_to_line_0(k, columns[name], columns[normal_name])
-            columns[name], columns[normal_name] = x + foothold[0], z + foothold[1]
-        slope = self.slopes[0]
-        height = foothold[1] * np.cos(slope) - foothold[0] * np.sin(slope)
-        for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            columns[name] = columns[name] + self.weight * height
+        for column_name in position_names:
+            normal_column_name = f"{column_name[:-1]}z"
+            x, z = self.rotate_to_line_0(
+                k, step_columns[column_name], step_columns[normal_column_name]
+            )
+            step_columns[column_name], step_columns[normal_column_name] = (
+                x + foothold[0],
+                z + foothold[1],
+            )
+        first_line_slope = self.line_slopes[0]
+        foothold_height = foothold[1] * np.cos(first_line_slope) - foothold[0] * np.sin(
+            first_line_slope
+        )
+        for column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            step_columns[column_name] = (
+                step_columns[column_name] + self.wheel_weight * foothold_height
+            )
 
     def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
         """Return the components in the frame of line 0 of a vector in the frame of line k."""
-        angle = self.slopes[k] - self.slopes[0]
-        sin, cos = np.sin(angle), np.cos(angle)
-        return x * cos + z * sin, z * cos - x * sin
+        line_angle = self.line_slopes[k] - self.line_slopes[0]
+        sine, cosine = np.sin(line_angle), np.cos(line_angle)
+        return x * cosine + z * sine, z * cosine - x * sine
 
 
-def sample_walk(
-    trajectory_spec: TrajectorySpec,
+def sample_walk_steps(
+    trajectory_spec: TrajectorySpecification,
     x: Array,
     n_steps: int,
     downslope_weight: float,
-    ground_lines: GroundLines | None = None,
+    ground_lines: UnevenGroundLines | None = None,
 ) -> SampledWalk:
     """Return the samples of a walk from the section state x, which ends at the first failure.
 
     Positions along the slope, m, are measured from the first landing. The energies in
     `HEIGHT_DEPENDENT_ENERGIES` decrease by `downslope_weight`, N, times the traveled distance. On
-    uneven ground, `GroundLines.convert_to_walk_frame` replaces both conversions.
+    uneven ground, `UnevenGroundLines.convert_to_walk_frame` converts positions and energies
+    instead.
     """
     columns_by_step: list[dict[str, np.ndarray]] = []
-    outcome, n_stepped, start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
+    walk_outcome, n_stepped, step_start_time, traveled_distance = Outcome.STEPPED, 0, 0.0, 0.0
     foothold = np.zeros(2)
-    while outcome == Outcome.STEPPED and n_stepped < n_steps:
+    while walk_outcome == Outcome.STEPPED and n_stepped < n_steps:
         sampled_step = trajectory_spec.sample_step(x, n_stepped)
         has_occurred, step_columns = sampled_step.durations > 0.0, dict[str, np.ndarray]()
         # A full slice copies nothing.
         occurred_selection = slice(None) if has_occurred.all() else has_occurred
-        for name, values in sampled_step.columns.items():
-            step_columns[name] = values[occurred_selection].reshape(-1, *values.shape[2:])
+        for column_name, sampled_values in sampled_step.sampled_columns.items():
+            step_columns[column_name] = sampled_values[occurred_selection].reshape(
+                -1, *sampled_values.shape[2:]
+            )
         if ground_lines is None:
-            for name in trajectory_spec.slope_position_names:
-                step_columns[name] = step_columns[name] + traveled_distance
-            for name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-                step_columns[name] = step_columns[name] - downslope_weight * traveled_distance
+            for column_name in trajectory_spec.slope_position_names:
+                step_columns[column_name] = step_columns[column_name] + traveled_distance
+            for column_name in step_columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+                step_columns[column_name] = (
+                    step_columns[column_name] - downslope_weight * traveled_distance
+                )
         else:
             ground_lines.convert_to_walk_frame(
                 step_columns, trajectory_spec.slope_position_names, n_stepped, foothold
             )
-            displacement = ground_lines.rotate_to_line_0(
-                n_stepped, sampled_step.step_length, sampled_step.normal_rise
+            foothold_displacement = ground_lines.rotate_to_line_0(
+                n_stepped, sampled_step.step_length, sampled_step.landing_normal_offset
             )
-            foothold = foothold + displacement
-        step_columns["time"] = step_columns["time"] + start_time
+            foothold = foothold + foothold_displacement
+        step_columns["time"] = step_columns["time"] + step_start_time
         step_columns["step"] = np.full(len(step_columns["time"]), n_stepped)
         columns_by_step.append(step_columns)
-        outcome = sampled_step.outcome
-        if outcome == Outcome.STEPPED:
+        walk_outcome = sampled_step.outcome
+        if walk_outcome == Outcome.STEPPED:
             n_stepped += 1
-            start_time += sampled_step.period
+            step_start_time += sampled_step.period
             traveled_distance += sampled_step.step_length
             x = sampled_step.next_section_state
-    columns = {
-        name: np.concatenate([step_columns[name] for step_columns in columns_by_step])
-        for name in columns_by_step[0]
+    walk_columns = {
+        column_name: np.concatenate([step_columns[column_name] for step_columns in columns_by_step])
+        for column_name in columns_by_step[0]
     }
-    return SampledWalk(columns, n_stepped, outcome)
+    return SampledWalk(walk_columns, n_stepped, walk_outcome)
 
 
 @functools.cache
-def _compile_step_sampling(
-    model: AbstractWheel, structure: Any, n_samples: int
+def _compile_step_sampler(
+    model: AbstractWheel, argument_structure: Any, n_samples: int
 ) -> Callable[..., Trajectory]:
-    """Return the compiled function that samples a step from x and the leaves of its inputs."""
+    """Return the compiled function that samples a step. Its arguments are the section state and the
+    leaves of wheel and options."""
 
     def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
-        params, options = jax.tree.unflatten(structure, leaves)
+        params, options = jax.tree.unflatten(argument_structure, leaves)
         return model.sample_step(params, x, options, n_samples)
 
     return jax.jit(sample_paper_step)
 
 
-def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
+def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return the columns of a step by the names of `TRAJECTORY_MEASURES`, shape (phase, sample).
 
     Positions are relative to the foot of Leg 1. The columns `landing_foot_x` and `landing_foot_z`
-    are added: the position of the foot of the leg that lands next, m.
+    are added. They give the position of the foot of the leg that lands next, m.
     """
     theta, L1, L2, dtheta, dL1, dL2 = np.moveaxis(np.asarray(trajectory.state), -1, 0)
-    kinetic, gravitational, elastic = np.moveaxis(np.asarray(trajectory.energy), -1, 0)
-    forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
-    motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
-    rear_leg = rear_direction(s, motion.sin, motion.cos)
-    hub_x, hub_z, zeros = L1 * motion.sin, L1 * motion.cos, np.zeros_like(L1)
-    landing_leg = landing_direction(s, motion.sin, motion.cos)
+    kinetic_energy, gravitational_energy, elastic_energy = np.moveaxis(
+        np.asarray(trajectory.energy), -1, 0
+    )
+    foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
+    wheel_motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
+    rear_leg_direction = rear_direction(s, wheel_motion.sin, wheel_motion.cos)
+    hub_x, hub_z, zeros = L1 * wheel_motion.sin, L1 * wheel_motion.cos, np.zeros_like(L1)
+    landing_leg_direction = landing_direction(s, wheel_motion.sin, wheel_motion.cos)
     return {
         "time": np.array(trajectory.time),
         "x": zeros,
@@ -316,69 +355,83 @@ def _make_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndarray]:
         "dtheta": dtheta,
         "dL1": dL1,
         "dL2": dL2,
-        **{f"lambda_{i + 1}": force for i, force in enumerate(forces)},
-        "kinetic_energy": kinetic,
-        "gravitational_energy": gravitational,
-        "elastic_energy": elastic,
-        "total_energy": kinetic + gravitational + elastic,
-        "damping_power": damping_power(s, motion),
+        **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
+        "kinetic_energy": kinetic_energy,
+        "gravitational_energy": gravitational_energy,
+        "elastic_energy": elastic_energy,
+        "total_energy": kinetic_energy + gravitational_energy + elastic_energy,
+        "damping_power": damping_power(s, wheel_motion),
         "foot_1_x": zeros,
         "foot_1_z": zeros,
-        "foot_2_x": hub_x - L2 * rear_leg.sin,
-        "foot_2_z": hub_z - L2 * rear_leg.cos,
+        "foot_2_x": hub_x - L2 * rear_leg_direction.sin,
+        "foot_2_z": hub_z - L2 * rear_leg_direction.cos,
         "hub_x": hub_x,
         "hub_z": hub_z,
-        "landing_foot_x": hub_x - s.L0 * landing_leg.sin,
-        "landing_foot_z": hub_z - s.L0 * landing_leg.cos,
+        "landing_foot_x": hub_x - s.L0 * landing_leg_direction.sin,
+        "landing_foot_z": hub_z - s.L0 * landing_leg_direction.cos,
     }
 
 
-StepWheels = list[tuple[Any, WheelParams]]
+StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
 """Model and wheel of each step, or one pair for all steps."""
 
 
-def make_phase_spec(
-    model_and_wheel_by_step: StepWheels, options: StepOptions, n_samples: int
-) -> TrajectorySpec:
-    """Return the specification of a trajectory for a model whose steps have the paper's phases."""
+def specify_phase_trajectory(
+    models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpecification:
+    """Return the description of a trajectory for a model whose steps have the paper's phases."""
 
-    def prepare_step(model: AbstractWheel, params: WheelParams) -> tuple:
-        leaves, structure = jax.tree.flatten((params, options))
+    def prepare_step_sampler(model: AbstractWheel, params: WheelParams) -> tuple:
+        argument_leaves, argument_structure = jax.tree.flatten((params, options))
         s = jax.tree.map(float, split_slopes(params)[0]).symbols()
-        return s, _compile_step_sampling(model, structure, n_samples), leaves
+        return s, _compile_step_sampler(model, argument_structure, n_samples), argument_leaves
 
-    prepared_steps = [prepare_step(*model_and_wheel) for model_and_wheel in model_and_wheel_by_step]
+    prepared_steps = [
+        prepare_step_sampler(*model_and_wheel) for model_and_wheel in models_and_wheels
+    ]
 
-    def sample_paper_step(x: Array, k: int) -> SampledStep:
-        s, sample_states, leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
-        trajectory = sample_states(x, *leaves)
-        columns, durations = _make_columns(s, trajectory), np.asarray(trajectory.durations)
-        landing_foot = columns.pop("landing_foot_x"), columns.pop("landing_foot_z")
-        columns["phase"] = np.tile(np.arange(len(durations))[:, None], (1, n_samples))
-        occurred_phases = np.flatnonzero(durations > 0.0)
-        step_length, normal_rise = 0.0, 0.0
+    def sample_phase_step(x: Array, k: int) -> SampledStep:
+        s, sample_step_states, argument_leaves = prepared_steps[k if len(prepared_steps) > 1 else 0]
+        trajectory = sample_step_states(x, *argument_leaves)
+        step_columns, phase_durations = (
+            _make_phase_columns(s, trajectory),
+            np.asarray(trajectory.durations),
+        )
+        landing_foot_columns = (
+            step_columns.pop("landing_foot_x"),
+            step_columns.pop("landing_foot_z"),
+        )
+        step_columns["phase"] = np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples))
+        occurred_phases = np.flatnonzero(phase_durations > 0.0)
+        step_length, landing_normal_offset = 0.0, 0.0
         if occurred_phases.size:
-            step_length, normal_rise = (float(x[occurred_phases[-1], -1]) for x in landing_foot)
+            step_length, landing_normal_offset = (
+                float(x[occurred_phases[-1], -1]) for x in landing_foot_columns
+            )
         return SampledStep(
-            columns,
-            durations,
+            step_columns,
+            phase_durations,
             Outcome(int(trajectory.outcome)),
             trajectory.section_state,
-            float(durations.sum()),
+            float(phase_durations.sum()),
             step_length,
-            normal_rise,
+            landing_normal_offset,
         )
 
-    attrs: dict[str, object] = {
+    dataset_attributes: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first foot at the origin",
         "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
     }
-    return TrajectorySpec(
-        sample_paper_step, tuple(TRAJECTORY_MEASURES), PHASE_SLOPE_POSITIONS, {}, attrs
+    return TrajectorySpecification(
+        sample_phase_step,
+        tuple(TRAJECTORY_MEASURES),
+        PHASE_SLOPE_POSITION_NAMES,
+        {},
+        dataset_attributes,
     )
 
 
-PHASE_SLOPE_POSITIONS = ("x", "foot_1_x", "foot_2_x", "hub_x")
+PHASE_SLOPE_POSITION_NAMES = ("x", "foot_1_x", "foot_2_x", "hub_x")
 """Names of the columns that are positions along the slope."""
 
 
@@ -387,39 +440,43 @@ CONTACT_ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energ
 
 
 @eqx.filter_jit
-def _make_contact_columns(
+def _compute_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
-    """Return the trajectory of a step and its columns, shape (phase, sample[, leg])."""
+    """Return the trajectory of a step with unilateral contact, and its columns, shape (phase,
+    sample[, leg])."""
     s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
     def compute_state_quantities(y: PackedState) -> dict[str, Array]:
         """Return positions (m), rates and energies (J) of one state by column name."""
-        motion, _ = unpack_state(y)
-        directions = leg_directions(s, motion.theta)
-        gravitational, elastic = potential_energy(s, motion)
+        wheel_motion, _ = unpack_state(y)
+        leg_directions_of_state = leg_directions(s, wheel_motion.theta)
+        gravitational_energy, elastic_energy = potential_energy(s, wheel_motion)
         return {
-            "hub_x": motion.x,
-            "hub_z": motion.z,
-            "theta": motion.theta,
-            "dtheta": motion.dtheta,
-            "kinetic_energy": kinetic_energy(s, motion),
-            "gravitational_energy": gravitational,
-            "elastic_energy": elastic,
-            "length": motion.L,
-            "length_rate": motion.dL,
-            "foot_x": foot_positions(motion, directions),
-            "foot_z": foot_heights(motion, directions),
+            "hub_x": wheel_motion.x,
+            "hub_z": wheel_motion.z,
+            "theta": wheel_motion.theta,
+            "dtheta": wheel_motion.dtheta,
+            "kinetic_energy": kinetic_energy(s, wheel_motion),
+            "gravitational_energy": gravitational_energy,
+            "elastic_energy": elastic_energy,
+            "length": wheel_motion.L,
+            "length_rate": wheel_motion.dL,
+            "foot_x": foot_positions(wheel_motion, leg_directions_of_state),
+            "foot_z": foot_heights(wheel_motion, leg_directions_of_state),
         }
 
-    columns = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
-    return trajectory, columns | {"tangential": trajectory.tangential, "normal": trajectory.normal}
+    state_columns = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
+    return trajectory, state_columns | {
+        "tangential": trajectory.tangential,
+        "normal": trajectory.normal,
+    }
 
 
-def make_contact_spec(
-    model_and_wheel_by_step: StepWheels, options: StepOptions, n_samples: int
-) -> TrajectorySpec:
-    """Return the specification of a trajectory for a model with unilateral contact, over time and
+def specify_contact_trajectory(
+    models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpecification:
+    """Return the description of a trajectory for a model with unilateral contact, over time and
     leg.
 
     Legs have the labels of their step. Each interval between two events has `n_samples` times,
@@ -427,44 +484,47 @@ def make_contact_spec(
     at each time and the reason (see `ModelChoice`).
     """
 
-    frictions = [float(model.friction) for model, _ in model_and_wheel_by_step]
-    n_legs = model_and_wheel_by_step[0][1].n_legs
+    friction_by_step = [float(model.friction) for model, _ in models_and_wheels]
+    n_legs = models_and_wheels[0][1].n_legs
 
     def sample_contact_step(x: Array, k: int) -> SampledStep:
-        model_and_wheel = model_and_wheel_by_step[k if len(model_and_wheel_by_step) > 1 else 0]
-        trajectory, columns = jax.tree.map(
-            np.array, _make_contact_columns(*model_and_wheel, x, options, n_samples)
+        model_and_wheel = models_and_wheels[k if len(models_and_wheels) > 1 else 0]
+        trajectory, step_columns = jax.tree.map(
+            np.array, _compute_contact_columns(*model_and_wheel, x, options, n_samples)
         )
         sample_shape = (len(trajectory.duration), n_samples)
         repeat_over_samples = lambda values_by_leg: np.repeat(
             values_by_leg[:, None], n_samples, axis=1
         )
-        columns |= {"time": trajectory.time, "contact": repeat_over_samples(trajectory.contact)}
-        columns |= {
-            name: np.full(sample_shape, int(value))
-            for name, value in trajectory.model_selection.items()
+        step_columns |= {
+            "time": trajectory.time,
+            "contact": repeat_over_samples(trajectory.contact),
         }
-        columns["on_stopper"] = repeat_over_samples(trajectory.locked)
+        step_columns |= {
+            variable_name: np.full(sample_shape, int(selection_code))
+            for variable_name, selection_code in trajectory.model_selection.items()
+        }
+        step_columns["on_stopper"] = repeat_over_samples(trajectory.locked)
         occurred_intervals = np.flatnonzero(trajectory.duration > 0.0)
-        normal_rise = 0.0
+        landing_normal_offset = 0.0
         if occurred_intervals.size:  # The foremost foot has landed.
-            normal_rise = float(columns["foot_z"][occurred_intervals[-1], -1, -1])
+            landing_normal_offset = float(step_columns["foot_z"][occurred_intervals[-1], -1, -1])
         return SampledStep(
-            columns,
+            step_columns,
             trajectory.duration,
             Outcome(int(trajectory.outcome)),
             jnp.asarray(trajectory.section_state),
             float(trajectory.duration.sum()),
             float(trajectory.step_length),
-            normal_rise,
+            landing_normal_offset,
         )
 
-    attrs: dict[str, object] = {
+    dataset_attributes: dict[str, object] = {
         "frame": "x downhill along the slope, z normal to it, first landing at the origin",
-        "friction": frictions[0] if len(set(frictions)) == 1 else frictions,
+        "friction": friction_by_step[0] if len(set(friction_by_step)) == 1 else friction_by_step,
     }
     variable_names = (*CONTACT_MOTION_NAMES, *CONTACT_ENERGY_NAMES, *CONTACT_MEASURES)
     leg_coordinate = {"leg": np.arange(1, n_legs + 1)}
-    return TrajectorySpec(
-        sample_contact_step, variable_names, ("hub_x", "foot_x"), leg_coordinate, attrs
+    return TrajectorySpecification(
+        sample_contact_step, variable_names, ("hub_x", "foot_x"), leg_coordinate, dataset_attributes
     )

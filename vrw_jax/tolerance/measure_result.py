@@ -10,7 +10,7 @@ from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StatusCode
 from vrw_jax.printing import (
     AbstractPrintable,
-    TextRow,
+    LabelAndText,
     describe_elements,
     describe_ending,
     format_outcome_counts,
@@ -154,7 +154,7 @@ class MeasureResult(AbstractPrintable):
         measures_text = "; ".join(self._format_measure(i) for i in range(len(self.names)))
         return f"{measures_text}: {self.why}. {_format_rounded(1e3 * self.seconds)} ms"
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         if not self.models.ndim:
             return []
         model_names = [str(name) for name in self.model]

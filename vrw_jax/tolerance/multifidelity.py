@@ -20,8 +20,8 @@ import numpy as np
 
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions, take_rows
-from vrw_jax.printing import AbstractPrintable, TextRow
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.printing import AbstractPrintable, LabelAndText
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import GroundBatch
 from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, ModelIndex, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult
@@ -115,7 +115,7 @@ class MultifidelityMean(AbstractPrintable):
             f"{self.n_gaits:.0f} of them have a gait."
         )
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         unit = MEASURES[self.measure].display_unit
         return [
             (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {unit}".strip()),
@@ -137,7 +137,7 @@ class _SamplingPlan(NamedTuple):
     control_index: int
 
 
-@with_default_settings
+@with_default_jax_settings
 def multifidelity_mean(
     measure: str,
     params: WheelParams,

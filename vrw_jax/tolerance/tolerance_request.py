@@ -18,7 +18,7 @@ import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, take_rows
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, GroundBatch
 from vrw_jax.tolerance.lower_fidelity import (
     LowerFidelityGait,
@@ -83,7 +83,7 @@ REQUEST_OPTIONS = RequestOptions()
 """Options of `vrw.measure_to_tolerance`."""
 
 
-@with_default_settings
+@with_default_jax_settings
 def measure_to_tolerance(
     measures: str | Sequence[str],
     params: WheelParams,

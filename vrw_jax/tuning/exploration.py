@@ -1,8 +1,8 @@
 """Exploration of many starts: an augmented Lagrangian, maximized by optax's Adam in one batch.
 
-First-order steps bring every start near a local optimum, and the best one is selected for the
-maximization. If a trial loses its gait, its start keeps its place and takes half the step size from
-then on.
+First-order steps bring every start near a local optimum, and the maximization continues from the
+best start. If a trial loses its gait, its start keeps the previous parameters, and its step size is
+halved.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import numpy as np
 from vrw_jax.cycles import is_same_branch
 from vrw_jax.numerics import take_rows
 from vrw_jax.runtime import lazy_import
-from vrw_jax.tuning.objective import GaitEvaluation, max_breach, scale_slacks
+from vrw_jax.tuning.objective import GaitEvaluation, compute_max_violation, compute_slack_scales
 from vrw_jax.wheel import Outcome
 
 optax = lazy_import("optax")
@@ -26,164 +26,197 @@ optax = lazy_import("optax")
 class ExplorationOptions:
     """Options of the exploration of many starts.
 
-    - `n_steps`: number of first-order steps;
-    - `learning_rate`: length of Adam's first step, in widths of the bounds;
-    - `gradient_decay`, `square_decay`: decay rates of Adam's averages of the gradient and of its
-      square;
+    - `n_first_order_steps`: number of first-order steps;
+    - `first_step_length`: length of Adam's first step, in widths of the bounds;
+    - `gradient_decay`, `squared_gradient_decay`: decay rates of Adam's averages of the gradient and
+      of its square;
     - `penalty_weight`: penalty on a violation of one width of the bounds, in units of the
       objective.
     """
 
-    n_steps: int = 25
-    learning_rate: float = 0.06
+    n_first_order_steps: int = 25
+    first_step_length: float = 0.06
     gradient_decay: float = 0.7
-    square_decay: float = 0.9
+    squared_gradient_decay: float = 0.9
     penalty_weight: float = 4.0
 
 
-EXPLORATION_OPTIONS = ExplorationOptions()
+DEFAULT_EXPLORATION_OPTIONS = ExplorationOptions()
 """Options of the exploration by `vrw.tune`."""
 
-EvaluateBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
-"""Function that returns the gaits at rows of normalized parameters, one per start, searched for
-from neighboring gaits.
-"""
+EvaluateGaitBatch = Callable[[np.ndarray, GaitEvaluation | None], GaitEvaluation]
+"""Function that returns the gaits at rows of normalized parameters, one per start. The search
+begins at neighboring gaits, if given."""
 
 
-class Exploration(NamedTuple):
+class ExplorationResult(NamedTuple):
     """Results of the exploration, one row per start."""
 
     normalized_starts: np.ndarray  # (n_starts, n_free): starts in widths of the bounds
     normalized_parameters: np.ndarray
     objective: np.ndarray  # objective at the end; NaN if no gait was found
-    max_breach: np.ndarray  # largest violation of a constraint, in widths of the bounds
-    merit: np.ndarray  # objective minus the penalty on the violation
-    n_lost: np.ndarray  # number of trials that lost the gait or its branch
+    max_violations: np.ndarray  # largest violation of a constraint, in widths of the bounds
+    penalized_objectives: np.ndarray  # objective minus the penalty on the violation
+    n_lost_trials: np.ndarray  # number of trials that lost the gait or its branch
     n_evaluations: int  # number of evaluated gaits
 
     @property
-    def best_index(self) -> int:
-        """Return the index of the start with the highest merit, from which the maximization
-        continues.
-        """
-        return int(np.nanargmax(self.merit))
+    def best_start_index(self) -> int:
+        """Return the index of the start with the highest penalized objective, from which the
+        maximization continues."""
+        return int(np.nanargmax(self.penalized_objectives))
 
 
 def explore_starts(
-    evaluate: EvaluateBatch,
-    starts: np.ndarray,
-    parameter_change: Callable[[np.ndarray], np.ndarray],
+    evaluate_gaits: EvaluateGaitBatch,
+    normalized_starts: np.ndarray,
+    compute_parameter_changes: Callable[[np.ndarray], np.ndarray],
     free_indices: list[int],
-    widths: np.ndarray,
+    bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
-    options: ExplorationOptions = EXPLORATION_OPTIONS,
-) -> Exploration:
-    """Take first-order steps from every start, and return where they end.
+    exploration_options: ExplorationOptions = DEFAULT_EXPLORATION_OPTIONS,
+) -> ExplorationResult:
+    """Take first-order steps from every start, and return the ends.
 
-    `parameter_change` converts changes of u to changes of the parameters. Jacobians of a gait are
-    with respect to all parameters; `free_indices` select the free ones.
+    `compute_parameter_changes` converts changes of normalized parameters to changes of all
+    parameters. Jacobians of a gait are with respect to all parameters; `free_indices` selects the
+    free ones.
     """
-    n_starts = starts.shape[0]
-    trial_evaluation = evaluate(starts, None)
-    is_active = has_gait(trial_evaluation) & _is_finite(trial_evaluation, free_indices)
-    slacks, slack_jacobian = _slack_and_jacobian(
-        trial_evaluation, free_indices, widths, min_constraint_values
+    n_starts = normalized_starts.shape[0]
+    trial_evaluation = evaluate_gaits(normalized_starts, None)
+    has_active_gait = find_starts_with_gait(trial_evaluation) & _find_finite_evaluations(
+        trial_evaluation, free_indices
     )
-    scales = scale_slacks(slacks, slack_jacobian)[is_active]
-    scales = np.median(scales, axis=0) if is_active.any() else np.ones(min_constraint_values.size)
-    objective_scale = _objective_gradient(trial_evaluation, free_indices, widths)[is_active]
-    objective_scale = np.median(np.linalg.norm(objective_scale, axis=1)) if is_active.any() else 1.0
-    learning_rates = np.full((n_starts, 1), options.learning_rate)
-    optimizer = optax.scale_by_adam(b1=options.gradient_decay, b2=options.square_decay)
-    optimizer_state = optimizer.init(jnp.asarray(starts))
-    multipliers = np.zeros((n_starts, min_constraint_values.size))
-    normalized_parameters, evaluation = starts.copy(), trial_evaluation
-    n_lost = np.zeros(n_starts, int)
-    for step_index in range(options.n_steps):
-        slacks, slack_jacobian = _slack_and_jacobian(
-            evaluation, free_indices, widths, min_constraint_values
+    constraint_slacks, slack_jacobians = _compute_slacks_and_jacobians(
+        trial_evaluation, free_indices, bound_widths, min_constraint_values
+    )
+    slack_scales = compute_slack_scales(constraint_slacks, slack_jacobians)[has_active_gait]
+    slack_scales = (
+        np.median(slack_scales, axis=0)
+        if has_active_gait.any()
+        else np.ones(min_constraint_values.size)
+    )
+    objective_gradient_norm = _compute_objective_gradients(
+        trial_evaluation, free_indices, bound_widths
+    )[has_active_gait]
+    objective_gradient_norm = (
+        np.median(np.linalg.norm(objective_gradient_norm, axis=1)) if has_active_gait.any() else 1.0
+    )
+    step_lengths = np.full((n_starts, 1), exploration_options.first_step_length)
+    optimizer = optax.scale_by_adam(
+        b1=exploration_options.gradient_decay, b2=exploration_options.squared_gradient_decay
+    )
+    optimizer_state = optimizer.init(jnp.asarray(normalized_starts))
+    constraint_multipliers = np.zeros((n_starts, min_constraint_values.size))
+    normalized_parameters, current_evaluation = normalized_starts.copy(), trial_evaluation
+    n_lost_trials = np.zeros(n_starts, int)
+    for step_index in range(exploration_options.n_first_order_steps):
+        constraint_slacks, slack_jacobians = _compute_slacks_and_jacobians(
+            current_evaluation, free_indices, bound_widths, min_constraint_values
         )
-        weights = np.maximum(0.0, multipliers - options.penalty_weight * slacks / scales)
-        multipliers = np.where(is_active[:, None], weights, multipliers)
-        penalty_gradient = np.einsum("lc,lcf->lf", weights / scales, slack_jacobian)
+        penalty_weights = np.maximum(
+            0.0,
+            constraint_multipliers
+            - exploration_options.penalty_weight * constraint_slacks / slack_scales,
+        )
+        constraint_multipliers = np.where(
+            has_active_gait[:, None], penalty_weights, constraint_multipliers
+        )
+        penalty_gradient = np.einsum("lc,lcf->lf", penalty_weights / slack_scales, slack_jacobians)
         ascent_direction = (
-            _objective_gradient(evaluation, free_indices, widths) / objective_scale
+            _compute_objective_gradients(current_evaluation, free_indices, bound_widths)
+            / objective_gradient_norm
             + penalty_gradient
         )
-        ascent_direction = np.where(is_active[:, None], ascent_direction, 0.0)
+        ascent_direction = np.where(has_active_gait[:, None], ascent_direction, 0.0)
         adam_update, optimizer_state = optimizer.update(
             jnp.asarray(ascent_direction), optimizer_state
         )
-        step_sizes = learning_rates * 0.5 * (1.0 + np.cos(np.pi * step_index / options.n_steps))
-        trial_parameters = np.clip(
-            normalized_parameters + step_sizes * np.asarray(adam_update), 0.0, 1.0
+        trial_step_lengths = (
+            step_lengths
+            * 0.5
+            * (1.0 + np.cos(np.pi * step_index / exploration_options.n_first_order_steps))
         )
-        trial_evaluation = evaluate(trial_parameters, evaluation)
-        is_accepted = (
-            has_gait(trial_evaluation)
-            & _is_finite(trial_evaluation, free_indices)
-            & is_active
-            & _stays_on_branch(
-                evaluation,
+        trial_parameters = np.clip(
+            normalized_parameters + trial_step_lengths * np.asarray(adam_update), 0.0, 1.0
+        )
+        trial_evaluation = evaluate_gaits(trial_parameters, current_evaluation)
+        is_trial_accepted = (
+            find_starts_with_gait(trial_evaluation)
+            & _find_finite_evaluations(trial_evaluation, free_indices)
+            & has_active_gait
+            & _find_trials_on_branch(
+                current_evaluation,
                 trial_evaluation,
-                parameter_change(trial_parameters - normalized_parameters),
+                compute_parameter_changes(trial_parameters - normalized_parameters),
             )
         )
-        n_lost += is_active & ~is_accepted
-        learning_rates = np.where(is_accepted[:, None], learning_rates, 0.5 * learning_rates)
+        n_lost_trials += has_active_gait & ~is_trial_accepted
+        step_lengths = np.where(is_trial_accepted[:, None], step_lengths, 0.5 * step_lengths)
         normalized_parameters = np.where(
-            is_accepted[:, None], trial_parameters, normalized_parameters
+            is_trial_accepted[:, None], trial_parameters, normalized_parameters
         )
-        select_accepted = lambda new_leaf, old_leaf, accepted=is_accepted: jnp.where(
+        select_accepted = lambda new_leaf, old_leaf, accepted=is_trial_accepted: jnp.where(
             accepted.reshape(-1, *(1,) * (jnp.ndim(new_leaf) - 1)), new_leaf, old_leaf
         )
-        evaluation = jax.tree.map(select_accepted, trial_evaluation, evaluation)
-    slacks, _ = _slack_and_jacobian(evaluation, free_indices, widths, min_constraint_values)
-    objective = np.where(is_active, np.asarray(evaluation.values)[:, 0], np.nan)
-    largest_breach = max_breach(slacks, scales)
-    merit = objective - options.penalty_weight * np.abs(objective) * largest_breach
-    n_evaluations = n_starts * (options.n_steps + 1)
-    return Exploration(
-        starts, normalized_parameters, objective, largest_breach, merit, n_lost, n_evaluations
+        current_evaluation = jax.tree.map(select_accepted, trial_evaluation, current_evaluation)
+    constraint_slacks, _ = _compute_slacks_and_jacobians(
+        current_evaluation, free_indices, bound_widths, min_constraint_values
+    )
+    end_objectives = np.where(has_active_gait, np.asarray(current_evaluation.values)[:, 0], np.nan)
+    max_violations = compute_max_violation(constraint_slacks, slack_scales)
+    penalized_objectives = (
+        end_objectives
+        - exploration_options.penalty_weight * np.abs(end_objectives) * max_violations
+    )
+    n_evaluations = n_starts * (exploration_options.n_first_order_steps + 1)
+    return ExplorationResult(
+        normalized_starts,
+        normalized_parameters,
+        end_objectives,
+        max_violations,
+        penalized_objectives,
+        n_lost_trials,
+        n_evaluations,
     )
 
 
-def has_gait(evaluation: GaitEvaluation) -> np.ndarray:
+def find_starts_with_gait(gait_evaluation: GaitEvaluation) -> np.ndarray:
     """Return whether each start has a gait that the event-driven step confirms."""
-    return evaluation.gait.outcome == Outcome.STEPPED
+    return gait_evaluation.gait.outcome == Outcome.STEPPED
 
 
-def _is_finite(evaluation: GaitEvaluation, free_indices: list[int]) -> np.ndarray:
-    """Return whether all values, and derivatives with respect to the free parameters, of each
-    start are finite.
-    """
-    jacobian = np.asarray(evaluation.jacobian)[:, free_indices]
-    return np.isfinite(evaluation.values).all(-1) & np.isfinite(jacobian).all((-1, -2))
-
-
-def _objective_gradient(
-    evaluation: GaitEvaluation, free_indices: list[int], widths: np.ndarray
+def _find_finite_evaluations(
+    gait_evaluation: GaitEvaluation, free_indices: list[int]
 ) -> np.ndarray:
-    """Return the gradient of the objective with respect to the normalized parameters, (starts,
-    free).
-    """
-    return np.asarray(evaluation.jacobian)[:, free_indices, 0] * widths
+    """Return whether all values of each start, and their derivatives by the free parameters, are
+    finite."""
+    free_jacobian = np.asarray(gait_evaluation.jacobian)[:, free_indices]
+    return np.isfinite(gait_evaluation.values).all(-1) & np.isfinite(free_jacobian).all((-1, -2))
 
 
-def _slack_and_jacobian(
-    evaluation: GaitEvaluation,
+def _compute_objective_gradients(
+    gait_evaluation: GaitEvaluation, free_indices: list[int], bound_widths: np.ndarray
+) -> np.ndarray:
+    """Return the gradient of the objective by the normalized parameters, shape (starts, free)."""
+    return np.asarray(gait_evaluation.jacobian)[:, free_indices, 0] * bound_widths
+
+
+def _compute_slacks_and_jacobians(
+    gait_evaluation: GaitEvaluation,
     free_indices: list[int],
-    widths: np.ndarray,
+    bound_widths: np.ndarray,
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slacks (starts, constraints), and their derivatives by normalized parameters (starts,
-    constraints, free).
-    """
-    jacobian = np.swapaxes(np.asarray(evaluation.jacobian)[:, free_indices, 1:], 1, 2) * widths
-    return np.asarray(evaluation.values)[:, 1:] - min_constraint_values, jacobian
+    """Return the slacks (starts, constraints), and their derivatives by the normalized parameters
+    (starts, constraints, free)."""
+    slack_jacobians = (
+        np.swapaxes(np.asarray(gait_evaluation.jacobian)[:, free_indices, 1:], 1, 2) * bound_widths
+    )
+    return np.asarray(gait_evaluation.values)[:, 1:] - min_constraint_values, slack_jacobians
 
 
-def _stays_on_branch(
+def _find_trials_on_branch(
     previous_evaluation: GaitEvaluation,
     trial_evaluation: GaitEvaluation,
     parameter_changes: np.ndarray,
@@ -194,7 +227,7 @@ def _stays_on_branch(
         trial_evaluation.gait.branch_point,
     )
     point_pairs = (
-        (*take_rows((previous_points, trial_points), start_index), parameter_change)
-        for start_index, parameter_change in enumerate(parameter_changes)
+        (*take_rows((previous_points, trial_points), start_index), parameter_changes_of_start)
+        for start_index, parameter_changes_of_start in enumerate(parameter_changes)
     )
     return np.array([is_same_branch(*point_pair) for point_pair in point_pairs])

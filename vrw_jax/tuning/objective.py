@@ -13,64 +13,66 @@ from vrw_jax.models import AbstractStep
 from vrw_jax.validation import check_known_name, check_names, check_range, check_real, check_reals
 from vrw_jax.wheel import WheelParams
 
-MeasureFunction = Callable[[AbstractCycle, AbstractStep], Array]
-MarginSpec = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
-ReadMeasure = Callable[[str, AbstractCycle, AbstractStep], Array]
+ObjectiveFunction = Callable[[AbstractCycle, AbstractStep], Array]
+ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
+ReadMeasureFunction = Callable[[str, AbstractCycle, AbstractStep], Array]
 
 UPPER_BOUND_PREFIX = "-"
 """Prefix of a measure with an upper bound, which is a lower bound of its negative."""
 
 
 @dataclass(frozen=True)
-class WeightedSum:
+class WeightedMeasureSum:
     """Weighted sum of measures of cycle and step, as an objective."""
 
-    read: ReadMeasure
-    weights: tuple[tuple[str, float], ...]
+    read_measure: ReadMeasureFunction
+    measure_weights: tuple[tuple[str, float], ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        terms = [weight * self.read(name, cycle, step) for name, weight in self.weights]
-        return sum(terms[1:], start=terms[0])
+        weighted_measures = [
+            measure_weight * self.read_measure(measure_name, cycle, step)
+            for measure_name, measure_weight in self.measure_weights
+        ]
+        return sum(weighted_measures[1:], start=weighted_measures[0])
 
 
 @dataclass(frozen=True)
 class CycleObjective:
     """A user's function of the cycle alone, as an objective of cycle and step."""
 
-    function: Callable[[Any], Array]
+    cycle_function: Callable[[Any], Array]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        return self.function(cycle)
+        return self.cycle_function(cycle)
 
 
 @dataclass(frozen=True)
 class ObjectiveAndConstraints:
-    """Objective and constraints of a gait as one array, the objective first.
+    """Objective and constraints of a gait as one array, with the objective first.
 
-    A constraint is a measure with a lower bound, or with the prefix a measure with an upper bound.
+    A constraint is a measure with a lower bound. With the prefix `UPPER_BOUND_PREFIX` it is a
+    measure with an upper bound.
     """
 
-    objective: MeasureFunction
-    read: ReadMeasure
-    constraints: tuple[str, ...]
+    objective_function: ObjectiveFunction
+    read_measure: ReadMeasureFunction
+    constraint_names: tuple[str, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        objective_value = self.objective(cycle, step)
+        objective_value = self.objective_function(cycle, step)
         if jnp.shape(check_reals("objective", objective_value, "return one number")):
             raise ValueError(
                 f"objective returns an array of shape {jnp.shape(objective_value)}, but what is "
                 "maximised is one number: reduce it, as by jnp.min or jnp.sum."
             )
-        constraint_values = [
-            self._evaluate_constraint(name, cycle, step) for name in self.constraints
-        ]
+        constraint_values = []
+        for constraint_name in self.constraint_names:
+            measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+            measure_value = jnp.ravel(self.read_measure(measure_name, cycle, step))
+            constraint_values.append(
+                measure_value if measure_name == constraint_name else -measure_value
+            )
         return jnp.concatenate([jnp.ravel(objective_value), *constraint_values])
-
-    def _evaluate_constraint(self, name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
-        """Return a measure, or its negative if its name has the prefix of an upper bound."""
-        measure = name.removeprefix(UPPER_BOUND_PREFIX)
-        value = jnp.ravel(self.read(measure, cycle, step))
-        return value if measure == name else -value
 
 
 class GaitEvaluation(NamedTuple):
@@ -81,69 +83,87 @@ class GaitEvaluation(NamedTuple):
     jacobian: Array  # (n_parameters, 1 + n_constraints)
 
 
-def parse_margins(
-    params: WheelParams, constraints: MarginSpec | None, finder: AbstractGaitFinder
+def parse_constraint_margins(
+    params: WheelParams,
+    constraints: ConstraintSpecification | None,
+    gait_finder: AbstractGaitFinder,
 ) -> dict[str, float]:
     """Return the smallest allowed value of each constrained measure by name.
 
-    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`, and the smallest value is
-    that of its negative.
+    A measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`. Its smallest value is that of
+    the negative measure.
     """
     if constraints is None:
-        defaults = default_margins(params)
-        return {name: lower for name, lower in defaults.items() if finder.supports_cold_start}
-    margins: dict[str, float] = {}
+        default_margin_by_name = default_margins(params)
+        return {
+            measure_name: lower_bound
+            for measure_name, lower_bound in default_margin_by_name.items()
+            if gait_finder.supports_cold_start
+        }
+    constraint_margins: dict[str, float] = {}
     if isinstance(constraints, Mapping):
-        for name, lower in constraints.items():
-            margins |= _parse_margin(name, lower)
+        for measure_name, lower_bound in constraints.items():
+            constraint_margins |= _parse_constraint_bound(measure_name, lower_bound)
     else:
-        margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
-    if "clearance_sls1" in margins:
+        constraint_margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
+    if "clearance_sls1" in constraint_margins:
         # The take-off acceleration has a nonzero derivative if the clearance has none.
-        margins.setdefault("takeoff_acceleration", 0.0)
-    for name in margins:
+        constraint_margins.setdefault("takeoff_acceleration", 0.0)
+    for measure_name in constraint_margins:
         check_known_name(
-            name.removeprefix(UPPER_BOUND_PREFIX),
-            finder.readable_measures,
+            measure_name.removeprefix(UPPER_BOUND_PREFIX),
+            gait_finder.readable_measures,
             "measure for a constraint",
         )
-    return margins
+    return constraint_margins
 
 
-def _parse_margin(name: str, bound: float | tuple[float | None, float | None]) -> dict[str, float]:
+def _parse_constraint_bound(
+    measure_name: str, bound_or_range: float | tuple[float | None, float | None]
+) -> dict[str, float]:
     """Return the smallest allowed values of one measure and of its negative, by name.
 
-    `bound` is a lower bound, or a pair of bounds of which one may be None.
+    `bound_or_range` is a lower bound, or a pair of bounds of which one may be None.
     """
-    if not isinstance(bound, tuple):
-        return {name: check_real(f"the margin of {name}", bound)}
-    if len(bound) != 2 or None not in bound:
-        lower_bound, upper_bound = check_range(f"the range of {name}", bound)
-        return {UPPER_BOUND_PREFIX + name: -upper_bound, name: lower_bound}
-    if bound == (None, None):
+    if not isinstance(bound_or_range, tuple):
+        return {measure_name: check_real(f"the margin of {measure_name}", bound_or_range)}
+    if len(bound_or_range) != 2 or None not in bound_or_range:
+        lower_bound, upper_bound = check_range(f"the range of {measure_name}", bound_or_range)
+        return {UPPER_BOUND_PREFIX + measure_name: -upper_bound, measure_name: lower_bound}
+    if bound_or_range == (None, None):
         raise ValueError(
-            f"the range of {name} is (None, None), which bounds nothing: give a lower or an upper "
+            f"the range of {measure_name} is (None, None), which bounds nothing: give a lower or "
+            "an upper "
             "bound, as in (None, 0.6), or leave the constraint out."
         )
-    low_end, high_end = bound
-    if low_end is None:
-        return {UPPER_BOUND_PREFIX + name: -check_real(f"the upper end of {name}", high_end)}
-    return {name: check_real(f"the lower end of {name}", low_end)}
+    lower_end, upper_end = bound_or_range
+    if lower_end is None:
+        return {
+            UPPER_BOUND_PREFIX + measure_name: -check_real(
+                f"the upper end of {measure_name}", upper_end
+            )
+        }
+    return {measure_name: check_real(f"the lower end of {measure_name}", lower_end)}
 
 
-def signed_bound(name: str, lower: float) -> float:
-    """Return a bound with the sign of its measure, without that of the upper-bound prefix."""
-    return float(-lower if name.startswith(UPPER_BOUND_PREFIX) else lower)
+def restore_bound_sign(constraint_name: str, lower_bound: float) -> float:
+    """Return a bound with the sign of its measure. A bound of a name with the upper-bound prefix
+    has the opposite sign."""
+    return float(-lower_bound if constraint_name.startswith(UPPER_BOUND_PREFIX) else lower_bound)
 
 
-def scale_slacks(slack: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
-    """Return the scale of each slack, which is its change over one width of the bounds."""
-    return np.maximum(np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(slack) + 1e-12)
+def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
+    """Return the scale of each slack, which is the change of the slack over one width of the
+    bounds."""
+    return np.maximum(
+        np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks) + 1e-12
+    )
 
 
-def max_breach(slack: np.ndarray, scales: np.ndarray) -> Any:
-    """Return the largest violation of a constraint in widths of the bounds, 0 if there is none.
+def compute_max_violation(constraint_slacks: np.ndarray, slack_scales: np.ndarray) -> Any:
+    """Return the largest violation of a constraint in widths of the bounds, or 0 if no constraint
+    is violated.
 
-    It is NaN if the gait is lost.
+    The result is NaN if the gait is lost.
     """
-    return np.max(-slack / scales, axis=-1, initial=0.0)
+    return np.max(-constraint_slacks / slack_scales, axis=-1, initial=0.0)

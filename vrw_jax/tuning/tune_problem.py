@@ -1,7 +1,8 @@
 """Tuning of a wheel: maximization of a gait's objective with margins as constraints, with exact
 gradients.
 
-Without margins as constraints, the maximization increases double support by letting the foot scuff.
+Without margins as constraints, the maximization would increase double support by letting the foot
+scuff.
 """
 
 from __future__ import annotations
@@ -37,30 +38,30 @@ from vrw_jax.measures import (
     provenance,
 )
 from vrw_jax.numerics import StepOptions
-from vrw_jax.runtime import with_default_settings
+from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.selection import SELECTION_MARGINS, describe_models
+from vrw_jax.selection import MODEL_SELECTION_MARGINS, describe_accepted_models
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel
-from vrw_jax.tuning.exploration import Exploration, explore_starts
+from vrw_jax.tuning.exploration import ExplorationResult, explore_starts
 from vrw_jax.tuning.maximization import (
     EvaluatedTrial,
     MaximizationResult,
     TrialKind,
-    compute_optimality,
+    compute_optimality_conditions,
     maximize_objective,
 )
 from vrw_jax.tuning.objective import (
     UPPER_BOUND_PREFIX,
+    ConstraintSpecification,
     CycleObjective,
     GaitEvaluation,
-    MarginSpec,
-    MeasureFunction,
     ObjectiveAndConstraints,
-    WeightedSum,
-    max_breach,
-    parse_margins,
-    scale_slacks,
-    signed_bound,
+    ObjectiveFunction,
+    WeightedMeasureSum,
+    compute_max_violation,
+    compute_slack_scales,
+    parse_constraint_margins,
+    restore_bound_sign,
 )
 from vrw_jax.tuning.tune_result import ActiveConstraint, TuneResult, WalkValidation
 from vrw_jax.validation import (
@@ -82,35 +83,36 @@ from vrw_jax.wheel import (
     check_parameter_name,
 )
 
-ObjectiveSpec = str | Mapping[str, float] | Callable[..., Array]
+ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class ValidationOptions:
+class WalkValidationOptions:
     """Options of the walk that validates a tuned wheel.
 
-    - `n_steps`: number of steps;
-    - `start_displacement`: relative displacement of the start from the limit cycle;
-    - `value_tolerance`: accepted violation of a constraint, as a fraction of its value. This and
-      the next tolerance are chosen because the optimum satisfies a constraint within 1e-6 of its
-      change over the bounds, and because the start is displaced. Each effect is some thousandths of
-      a take-off margin;
-    - `margin_tolerance`: accepted violation, as a fraction of the constraint's default margin.
+    - `n_validation_steps`: number of steps;
+    - `relative_start_displacement`: relative displacement of the start from the limit cycle;
+    - `constraint_value_tolerance`: accepted violation of a constraint, as a fraction of its value.
+      Both tolerances are chosen for two reasons. The optimum satisfies a constraint within 1e-6 of
+      its change over the bounds, and the start is displaced. Each effect is some thousandths of a
+      take-off margin;
+    - `default_margin_tolerance`: accepted violation, as a fraction of the constraint's default
+      margin.
     """
 
-    n_steps: int = 10
-    start_displacement: float = 1e-5
-    value_tolerance: float = 1e-3
-    margin_tolerance: float = 1e-2
+    n_validation_steps: int = 10
+    relative_start_displacement: float = 1e-5
+    constraint_value_tolerance: float = 1e-3
+    default_margin_tolerance: float = 1e-2
 
 
-@with_default_settings
+@with_default_jax_settings
 def tune(
     params: WheelParams,
-    objective: ObjectiveSpec,
+    objective: ObjectiveSpecification,
     free: Sequence[str],
     bounds: Mapping[str, tuple[float, float]],
-    constraints: MarginSpec | None = None,
+    constraints: ConstraintSpecification | None = None,
     *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
@@ -167,7 +169,7 @@ def tune(
     n_starts = check_int("n_starts", n_starts)
     tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
     start_seconds = time.perf_counter()
-    problem = make_tune_problem(
+    tune_problem = make_tune_problem(
         params,
         objective,
         free,
@@ -177,18 +179,23 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
-    exploration = problem.explore_starts(n_starts, seed) if n_starts > 1 else None
-    problem.finder.precompile(params)
-    start_trial = problem.evaluate_start(
-        problem.normalized_start
-        if exploration is None
-        else exploration.normalized_parameters[exploration.best_index]
+    exploration_result = tune_problem.explore_starts(n_starts, seed) if n_starts > 1 else None
+    tune_problem.gait_finder.precompile(params)
+    start_trial = tune_problem.evaluate_start(
+        tune_problem.normalized_start
+        if exploration_result is None
+        else exploration_result.normalized_parameters[exploration_result.best_start_index]
     )
     compiled_seconds = time.perf_counter()
-    maximization = maximize_objective(
-        problem.evaluate_trial, start_trial, tolerance=tolerance, max_evaluations=max_evaluations
+    maximization_result = maximize_objective(
+        tune_problem.evaluate_trial,
+        start_trial,
+        tolerance=tolerance,
+        max_evaluations=max_evaluations,
     )
-    return problem.make_result(maximization, start_seconds, compiled_seconds, exploration)
+    return tune_problem.make_tune_result(
+        maximization_result, start_seconds, compiled_seconds, exploration_result
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,334 +203,421 @@ class TuneProblem:
     """Validated tuning problem: free parameters, objective and constraints."""
 
     params: WheelParams
-    free: tuple[str, ...]
-    lower: np.ndarray
-    upper: np.ndarray
+    free_parameters: tuple[str, ...]
+    lower_bounds: np.ndarray
+    upper_bounds: np.ndarray
     margins: dict[str, float]
     objective_label: str
     objective_and_constraints: ObjectiveAndConstraints
-    finder: AbstractGaitFinder
-    validation_options: ValidationOptions = ValidationOptions()
+    gait_finder: AbstractGaitFinder
+    validation_options: WalkValidationOptions = WalkValidationOptions()
 
     @property
-    def widths(self) -> np.ndarray:
+    def bound_widths(self) -> np.ndarray:
         """Return the widths of the bounds, shape (free,)."""
-        return self.upper - self.lower
+        return self.upper_bounds - self.lower_bounds
 
     @property
-    def free_indices(self) -> list[int]:
+    def free_parameter_indices(self) -> list[int]:
         """Return the indices of the free parameters among all parameters."""
-        return [PARAMETER_NAMES.index(name) for name in self.free]
+        return [PARAMETER_NAMES.index(parameter_name) for parameter_name in self.free_parameters]
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
-        """Return the name of each constrained number; a margin of the locked legs has one per
-        leg.
-        """
-        names: list[str] = []
-        for name in self.margins:
-            if get_measure(name).dimension:
-                names += [f"{name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
+        """Return the name of each constrained number. A margin of the locked legs has one number
+        per leg."""
+        constraint_names: list[str] = []
+        for measure_name in self.margins:
+            if get_measure(measure_name).dimension:
+                constraint_names += [
+                    f"{measure_name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)
+                ]
             else:
-                names.append(name)
-        return tuple(names)
+                constraint_names.append(measure_name)
+        return tuple(constraint_names)
 
     @property
     def min_constraint_values(self) -> np.ndarray:
-        """Return the least values of the constraints, in the order of `constraint_names`."""
-        return np.array([self.margins[name.partition("[")[0]] for name in self.constraint_names])
+        """Return the smallest allowed values of the constraints, in the order of
+        `constraint_names`."""
+        return np.array(
+            [
+                self.margins[constraint_name.partition("[")[0]]
+                for constraint_name in self.constraint_names
+            ]
+        )
 
-    def denormalize(self, normalized_parameters: np.ndarray) -> np.ndarray:
-        """Return all float parameters from the free ones in widths above their lower bounds."""
-        values = np.array(self.finder.model.parameter_values(self.params))
-        values[self.free_indices] = self.lower + normalized_parameters * self.widths
-        return values
+    def denormalize_parameters(self, normalized_parameters: np.ndarray) -> np.ndarray:
+        """Return the values of all float parameters. The free ones are given in widths of the
+        bounds above the lower bounds."""
+        parameter_values = np.array(self.gait_finder.model.parameter_values(self.params))
+        parameter_values[self.free_parameter_indices] = (
+            self.lower_bounds + normalized_parameters * self.bound_widths
+        )
+        return parameter_values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
-        """Return the wheel with these normalized free parameters."""
-        return self.finder.model.from_values(
-            jnp.asarray(self.denormalize(normalized_parameters)), self.params.n_legs
+        """Return the wheel with the given normalized free parameters."""
+        return self.gait_finder.model.from_values(
+            jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.params.n_legs
         )[1]
 
     @property
     def normalized_start(self) -> np.ndarray:
         """Return the normalized free parameters of the start, shape (free,)."""
-        values = np.array([float(getattr(self.params, name)) for name in self.free])
-        return np.clip((values - self.lower) / self.widths, 0.0, 1.0)
+        start_values = np.array(
+            [float(getattr(self.params, parameter_name)) for parameter_name in self.free_parameters]
+        )
+        return np.clip((start_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
     def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
-        """Return the trial at the normalized parameters `u`; raise a ValueError if it is
-        unusable.
-        """
-        trial = self.evaluate_trial(u, None)
-        if not trial.is_found:
+        """Return the trial at the normalized parameters `u`. Raise a ValueError if the trial is
+        unusable."""
+        start_trial = self.evaluate_trial(u, None)
+        if not start_trial.has_gait_on_branch:
             raise ValueError(
-                f"the start has no gait to tune ({trial.outcome.name}: {trial.outcome.meaning[:-1]}"
+                f"the start has no gait to tune ({start_trial.outcome.name}: "
+                f"{start_trial.outcome.meaning[:-1]}"
                 "): start from a wheel that walks, such as WheelParams()."
             )
-        if not trial.is_finite:
-            description = trial.describe_nonfinite(
+        if not start_trial.has_finite_numbers:
+            nonfinite_description = start_trial.describe_first_nonfinite_number(
                 self.objective_label, self.constraint_names, self.min_constraint_values
             )
             raise ValueError(
-                f"{description} at the start, but a maximization needs finite numbers: start from "
+                f"{nonfinite_description} at the start, but a maximization needs finite numbers: "
+                "start from "
                 "another wheel, or give an objective and constraints that are finite there."
             )
-        return trial
+        return start_trial
 
     def evaluate_trial(
-        self, normalized_parameters: np.ndarray, neighbor: EvaluatedTrial | None
+        self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
     ) -> EvaluatedTrial:
-        """Return the trial at these normalized parameters, searched for from `neighbor` if it
-        is given.
-        """
-        parameters = jnp.asarray(self.denormalize(normalized_parameters))
-        neighbor_evaluation = None if neighbor is None else neighbor.evaluation
-        guess = (
-            self.finder.make_initial_guess(parameters)
+        """Return the trial at the normalized parameters. The search begins at the gait of
+        `neighbor_trial`, if given."""
+        parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
+        neighbor_evaluation = None if neighbor_trial is None else neighbor_trial.gait_evaluation
+        initial_guess = (
+            self.gait_finder.make_initial_guess(parameter_values)
             if neighbor_evaluation is None
             else neighbor_evaluation.gait.cycle.warm_start
         )
-        gait = self.finder.find_gait(parameters, guess)
-        evaluation = GaitEvaluation(gait, *evaluate_on_gait(self.objective_and_constraints, gait))
-        outcome, is_on_branch = Outcome(int(evaluation.gait.outcome)), True
-        if outcome == Outcome.STEPPED and neighbor is not None and neighbor_evaluation is not None:
-            parameter_change = self.denormalize(normalized_parameters) - self.denormalize(
-                neighbor.normalized_parameters
-            )
+        gait = self.gait_finder.find_gait(parameter_values, initial_guess)
+        gait_evaluation = GaitEvaluation(
+            gait, *evaluate_on_gait(self.objective_and_constraints, gait)
+        )
+        gait_outcome, is_on_branch = Outcome(int(gait_evaluation.gait.outcome)), True
+        if (
+            gait_outcome == Outcome.STEPPED
+            and neighbor_trial is not None
+            and neighbor_evaluation is not None
+        ):
+            parameter_change = self.denormalize_parameters(
+                normalized_parameters
+            ) - self.denormalize_parameters(neighbor_trial.normalized_parameters)
             is_on_branch = is_same_branch(
                 neighbor_evaluation.gait.branch_point,
-                evaluation.gait.branch_point,
+                gait_evaluation.gait.branch_point,
                 parameter_change,
             )
-        return self.make_trial(normalized_parameters, evaluation, outcome, is_on_branch)
+        return self.make_evaluated_trial(
+            normalized_parameters, gait_evaluation, gait_outcome, is_on_branch
+        )
 
-    def make_trial(
+    def make_evaluated_trial(
         self,
         normalized_parameters: np.ndarray,
-        evaluation: GaitEvaluation,
-        outcome: Outcome,
+        gait_evaluation: GaitEvaluation,
+        gait_outcome: Outcome,
         is_on_branch: bool,
     ) -> EvaluatedTrial:
         """Return a trial from the objective and constraints of a gait."""
-        values = np.array(evaluation.values)
-        jacobian = np.array(evaluation.jacobian)[self.free_indices].T * self.widths
-        if outcome != Outcome.STEPPED:
-            values, jacobian = np.full_like(values, np.nan), np.full_like(jacobian, np.nan)
+        objective_and_constraint_values = np.array(gait_evaluation.values)
+        free_jacobian = (
+            np.array(gait_evaluation.jacobian)[self.free_parameter_indices].T * self.bound_widths
+        )
+        if gait_outcome != Outcome.STEPPED:
+            objective_and_constraint_values, free_jacobian = (
+                np.full_like(objective_and_constraint_values, np.nan),
+                np.full_like(free_jacobian, np.nan),
+            )
         return EvaluatedTrial(
             normalized_parameters,
-            outcome,
+            gait_outcome,
             is_on_branch,
-            float(values[0]),
-            jacobian[0],
-            values[1:] - self.min_constraint_values,
-            jacobian[1:],
-            evaluation,
+            float(objective_and_constraint_values[0]),
+            free_jacobian[0],
+            objective_and_constraint_values[1:] - self.min_constraint_values,
+            free_jacobian[1:],
+            gait_evaluation,
         )
 
-    def explore_starts(self, n_starts: int, seed: int) -> Exploration:
-        """Take first-order steps from this wheel and random ones in one batch, and return the
-        exploration.
-        """
-        random_starts = np.random.default_rng(seed).uniform(size=(n_starts - 1, len(self.free)))
-        exploration = explore_starts(
-            self._evaluate_batch,
+    def explore_starts(self, n_starts: int, seed: int) -> ExplorationResult:
+        """Return the ends of first-order steps from this wheel and from random wheels, all in one
+        batch."""
+        random_starts = np.random.default_rng(seed).uniform(
+            size=(n_starts - 1, len(self.free_parameters))
+        )
+
+        def compute_parameter_changes(normalized_changes: np.ndarray) -> np.ndarray:
+            parameter_changes = np.zeros(
+                (normalized_changes.shape[0], len(self.gait_finder.model.parameter_names))
+            )
+            parameter_changes[:, self.free_parameter_indices] = (
+                normalized_changes * self.bound_widths
+            )
+            return parameter_changes
+
+        exploration_result = explore_starts(
+            self._evaluate_gait_batch,
             np.vstack([self.normalized_start, random_starts]),
-            self._parameter_change,
-            self.free_indices,
-            self.widths,
+            compute_parameter_changes,
+            self.free_parameter_indices,
+            self.bound_widths,
             self.min_constraint_values,
         )
-        if not np.isfinite(exploration.objective).any():
+        if not np.isfinite(exploration_result.objective).any():
             raise ValueError(
                 f"none of {n_starts} starts within the bounds has a gait with a finite objective: "
                 "narrow the bounds around wheels that walk, such as WheelParams()."
             )
-        return exploration
+        return exploration_result
 
-    def _evaluate_batch(
-        self, normalized_parameters: np.ndarray, neighbors: GaitEvaluation | None
+    def _evaluate_gait_batch(
+        self, normalized_parameters: np.ndarray, neighbor_evaluation: GaitEvaluation | None
     ) -> GaitEvaluation:
-        """Return the gaits at rows of normalized parameters, searched for from `neighbors` if
-        given.
-        """
-        parameters = jnp.asarray(
-            [self.denormalize(parameter_row) for parameter_row in normalized_parameters]
+        """Return the gaits at rows of normalized parameters. The search begins at the gaits of
+        `neighbor_evaluation`, if given."""
+        parameter_values = jnp.asarray(
+            [self.denormalize_parameters(parameter_row) for parameter_row in normalized_parameters]
         )
-        guesses = self.finder.make_initial_guesses(parameters)
-        guess = guesses if neighbors is None else neighbors.gait.cycle.warm_start
-        gait = self.finder.find_gaits(parameters, guess)
-        return GaitEvaluation(gait, *evaluate_on_gaits(self.objective_and_constraints, gait))
+        initial_guesses = self.gait_finder.make_initial_guesses(parameter_values)
+        search_guesses = (
+            initial_guesses
+            if neighbor_evaluation is None
+            else neighbor_evaluation.gait.cycle.warm_start
+        )
+        gait_batch = self.gait_finder.find_gaits(parameter_values, search_guesses)
+        return GaitEvaluation(
+            gait_batch, *evaluate_on_gaits(self.objective_and_constraints, gait_batch)
+        )
 
-    def _parameter_change(self, difference: np.ndarray) -> np.ndarray:
-        """Return the changes of all parameters, one row per change of the normalized parameters."""
-        parameter_change = np.zeros((difference.shape[0], len(self.finder.model.parameter_names)))
-        parameter_change[:, self.free_indices] = difference * self.widths
-        return parameter_change
-
-    def make_result(
+    def make_tune_result(
         self,
-        maximization: MaximizationResult,
+        maximization_result: MaximizationResult,
         start_seconds: float,
         compiled_seconds: float,
-        exploration: Exploration | None = None,
+        exploration_result: ExplorationResult | None = None,
     ) -> TuneResult:
         """Return the result of a maximization, with active constraints and a validation walk."""
-        best_trial = maximization.best
-        assert best_trial.evaluation is not None
-        gait = best_trial.evaluation.gait
+        best_trial = maximization_result.best_trial
+        assert best_trial.gait_evaluation is not None
+        best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
-        conditions = compute_optimality(best_trial)
-        active = [
+        optimality_conditions = compute_optimality_conditions(best_trial)
+        active_constraints = [
             ActiveConstraint(
-                name.removeprefix(UPPER_BOUND_PREFIX),
-                signed_bound(name, limit),
-                get_measure(name).unit,
-                price,
+                measure_name.removeprefix(UPPER_BOUND_PREFIX),
+                restore_bound_sign(measure_name, limit_value),
+                get_measure(measure_name).unit,
+                objective_price,
             )
-            for name, limit, price in zip(
+            for measure_name, limit_value, objective_price in zip(
                 self.constraint_names,
                 self.min_constraint_values,
-                map(float, conditions.prices),
+                map(float, optimality_conditions.constraint_prices),
                 strict=True,
             )
-            if price > 0.0
+            if objective_price > 0.0
         ]
         bound_sides = (
-            (self.lower, conditions.lower_bound_prices),
-            (self.upper, conditions.upper_bound_prices),
+            (self.lower_bounds, optimality_conditions.lower_bound_prices),
+            (self.upper_bounds, optimality_conditions.upper_bound_prices),
         )
-        for bound_values, prices in bound_sides:
-            for name, limit, price, width in zip(
-                self.free, bound_values, prices, self.widths, strict=True
+        for bound_values, bound_prices in bound_sides:
+            for measure_name, limit_value, objective_price, bound_width in zip(
+                self.free_parameters, bound_values, bound_prices, self.bound_widths, strict=True
             ):
-                if price > 0.0:
-                    unit, price_per_unit = get_measure(name).unit, float(price / width)
-                    active.append(ActiveConstraint(name, float(limit), unit, price_per_unit))
+                if objective_price > 0.0:
+                    limit_unit, price_per_unit = (
+                        get_measure(measure_name).unit,
+                        float(objective_price / bound_width),
+                    )
+                    active_constraints.append(
+                        ActiveConstraint(
+                            measure_name, float(limit_value), limit_unit, price_per_unit
+                        )
+                    )
         end_seconds = time.perf_counter()
-        validation = self._validate_by_walking(params, gait)
-        measures = gait.step.measures()
+        walk_validation = self._validate_by_walking(params, best_gait)
+        step_measures = best_gait.step.measures()
         violated_names = [
-            name for name in MARGIN_MEASURES if name in measures and np.min(measures[name]) < 0.0
+            measure_name
+            for measure_name in MARGIN_MEASURES
+            if measure_name in step_measures and np.min(step_measures[measure_name]) < 0.0
         ]
         return TuneResult(
             params=params,
-            status=maximization.status,
+            status=maximization_result.status,
             objective=self.objective_label,
             value=best_trial.objective,
-            start_value=maximization.trials[0].objective,
-            cycle=gait.cycle,
-            step=gait.step,
-            active=tuple(active),
-            kkt_residual=conditions.residual,
-            violated_margins=tuple(name for name in violated_names if name not in self.margins),
-            validation=validation,
-            path=self._make_path(maximization),
-            n_evaluations=len(maximization.trials)
-            + (0 if exploration is None else exploration.n_evaluations),
+            start_value=maximization_result.evaluated_trials[0].objective,
+            cycle=best_gait.cycle,
+            step=best_gait.step,
+            active=tuple(active_constraints),
+            kkt_residual=optimality_conditions.residual,
+            violated_margins=tuple(
+                measure_name for measure_name in violated_names if measure_name not in self.margins
+            ),
+            validation=walk_validation,
+            path=self._make_path_dataset(maximization_result),
+            n_evaluations=len(maximization_result.evaluated_trials)
+            + (0 if exploration_result is None else exploration_result.n_evaluations),
             n_backtracks=sum(
-                kind in (TrialKind.LOST, TrialKind.NOT_FINITE) for kind in maximization.kinds
+                trial_kind in (TrialKind.LOST, TrialKind.NOT_FINITE)
+                for trial_kind in maximization_result.trial_kinds
             ),
             seconds=end_seconds - start_seconds,
             compile_seconds=compiled_seconds - start_seconds,
-            exploration=exploration,
+            exploration=exploration_result,
         )
 
     def _validate_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
-        """Return the result of a walk from a state near that of the gait."""
-        cycle_state, options = np.array(gait.cycle.section_state), self.validation_options
+        """Return the result of a walk from a state near the section state of the gait."""
+        cycle_state, walk_options = np.array(gait.cycle.section_state), self.validation_options
         # The state is scaled down, not up, because no leg may be beyond its stopper.
-        section_state = cycle_state * (1.0 - options.start_displacement)
-        is_feasible, outcome, n_walked = True, Outcome.STEPPED, 0
+        section_state = cycle_state * (1.0 - walk_options.relative_start_displacement)
+        is_feasible, walk_outcome, n_walked = True, Outcome.STEPPED, 0
         margins_by_default = default_margins(params)
-        for _ in range(options.n_steps):
-            step_result = self.finder.take_step(params, jnp.asarray(section_state))
-            outcome = Outcome(int(step_result.outcome))
-            if outcome != Outcome.STEPPED:
+        for _ in range(walk_options.n_validation_steps):
+            step_result = self.gait_finder.take_step(params, jnp.asarray(section_state))
+            walk_outcome = Outcome(int(step_result.outcome))
+            if walk_outcome != Outcome.STEPPED:
                 break
             n_walked, section_state = n_walked + 1, np.array(step_result.section_state)
-            measures = {name: np.asarray(value) for name, value in step_result.measures().items()}
-            for name, min_value in self.margins.items():
-                if (measure := name.removeprefix(UPPER_BOUND_PREFIX)) in measures:
-                    value = measures[measure] if measure == name else -measures[measure]
-                    default_margin = abs(margins_by_default.get(name, 0.0))
-                    tolerance = options.value_tolerance * np.max(np.abs(value))
-                    tolerance += options.margin_tolerance * default_margin
-                    is_feasible &= bool(np.all(value >= min_value - tolerance - 1e-9))
-        distance = float(np.max(np.abs(section_state - cycle_state)))
+            step_measures = {
+                constraint_name: np.asarray(constraint_value)
+                for constraint_name, constraint_value in step_result.measures().items()
+            }
+            for constraint_name, min_value in self.margins.items():
+                if (
+                    measure_name := constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+                ) in step_measures:
+                    constraint_value = (
+                        step_measures[measure_name]
+                        if measure_name == constraint_name
+                        else -step_measures[measure_name]
+                    )
+                    default_margin = abs(margins_by_default.get(constraint_name, 0.0))
+                    violation_tolerance = walk_options.constraint_value_tolerance * np.max(
+                        np.abs(constraint_value)
+                    )
+                    violation_tolerance += walk_options.default_margin_tolerance * default_margin
+                    is_feasible &= bool(
+                        np.all(constraint_value >= min_value - violation_tolerance - 1e-9)
+                    )
+        final_distance = float(np.max(np.abs(section_state - cycle_state)))
         return WalkValidation(
-            n_walked, outcome, distance, is_feasible and outcome == Outcome.STEPPED
+            n_walked, walk_outcome, final_distance, is_feasible and walk_outcome == Outcome.STEPPED
         )
 
-    def _make_path(self, maximization: MaximizationResult) -> xr.Dataset:
-        """Return the dataset of all trials in order."""
-        dimension = "evaluation"
+    def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
+        """Return the dataset of all trials of a maximization, in order."""
+        evaluation_dimension = "evaluation"
         normalized_parameters = np.array(
-            [trial.normalized_parameters for trial in maximization.trials]
+            [trial.normalized_parameters for trial in maximization_result.evaluated_trials]
         )
-        values = self.lower + normalized_parameters * self.widths
-        lower = self.min_constraint_values
-        constraints = np.array([trial.slack + lower for trial in maximization.trials])
-        start = maximization.trials[0]
-        scales = scale_slacks(start.slack, start.slack_jacobian)
-        outcomes = [
+        parameter_values = self.lower_bounds + normalized_parameters * self.bound_widths
+        min_constraint_values = self.min_constraint_values
+        constraint_values = np.array(
+            [
+                trial.constraint_slacks + min_constraint_values
+                for trial in maximization_result.evaluated_trials
+            ]
+        )
+        start_trial = maximization_result.evaluated_trials[0]
+        slack_scales = compute_slack_scales(
+            start_trial.constraint_slacks, start_trial.slack_jacobian
+        )
+        trial_outcomes = [
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND
-            for trial in maximization.trials
+            for trial in maximization_result.evaluated_trials
         ]
-        data: dict[str, Any] = {
-            name: (dimension, values[:, parameter_index], measure_attrs(name))
-            for parameter_index, name in enumerate(self.free)
+        path_variables: dict[str, Any] = {
+            parameter_name: (
+                evaluation_dimension,
+                parameter_values[:, parameter_index],
+                measure_attrs(parameter_name),
+            )
+            for parameter_index, parameter_name in enumerate(self.free_parameters)
         }
-        data |= {
+        path_variables |= {
             "objective": (
-                dimension,
-                [trial.objective for trial in maximization.trials],
+                evaluation_dimension,
+                [trial.objective for trial in maximization_result.evaluated_trials],
                 {"long_name": self.objective_label},
             ),
             "constraint_value": (
-                (dimension, "constraint"),
-                constraints.reshape(len(normalized_parameters), lower.size),
+                (evaluation_dimension, "constraint"),
+                constraint_values.reshape(len(normalized_parameters), min_constraint_values.size),
             ),
-            "margin": ("constraint", lower, {"long_name": "least value allowed"}),
+            "margin": ("constraint", min_constraint_values, {"long_name": "least value allowed"}),
             "breach": (
-                dimension,
-                np.array([max_breach(trial.slack, scales) for trial in maximization.trials]),
+                evaluation_dimension,
+                np.array(
+                    [
+                        compute_max_violation(trial.constraint_slacks, slack_scales)
+                        for trial in maximization_result.evaluated_trials
+                    ]
+                ),
                 {"long_name": "largest breach of a constraint, in widths of the bounds"},
             ),
             "kind": (
-                dimension,
-                np.array(maximization.kinds, int),
-                flag_attrs(kind.name for kind in TrialKind),
+                evaluation_dimension,
+                np.array(maximization_result.trial_kinds, int),
+                flag_attrs(trial_kind.name for trial_kind in TrialKind),
             ),
-            "outcome": (dimension, np.array(outcomes, int), measure_attrs("outcome")),
+            "outcome": (
+                evaluation_dimension,
+                np.array(trial_outcomes, int),
+                measure_attrs("outcome"),
+            ),
             "on_branch": (
-                dimension,
-                np.array([trial.is_on_branch for trial in maximization.trials]),
+                evaluation_dimension,
+                np.array([trial.is_on_branch for trial in maximization_result.evaluated_trials]),
             ),
         }
-        units = [get_measure(name).unit for name in self.constraint_names]
-        labels = {
-            dimension: np.arange(len(normalized_parameters)),
+        constraint_units = [
+            get_measure(parameter_name).unit for parameter_name in self.constraint_names
+        ]
+        path_coordinates = {
+            evaluation_dimension: np.arange(len(normalized_parameters)),
             "constraint": list(self.constraint_names),
-            "constraint_unit": ("constraint", units),
+            "constraint_unit": ("constraint", constraint_units),
         }
-        attrs = {
-            "title": f"Path of tuning {self.objective_label} over {', '.join(self.free)}",
-            "free": " ".join(self.free),  # It is a text because netCDF has no lists of names.
-            "lower": [float(bound) for bound in self.lower],
-            "upper": [float(bound) for bound in self.upper],
-            "ending": maximization.status.name,
+        path_attributes = {
+            "title": f"Path of tuning {self.objective_label} over "
+            "{', '.join(self.free_parameters)}",
+            "free": " ".join(
+                self.free_parameters
+            ),  # It is a text because netCDF has no lists of names.
+            "lower": [float(parameter_bound) for parameter_bound in self.lower_bounds],
+            "upper": [float(parameter_bound) for parameter_bound in self.upper_bounds],
+            "ending": maximization_result.status.name,
         }
-        provenance_attrs = provenance(self.params, self.finder.model, self.finder.step_options)
-        return xr.Dataset(data, labels, attrs | provenance_attrs)
+        provenance_attributes = provenance(
+            self.params, self.gait_finder.model, self.gait_finder.step_options
+        )
+        return xr.Dataset(path_variables, path_coordinates, path_attributes | provenance_attributes)
 
 
 def make_tune_problem(
     params: WheelParams,
-    objective: ObjectiveSpec,
+    objective: ObjectiveSpecification,
     free: Sequence[str],
     bounds: Mapping[str, tuple[float, float]],
-    constraints: MarginSpec | None = None,
+    constraints: ConstraintSpecification | None = None,
     *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
@@ -535,45 +629,56 @@ def make_tune_problem(
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
     """
     check_single_wheel(params, "tune one after the other")
-    names, lower, upper = _check_bounds(params, free, bounds)
+    free_parameters, lower_bounds, upper_bounds = _check_parameter_bounds(params, free, bounds)
     checked_model = check_model(model)
-    finder = make_finder(
+    gait_finder = make_finder(
         check_model(resolve_model(params, checked_model)),
         params.n_legs,
         cycle_options=cycle_options,
         step_options=options,
     )
-    if not finder.model.is_compliant:
+    if not gait_finder.model.is_compliant:
         raise TypeError(
             f"model is {model!r}, but what is tuned has compliant legs: give "
-            f"{describe_models('tune')}."
+            f"{describe_accepted_models('tune')}."
         )
-    finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
-    reader, label = _parse_objective(objective, finder)
+    gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    objective_function, objective_label = _parse_objective_function(objective, gait_finder)
     if (
         constraints is None
         and checked_model.fallback_model is not checked_model
-        and finder.supports_cold_start
+        and gait_finder.supports_cold_start
     ):
-        constraints = tuple(SELECTION_MARGINS)
-    margins = parse_margins(params, constraints, finder)
+        constraints = tuple(MODEL_SELECTION_MARGINS)
+    constraint_margins = parse_constraint_margins(params, constraints, gait_finder)
     objective_and_constraints = ObjectiveAndConstraints(
-        reader, type(finder).read_measure, tuple(margins)
+        objective_function, type(gait_finder).read_measure, tuple(constraint_margins)
     )
     if callable(objective):  # Errors of the objective are raised here, before compilation.
-        cycle = jax.eval_shape(finder.find_cycle, params)
-        x = jax.ShapeDtypeStruct((finder.model.section_size(params),), params.damping.dtype)
-        step = jax.eval_shape(finder.model.take_step, params, x, finder.step_options)
-        jax.eval_shape(objective_and_constraints, cycle, step)
+        abstract_cycle = jax.eval_shape(gait_finder.find_cycle, params)
+        abstract_section_state = jax.ShapeDtypeStruct(
+            (gait_finder.model.section_size(params),), params.damping.dtype
+        )
+        abstract_step = jax.eval_shape(
+            gait_finder.model.take_step, params, abstract_section_state, gait_finder.step_options
+        )
+        jax.eval_shape(objective_and_constraints, abstract_cycle, abstract_step)
     return TuneProblem(
-        params, names, lower, upper, margins, label, objective_and_constraints, finder
+        params,
+        free_parameters,
+        lower_bounds,
+        upper_bounds,
+        constraint_margins,
+        objective_label,
+        objective_and_constraints,
+        gait_finder,
     )
 
 
-def _parse_objective(
-    objective: ObjectiveSpec, finder: AbstractGaitFinder
-) -> tuple[MeasureFunction, str]:
-    """Return the function of an objective, and its label."""
+def _parse_objective_function(
+    objective: ObjectiveSpecification, gait_finder: AbstractGaitFinder
+) -> tuple[ObjectiveFunction, str]:
+    """Return the function of an objective and its label."""
     if not (callable(objective) or isinstance(objective, str | Mapping)):
         raise TypeError(
             f"objective is {format_value(objective)}, but it is a measure's name, weights of "
@@ -581,71 +686,85 @@ def _parse_objective(
             'function of the cycle: give "dls_fraction", say.'
         )
     if callable(objective):
-        if not finder.supports_cold_start:
+        if not gait_finder.supports_cold_start:
             raise TypeError(
                 "objective is a function, but with contact it must be a measure's name or "
-                f"weights of several: choose from {', '.join(finder.differentiable_measures)}."
+                f"weights of several: choose from {', '.join(gait_finder.differentiable_measures)}."
             )
-        label = getattr(objective, "__name__", "objective")
-        arguments = inspect.signature(objective).parameters
-        return (objective if len(arguments) >= 2 else CycleObjective(objective)), label
-    weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
-    if not weights:
+        objective_label = getattr(objective, "__name__", "objective")
+        objective_arguments = inspect.signature(objective).parameters
+        return (
+            objective if len(objective_arguments) >= 2 else CycleObjective(objective)
+        ), objective_label
+    measure_weights = {objective: 1.0} if isinstance(objective, str) else dict(objective)
+    if not measure_weights:
         raise ValueError(
             "objective is an empty mapping, but something must be maximised: "
             'give a measure such as "dls_fraction".'
         )
-    for name, weight in weights.items():
-        check_known_name(name, finder.readable_measures, "measure for objective")
-        check_real(f"the weight of {name}", weight)
-        if MEASURES[name].dimension:
+    for measure_name, measure_weight in measure_weights.items():
+        check_known_name(measure_name, gait_finder.readable_measures, "measure for objective")
+        check_real(f"the weight of {measure_name}", measure_weight)
+        if MEASURES[measure_name].dimension:
             raise ValueError(
-                f"{name} has one value for each locked leg, but an objective is one number: "
+                f"{measure_name} has one value for each locked leg, but an objective is one "
+                "number: "
                 "give a function of the cycle and the step that reduces it."
             )
-    label = " + ".join(
+    objective_label = " + ".join(
         measure_name if measure_weight == 1.0 else f"{measure_weight:g} {measure_name}"
-        for measure_name, measure_weight in weights.items()
+        for measure_name, measure_weight in measure_weights.items()
     )
-    return WeightedSum(type(finder).read_measure, tuple(weights.items())), label.replace(
-        "+ -", "- "
-    )
+    return WeightedMeasureSum(
+        type(gait_finder).read_measure, tuple(measure_weights.items())
+    ), objective_label.replace("+ -", "- ")
 
 
-def _check_bounds(
+def _check_parameter_bounds(
     params: WheelParams, free: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the names of the free parameters, their lower and their upper bounds."""
-    names = check_names("free", free)
+    free_parameters = check_names("free", free)
     check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"free is {names}, which names one twice: name each once.")
-    if not names:
+    if len(set(free_parameters)) < len(free_parameters):
+        raise ValueError(f"free is {free_parameters}, which names one twice: name each once.")
+    if not free_parameters:
         raise ValueError(
             f"free names no parameter, but at least one must move: choose from "
             f"{', '.join(PARAMETER_NAMES)}."
         )
-    for name in (*names, *bounds):
-        check_parameter_name(name, PARAMETER_NAMES, "parameter of the wheel")
-    for name in bounds:
-        if name not in names:
-            raise ValueError(f"bounds holds {name!r}, but it is not free: add it to free.")
-    for name in names:
-        if name not in bounds:
-            raise ValueError(f"{name} is free but has no bounds: give bounds[{name!r}].")
-        lower_bound, upper_bound = check_range(f"the range of {name}", bounds[name])
-        for bound_value in (lower_bound, upper_bound):
-            if not PARAMETER_DOMAINS[name].contains(bound_value):
-                raise ValueError(
-                    f"the bounds of {name} reach {bound_value:g}, but "
-                    f"{PARAMETER_DOMAINS[name].description} must lie "
-                    f"in {PARAMETER_DOMAINS[name]}: keep them inside."
-                )
-        value = float(getattr(params, name))
-        if not lower_bound <= value <= upper_bound:
+    for parameter_name in (*free_parameters, *bounds):
+        check_parameter_name(parameter_name, PARAMETER_NAMES, "parameter of the wheel")
+    for parameter_name in bounds:
+        if parameter_name not in free_parameters:
             raise ValueError(
-                f"the start has {name} {value:g}, outside its bounds "
+                f"bounds holds {parameter_name!r}, but it is not free: add it to free."
+            )
+    for parameter_name in free_parameters:
+        if parameter_name not in bounds:
+            raise ValueError(
+                f"{parameter_name} is free but has no bounds: give bounds[{parameter_name!r}]."
+            )
+        lower_bound, upper_bound = check_range(
+            f"the range of {parameter_name}", bounds[parameter_name]
+        )
+        for bound_value in (lower_bound, upper_bound):
+            if not PARAMETER_DOMAINS[parameter_name].contains(bound_value):
+                raise ValueError(
+                    f"the bounds of {parameter_name} reach {bound_value:g}, but "
+                    f"{PARAMETER_DOMAINS[parameter_name].description} must lie "
+                    f"in {PARAMETER_DOMAINS[parameter_name]}: keep them inside."
+                )
+        start_value = float(getattr(params, parameter_name))
+        if not lower_bound <= start_value <= upper_bound:
+            raise ValueError(
+                f"the start has {parameter_name} {start_value:g}, outside its bounds "
                 f"({lower_bound:g}, {upper_bound:g}): widen the bounds or start inside them."
             )
-    bound_pair = np.array([[float(bound) for bound in bounds[name]] for name in names])
-    return names, bound_pair[:, 0], bound_pair[:, 1]
+    bound_pairs = np.array(
+        [
+            [float(parameter_bound) for parameter_bound in bounds[parameter_name]]
+            for parameter_name in free_parameters
+        ]
+    )
+    return free_parameters, bound_pairs[:, 0], bound_pairs[:, 1]

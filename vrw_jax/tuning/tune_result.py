@@ -1,4 +1,4 @@
-"""Result of tuning: the gait, the way to it, and the constraints that are active."""
+"""Result of tuning: the gait, all evaluated gaits, and the constraints that are active."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from vrw_jax.measures import MEASURES, get_measure
 from vrw_jax.printing import format_html_table, format_text
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.tuning.exploration import Exploration
+from vrw_jax.tuning.exploration import ExplorationResult
 from vrw_jax.tuning.maximization import TuneStatus
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -93,7 +93,7 @@ class TuneResult:
     n_backtracks: int
     seconds: float
     compile_seconds: float
-    exploration: Exploration | None = None
+    exploration: ExplorationResult | None = None
 
     @property
     def converged(self) -> bool:
@@ -109,16 +109,19 @@ class TuneResult:
         """Return the printed lines of the result by label."""
         free_names = self.path.attrs["free"].split()
         parameter_texts = [
-            f"{name} {MEASURES[name].format_with_unit(getattr(self.params, name))}"
-            for name in free_names
+            f"{parameter_name} "
+            f"{MEASURES[parameter_name].format_with_unit(getattr(self.params, parameter_name))}"
+            for parameter_name in free_names
         ]
-        feasibility = (
+        feasibility_text = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
         )
-        feasibility = feasibility if self.path.sizes["constraint"] else "no constraint to keep"
+        feasibility_text = (
+            feasibility_text if self.path.sizes["constraint"] else "no constraint to keep"
+        )
         active_texts = [
-            f"{name} at {get_measure(name).format_with_unit(limit)}"
-            for name, limit, *_ in self.active
+            f"{parameter_name} at {get_measure(parameter_name).format_with_unit(limit_value)}"
+            for parameter_name, limit_value, *_ in self.active
         ]
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
@@ -127,7 +130,7 @@ class TuneResult:
             "held by": ", ".join(active_texts) or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
             "not asked for, and broken": ", ".join(self.violated_margins) or "none",
             "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
-            f"{self.validation.distance:.1e} from the cycle at last; {feasibility}",
+            f"{self.validation.distance:.1e} from the cycle at last; {feasibility_text}",
             "cost": f"{self.n_evaluations} gaits, {self.n_backtracks} steps shortened, "
             f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
             "compile",

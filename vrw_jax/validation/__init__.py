@@ -20,8 +20,8 @@ from vrw_jax.validation.checks import (
     suggest_name,
 )
 from vrw_jax.validation.renamed import (
-    RENAMED_IN_PACKAGE,
-    describe_renamed,
+    RENAMED_PACKAGE_NAMES,
+    describe_renamed_attribute,
+    raise_for_missing_numerics_name,
     raise_for_renamed_arguments,
-    raise_for_renamed_numerics,
 )

@@ -1,10 +1,12 @@
-"""Public names of version 0.1; the use of one raises an error that gives the present name."""
+"""Public names of version 0.1. The use of such a name raises an error that states the present
+name.
+"""
 
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-RENAMED_IN_PACKAGE = {
+RENAMED_PACKAGE_NAMES = {
     "Answer": "MeasureResult",
     "Average": "MultifidelityMean",
     "Border": "SpecialPoint",
@@ -21,9 +23,9 @@ RENAMED_IN_PACKAGE = {
     "newton_cycle": "solve_fixed_point",
     "steps": "step_batch",
 }
-"""Old names of `vrw_jax`, each with the present one."""
+"""Present names in `vrw_jax` by old name."""
 
-RENAMED_IN_NUMERICS = {
+RENAMED_NUMERICS_NAMES = {
     "AbstractFollowed": "vrw_jax.continuation.AbstractContinuationProblem",
     "Answers": "vrw_jax.hybrid.LCPStatus",
     "Guard": "vrw_jax.hybrid.Guard",
@@ -42,54 +44,66 @@ RENAMED_IN_NUMERICS = {
     "volume_change": "vrw_jax.hybrid.flow_jacobian_determinant",
     "walk": "vrw_jax.hybrid.simulate_hybrid",
 }
-"""Old names of `vrw_jax.numerics`, each with the present one."""
+"""Present names of former attributes of `vrw_jax.numerics` by old name."""
 
 
-def raise_for_renamed_numerics(name: str) -> Any:
-    """Raise the AttributeError of `vrw_jax.numerics` for a name that it does not have."""
-    hint = f": it is called {RENAMED_IN_NUMERICS[name]} now" if name in RENAMED_IN_NUMERICS else ""
-    raise AttributeError(f"vrw_jax.numerics has no {name!r}{hint}.")
+def raise_for_missing_numerics_name(missing_name: str) -> Any:
+    """Raise the AttributeError for a name that `vrw_jax.numerics` does not have, with the present
+    name if it was renamed."""
+    renaming_hint = (
+        f": it is called {RENAMED_NUMERICS_NAMES[missing_name]} now"
+        if missing_name in RENAMED_NUMERICS_NAMES
+        else ""
+    )
+    raise AttributeError(f"vrw_jax.numerics has no {missing_name!r}{renaming_hint}.")
 
 
 FunctionType = TypeVar("FunctionType", bound=Callable)
 
 
-def describe_renamed(module: str, name: str, new_name_by_old: Mapping[str, str]) -> str | None:
-    """Return a sentence with the present name of a renamed attribute, or None."""
-    if name not in new_name_by_old:
+def describe_renamed_attribute(
+    module_name: str, attribute_name: str, new_name_by_old: Mapping[str, str]
+) -> str | None:
+    """Return a sentence with the present name of a renamed attribute, or None if it was not
+    renamed."""
+    if attribute_name not in new_name_by_old:
         return None
-    return f"{module} has no {name!r}: it is called {new_name_by_old[name]} now."
+    present_name = new_name_by_old[attribute_name]
+    return f"{module_name} has no {attribute_name!r}: it is called {present_name} now."
 
 
-def raise_for_renamed_arguments(**renamed: str) -> Callable[[FunctionType], FunctionType]:
-    """Return a decorator that makes old keyword arguments of a function or class raise a TypeError.
+def raise_for_renamed_arguments(
+    **new_name_by_old_name: str,
+) -> Callable[[FunctionType], FunctionType]:
+    """Return a decorator with which old keyword arguments of a function or class raise a TypeError.
 
-    `renamed` maps old names to the present ones. The message gives the present name.
+    `new_name_by_old_name` maps old names to the present ones. The message states the present name.
     """
 
-    def check_keywords(owner_name: str, keywords: Mapping[str, Any]) -> None:
-        for old_name in renamed.keys() & keywords.keys():
+    def reject_renamed_keywords(owner_name: str, given_keywords: Mapping[str, Any]) -> None:
+        for old_name in new_name_by_old_name.keys() & given_keywords.keys():
             raise TypeError(
-                f"{owner_name} has no argument {old_name!r}: it is called {renamed[old_name]} now."
+                f"{owner_name} has no argument {old_name!r}: it is called "
+                f"{new_name_by_old_name[old_name]} now."
             )
 
-    def decorate(function: Any) -> Any:
-        if isinstance(function, type):
-            original_init = function.__init__  # type: ignore[misc]
+    def decorate_with_check(decorated_object: Any) -> Any:
+        if isinstance(decorated_object, type):
+            original_init = decorated_object.__init__  # type: ignore[misc]
 
             @functools.wraps(original_init)
-            def checked_init(self: Any, *args: Any, **keywords: Any) -> None:
-                check_keywords(function.__name__, keywords)
+            def initialize_checked(self: Any, *args: Any, **keywords: Any) -> None:
+                reject_renamed_keywords(decorated_object.__name__, keywords)
                 original_init(self, *args, **keywords)
 
-            function.__init__ = checked_init  # type: ignore[misc]
-            return function
+            decorated_object.__init__ = initialize_checked  # type: ignore[misc]
+            return decorated_object
 
-        @functools.wraps(function)
-        def checked_call(*args: Any, **keywords: Any) -> Any:
-            check_keywords(function.__name__, keywords)
-            return function(*args, **keywords)
+        @functools.wraps(decorated_object)
+        def call_checked(*args: Any, **keywords: Any) -> Any:
+            reject_renamed_keywords(decorated_object.__name__, keywords)
+            return decorated_object(*args, **keywords)
 
-        return checked_call
+        return call_checked
 
-    return decorate
+    return decorate_with_check

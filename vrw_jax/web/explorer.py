@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
-from vrw_jax.selection import list_config_names
+from vrw_jax.selection import list_model_config_names
 from vrw_jax.validation import (
     check_choice,
     check_int,
@@ -19,7 +19,7 @@ from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require
 if TYPE_CHECKING:
     import xarray as xr
 
-PAGE_MODEL_NAMES = list_config_names("explore")
+PAGE_MODEL_NAMES = list_model_config_names("explore")
 """Names of the models that the page supports."""
 
 WIDGET_JAVASCRIPT = """
@@ -63,24 +63,31 @@ it.
 """
 
 
-def find_page() -> Path:
-    """Return the path of the page, inside an installed package or beside it."""
-    package = Path(__file__).parents[1]
+def find_wheel_page() -> Path:
+    """Return the path of the page, which is inside the installed package or beside the package."""
+    package_folder = Path(__file__).parents[1]
     return next(
         candidate_path
-        for candidate_path in (package / "wheel.html", package.parent / "docs/wheel.html")
+        for candidate_path in (
+            package_folder / "wheel.html",
+            package_folder.parent / "docs/wheel.html",
+        )
         if candidate_path.exists()
     )
 
 
 def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]) -> str:
-    """Return the address of the page, opened with this wheel."""
-    default_values = _page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
-    page_values = _page_values(
+    """Return the address of the page that shows this wheel."""
+    default_values = _make_page_values(WheelParams(), 1.0, PAGE_MODEL_NAMES[0])
+    page_values = _make_page_values(
         params, 1.0, check_choice("model_name", model_name, PAGE_MODEL_NAMES)
     )
-    values = {name: value for name, value in page_values.items() if value != default_values[name]}
-    return find_page().as_uri() + (f"#{urlencode(values)}" if values else "")
+    changed_values = {
+        value_name: page_value
+        for value_name, page_value in page_values.items()
+        if page_value != default_values[value_name]
+    }
+    return find_wheel_page().as_uri() + (f"#{urlencode(changed_values)}" if changed_values else "")
 
 
 @raise_for_renamed_arguments(rung="model_name")
@@ -124,15 +131,15 @@ def explore(
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     check_not_traced("vrw.explore", "it shows one known wheel", params)
     params.require_single("show one after the other")
-    map_data = {} if dataset is None else _make_map(dataset)
+    page_map = {} if dataset is None else _make_page_map(dataset)
     return _make_widget_class()(
-        page=find_page().read_text(encoding="utf-8"),
-        values=_page_values(
+        page=find_wheel_page().read_text(encoding="utf-8"),
+        values=_make_page_values(
             params,
             require_known_friction(friction),
             check_choice("model_name", model_name, PAGE_MODEL_NAMES),
         ),
-        map=map_data,
+        map=page_map,
         height=check_int("height", height),
     )
 
@@ -169,7 +176,7 @@ def _make_widget_class() -> type:
 
         @params.setter
         def params(self, params: WheelParams) -> None:
-            self.values = _page_values(params, self.friction, self.model_name)
+            self.values = _make_page_values(params, self.friction, self.model_name)
 
         @property
         def friction(self) -> float:
@@ -195,42 +202,69 @@ def _make_widget_class() -> type:
     return Explorer
 
 
-def _page_values(params: WheelParams, friction: float, model_name: str) -> dict[str, float | str]:
+def _make_page_values(
+    params: WheelParams, friction: float, model_name: str
+) -> dict[str, float | str]:
     """Return the values that the page exchanges: parameters, friction and model, by name."""
-    numbers = {name: float(getattr(params, name)) for name in PARAMETER_DOMAINS}
-    return {**numbers, FRICTION_NAME: friction, "n_legs": params.n_legs, "rung": model_name}
+    parameter_values = {
+        parameter_name: float(getattr(params, parameter_name))
+        for parameter_name in PARAMETER_DOMAINS
+    }
+    return {
+        **parameter_values,
+        FRICTION_NAME: friction,
+        "n_legs": params.n_legs,
+        "rung": model_name,
+    }
 
 
-def _make_map(dataset: "xr.Dataset") -> dict[str, Any]:
+def _make_page_map(dataset: "xr.Dataset") -> dict[str, Any]:
     """Return a scan over two parameters in the format of the page's map.
 
-    Values that are not finite become None. Of the values of several legs the smallest one is taken.
+    Values that are not finite become None. A measure with one value per leg is replaced by its
+    smallest value.
     """
     import xarray
 
     check_type("dataset", dataset, xarray.Dataset, "give a scan of vrw.grid over two parameters")
-    axes = [
-        str(name) for name in dataset.sizes if name in PARAMETER_DOMAINS and dataset.sizes[name] > 1
+    map_axes = [
+        str(variable_name)
+        for variable_name in dataset.sizes
+        if variable_name in PARAMETER_DOMAINS and dataset.sizes[variable_name] > 1
     ]
-    if len(axes) != 2:
+    if len(map_axes) != 2:
         raise ValueError(
             f"the dataset has the axes {', '.join(map(str, dataset.sizes))}, but a map has two "
             "parameters: give a scan of vrw.grid over two of them."
         )
     measure_values = dataset.isel(
-        {name: 0 for name in dataset.sizes if name in PARAMETER_DOMAINS and name not in axes}
+        {
+            variable_name: 0
+            for variable_name in dataset.sizes
+            if variable_name in PARAMETER_DOMAINS and variable_name not in map_axes
+        }
     )
-    measures: dict[str, Any] = {}
-    for name, values_of_column in measure_values.data_vars.items():
-        other_dims = [dim for dim in values_of_column.dims if dim not in axes]
-        if values_of_column.dtype.kind == "f" and set(axes) <= set(values_of_column.dims):
-            worst_values = values_of_column.min(other_dims).transpose(*axes[::-1]).values
-            measures[str(name)] = [
-                [float(value) if math.isfinite(value) else None for value in row]
-                for row in worst_values.tolist()
+    map_measures: dict[str, Any] = {}
+    for variable_name, measure_array in measure_values.data_vars.items():
+        other_dimensions = [
+            dimension_name
+            for dimension_name in measure_array.dims
+            if dimension_name not in map_axes
+        ]
+        if measure_array.dtype.kind == "f" and set(map_axes) <= set(measure_array.dims):
+            lowest_values = measure_array.min(other_dimensions).transpose(*map_axes[::-1]).values
+            map_measures[str(variable_name)] = [
+                [
+                    float(measure_value) if math.isfinite(measure_value) else None
+                    for measure_value in value_row
+                ]
+                for value_row in lowest_values.tolist()
             ]
     return {
-        "axes": [{"name": name, "values": measure_values[name].values.tolist()} for name in axes],
-        "measures": measures,
-        "outcome": measure_values["outcome"].transpose(*axes[::-1]).values.tolist(),
+        "axes": [
+            {"name": variable_name, "values": measure_values[variable_name].values.tolist()}
+            for variable_name in map_axes
+        ],
+        "measures": map_measures,
+        "outcome": measure_values["outcome"].transpose(*map_axes[::-1]).values.tolist(),
     }

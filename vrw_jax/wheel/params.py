@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from vrw_jax.numerics import Elementwise, RealInput, Scalar, sine_cosine
-from vrw_jax.printing import AbstractPrintable, TextRow, format_quantity
+from vrw_jax.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.validation import check_int, check_known_name, check_reals, format_value
 
 
@@ -123,7 +123,7 @@ _check_n_legs = functools.partial(
     check_int,
     "n_legs",
     min_value=5,
-    reason=" (with fewer the angle between legs is 90 degrees or more)",
+    limit_reason=" (with fewer the angle between legs is 90 degrees or more)",
 )
 
 
@@ -243,7 +243,7 @@ class WheelParams(AbstractPrintable):
         )
         return "WheelParams" + title_suffix
 
-    def summary_rows(self) -> list[TextRow]:
+    def summary_rows(self) -> list[LabelAndText]:
         """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
         parameter_numbers = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
         if not np.all(self.is_in_domain()):

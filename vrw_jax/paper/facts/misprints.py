@@ -7,54 +7,55 @@ import numpy as np
 from vrw_jax.paper.facts import printed
 from vrw_jax.paper.facts.base import (
     STEP_ERROR_TOLERANCE,
-    Claim,
-    ClaimGroup,
-    Evidence,
-    NumbersByName,
-    agrees_within,
+    ClaimNumbers,
+    PaperClaim,
+    PaperClaimGroup,
+    PaperEvidence,
+    make_agreement_test,
 )
 from vrw_jax.wheel import Outcome
 
 
-def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
-    """Return the numbers for the claims on misprints: equations as printed and as corrected, by
-    name.
-    """
+def _compute_misprint_numbers(e: PaperEvidence) -> ClaimNumbers:
+    """Return the numbers for the claims on misprints, from equations as printed and as corrected,
+    by name."""
     section_state, library_impulse = (
         e.table_1_gait.section_state.values,
         float(e.table_1_gait.lambda_I4),
     )
-    landing = printed.compute_landing(e.params, section_state)
+    printed_landing = printed.compute_printed_landing(e.params, section_state)
     reference_velocity = printed.differentiate_landing_foot_position(e.params, section_state)
-    velocity_error = lambda rate: float(
+    compute_velocity_error = lambda rate: float(
         np.abs(
             printed.compute_landing_foot_velocity(e.params, section_state, rate)
             - reference_velocity
         ).max()
     )
     gentle_slope_gait = e.slope_branch.sel(slope=0.10, method="nearest")
-    is_settled = e.gentle_slope_branch.settled.values
+    has_settled_gait = e.gentle_slope_branch.settled.values
     return {
         "wrong": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=True),
         "right": printed.compute_constraint_violation(e.table_1_trajectory, is_as_printed=False),
-        "residual": landing.momentum_residual,
-        "velocities": bool(np.array_equal(landing.printed_impulse, landing.velocity_after)),
-        "impulse": landing.impulse[3],
+        "residual": printed_landing.momentum_residual,
+        "velocities": bool(
+            np.array_equal(printed_landing.printed_impulse, printed_landing.velocity_after)
+        ),
+        "impulse": printed_landing.impulse[3],
         "here": library_impulse,
-        "off": abs(landing.impulse[3] - library_impulse),
-        "off_new": velocity_error(0.0),
-        "off_old": velocity_error(float(section_state[2])),
+        "off": abs(printed_landing.impulse[3] - library_impulse),
+        "off_new": compute_velocity_error(0.0),
+        "off_old": compute_velocity_error(float(section_state[2])),
         "slow_settled": bool(gentle_slope_gait.settled),
         "share": 100.0 * float(gentle_slope_gait.dls_fraction),
         "period": float(gentle_slope_gait.period),
-        "rear": float(e.gentle_slope_branch.lambda_4_plus.values[is_settled].min())
-        if is_settled.any()
+        "rear": float(e.gentle_slope_branch.lambda_4_plus.values[has_settled_gait].min())
+        if has_settled_gait.any()
         else math.nan,
-        "last": float(e.gentle_slope_branch.damping.values[is_settled].max())
-        if is_settled.any()
+        "last": float(e.gentle_slope_branch.damping.values[has_settled_gait].max())
+        if has_settled_gait.any()
         else math.nan,
         "end": float(e.gentle_slope_branch.damping.max()),
-        "end_walks": is_settled[-1],
+        "end_walks": has_settled_gait[-1],
         "end_outcome": Outcome(int(e.gentle_slope_branch.outcome.values[-1]))
         .name.lower()
         .replace("_", " "),
@@ -64,32 +65,34 @@ def _compute_misprint_numbers(e: Evidence) -> NumbersByName:
 
 
 # fmt: off
-MISPRINT_CLAIMS = ClaimGroup(
+MISPRINT_CLAIMS = PaperClaimGroup(
     "Misprints of the paper, with the evidence", _compute_misprint_numbers, (
-    Claim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)", "−L1 sin θ − L2 sin(θ+α)",
+    PaperClaim("eq. (11): J43 must be −L1 sin θ + L2 sin(θ+α)", "eq. (11)",
+          "−L1 sin θ − L2 sin(θ+α)",
           "J q̇ reaches {wrong:.2f} m/s as printed, {right:.0e} corrected (must be 0)",
           lambda n: n.wrong > 0.1 and n.right < 1e-12,
           "1e-12 m/s: rounding; as printed far from it"),
-    Claim("eq. (35): the impulse is −X⁻¹ J q̇†", "eq. (35)", "the projector of eq. (20)",
+    PaperClaim("eq. (35): the impulse is −X⁻¹ J q̇†", "eq. (35)", "the projector of eq. (20)",
           "as printed five numbers, eq. (20)'s velocities; corrected M Δq̇ = Jᵀ λ_I to "
           "{residual:.0e} N·s, λ_I4 = {impulse:.4f}, here {here:.4f} N·s",
           lambda n: n.velocities and n.residual < 1e-10 and n.off <= STEP_ERROR_TOLERANCE,
           "1e-10 N·s: rounding; λ_I4 to the error of a step"),
-    Claim("eqs (16), (17): L̇1 without a superscript is L̇1⁻", "eqs (16), (17)", "L̇1",
+    PaperClaim("eqs (16), (17): L̇1 without a superscript is L̇1⁻", "eqs (16), (17)", "L̇1",
           "landing foot's velocity off by {off_old:.0e} m/s with L̇1⁻, "
           "by {off_new:.2f} with the new L̇1 = 0",
           lambda n: n.off_old < 1e-8 and n.off_new > 1e-2,
           "1e-8 m/s: error of the difference quotient"),
-    Claim("§5.2 prints φ = 0.10 for Fig. 10, where gaits are nearly at rest", "§5.2",
+    PaperClaim("§5.2 prints φ = 0.10 for Fig. 10, where gaits are nearly at rest", "§5.2",
           "c = 100: 96 % DLS, T ≈ 4.5 s (independent code)",
           "{share:.1f} % DLS, T = {period:.2f} s",
-          lambda n: n.slow_settled and agrees_within(share=(96.0, 0.5), period=(4.5, 0.05))(n)),
-    Claim("λ4⁺ does not vanish at c = 220 at φ = 0.10", "§5.2",
+          lambda n: n.slow_settled and make_agreement_test(share=(96.0, 0.5), period=(4.5,
+          0.05))(n)),
+    PaperClaim("λ4⁺ does not vanish at c = 220 at φ = 0.10", "§5.2",
           "0 at 220 (at φ = 0.30 it is)",
           "λ4⁺ ≥ {rear:.0f} N up to c = {last:.0f}; at c = {end:.0f}: {end_outcome}",
           lambda n: n.rear > 10.0 and not n.end_walks,
           "10 N: far from zero; no gait left at 220 for λ4⁺ to vanish on"),
-    Claim("λ2⁺ does not vanish at c = 4 at φ = 0.10", "§5.2", "0 at 4 (at φ = 0.30 it is)",
+    PaperClaim("λ2⁺ does not vanish at c = 4 at φ = 0.10", "§5.2", "0 at 4 (at φ = 0.30 it is)",
           "λ2⁺ = {low:.1f} N at c = 4", lambda n: n.low > 1.0 and n.low_settled,
           "1 N: far from zero"),
 ))

@@ -2,7 +2,7 @@
 forms.
 
 The equations use the paper's five coordinates q = (x, z, theta, L1, L2). Only the mass matrix and
-the momentum are those of the simulator.
+the momentum are taken from the simulator.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,9 @@ from vrw_jax.wheel import Motion, Symbols, WheelParams, length_at_touchdown, mas
 
 
 @jax.jit
-def _compute_touchdown(params: WheelParams, theta: float) -> tuple[Symbols, Array]:
+def _compute_symbols_and_touchdown_length(
+    params: WheelParams, theta: float
+) -> tuple[Symbols, Array]:
     """Return the symbols of the paper, and the length of Leg 1 at touchdown in m."""
     s = params.symbols()
     return s, length_at_touchdown(s, jnp.asarray(theta))
@@ -29,27 +31,27 @@ def compute_double_support_jacobian(
 ) -> np.ndarray:
     """Return the Jacobian J_DLS of eq. (11), shape (..., 4, 5).
 
-    The misprint is the sign in its entry J43.
+    The sign of its entry J43 is a misprint.
 
-    - `is_as_printed`: whether the entry has the printed sign.
+    - `is_as_printed`: whether the entry J43 has the printed sign.
     """
     zeros, ones = np.zeros_like(theta), np.ones_like(theta)
-    sin, cos = np.sin(theta), np.cos(theta)
-    rear_sin, rear_cos = np.sin(theta + alpha), np.cos(theta + alpha)
+    fore_sine, fore_cosine = np.sin(theta), np.cos(theta)
+    rear_sine, rear_cosine = np.sin(theta + alpha), np.cos(theta + alpha)
     j43_sign = -1.0 if is_as_printed else 1.0
     jacobian_rows = (
         (ones, zeros, zeros, zeros, zeros),
         (zeros, ones, zeros, zeros, zeros),
-        (ones, zeros, L1 * cos - L2 * rear_cos, sin, -rear_sin),
-        (zeros, ones, -L1 * sin + j43_sign * L2 * rear_sin, cos, -rear_cos),
+        (ones, zeros, L1 * fore_cosine - L2 * rear_cosine, fore_sine, -rear_sine),
+        (zeros, ones, -L1 * fore_sine + j43_sign * L2 * rear_sine, fore_cosine, -rear_cosine),
     )
     return np.stack([np.stack(jacobian_row, axis=-1) for jacobian_row in jacobian_rows], axis=-2)
 
 
-def compute_constraint_violation(gait: xr.Dataset, is_as_printed: bool) -> float:
+def compute_constraint_violation(walk_trajectory: xr.Dataset, is_as_printed: bool) -> float:
     """Return the largest foot speed J q' of eq. (2) in the double support of a walk, m/s."""
-    double_support = gait.isel(time=gait.phase.values == 0)
-    alpha = 2.0 * np.pi / gait.attrs["parameter_n_legs"]
+    double_support = walk_trajectory.isel(time=walk_trajectory.phase.values == 0)
+    alpha = 2.0 * np.pi / walk_trajectory.attrs["parameter_n_legs"]
     J = compute_double_support_jacobian(
         double_support.theta.values,
         double_support.L1.values,
@@ -57,13 +59,14 @@ def compute_constraint_violation(gait: xr.Dataset, is_as_printed: bool) -> float
         alpha,
         is_as_printed,
     )
-    rates = np.stack(
-        [double_support[name].values for name in ("dx", "dz", "dtheta", "dL1", "dL2")], axis=-1
+    coordinate_rates = np.stack(
+        [double_support[rate_name].values for rate_name in ("dx", "dz", "dtheta", "dL1", "dL2")],
+        axis=-1,
     )
-    return float(np.abs(np.einsum("tij,tj->ti", J, rates)).max())
+    return float(np.abs(np.einsum("tij,tj->ti", J, coordinate_rates)).max())
 
 
-class PaperLanding(NamedTuple):
+class PrintedLandingResult(NamedTuple):
     """Result of collision I by eqs (15)-(21) and (33)-(35), corrected and as printed."""
 
     velocity_after: np.ndarray  # q'+ of eq. (20)
@@ -72,13 +75,15 @@ class PaperLanding(NamedTuple):
     momentum_residual: float  # largest |M (q'+ - q') - J^T lambda_I|, N s
 
 
-def compute_landing(params: WheelParams, section_state: np.ndarray) -> PaperLanding:
+def compute_printed_landing(params: WheelParams, section_state: np.ndarray) -> PrintedLandingResult:
     """Return the result of collision I from (theta-, dtheta-, dL1-), in five coordinates."""
-    theta, dtheta, dL1 = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
+    touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
+    s, touchdown_length = jax.tree.map(
+        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
+    )
     foot_velocity = compute_landing_foot_velocity(params, section_state, leg_1_rate=dL1)
-    velocity_before = np.array([*foot_velocity, dtheta, 0.0, dL1])
-    theta_after = np.asarray(theta - s.alpha)
+    velocity_before = np.array([*foot_velocity, touchdown_rate, 0.0, dL1])
+    theta_after = np.asarray(touchdown_angle - s.alpha)
     coordinates_after = (theta_after, np.asarray(s.L0), np.asarray(touchdown_length))
     J = compute_double_support_jacobian(*coordinates_after, float(s.alpha), is_as_printed=False)
     M = np.asarray(
@@ -88,17 +93,24 @@ def compute_landing(params: WheelParams, section_state: np.ndarray) -> PaperLand
     )
     inverse_mass_matrix = np.linalg.inv(M)
     X = J @ inverse_mass_matrix @ J.T
-    projector = np.eye(5) - inverse_mass_matrix @ J.T @ np.linalg.solve(X, J)
-    velocity_after, impulse = projector @ velocity_before, -np.linalg.solve(X, J @ velocity_before)
-    momentum_residual = float(np.abs(M @ (velocity_after - velocity_before) - J.T @ impulse).max())
-    return PaperLanding(velocity_after, impulse, projector @ velocity_before, momentum_residual)
+    velocity_projector = np.eye(5) - inverse_mass_matrix @ J.T @ np.linalg.solve(X, J)
+    velocity_after, landing_impulse = (
+        velocity_projector @ velocity_before,
+        -np.linalg.solve(X, J @ velocity_before),
+    )
+    momentum_residual = float(
+        np.abs(M @ (velocity_after - velocity_before) - J.T @ landing_impulse).max()
+    )
+    return PrintedLandingResult(
+        velocity_after, landing_impulse, velocity_projector @ velocity_before, momentum_residual
+    )
 
 
 @jax.jit
 def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L2: Scalar) -> Array:
     """Return the mass matrix M(q) of eq. (1), shape (5, 5).
 
-    Its parts are the mass matrix of the planted wheel, and the momentum of a wheel whose foot
+    It consists of the mass matrix of the planted wheel and the momentum of a wheel whose foot
     moves.
     """
     planted_mass_matrix = mass_matrix(s, L1, L2)
@@ -126,33 +138,37 @@ def compute_landing_foot_velocity(
 
     - `leg_1_rate`: rate of L1 in these equations, m/s.
     """
-    theta, dtheta, _ = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
+    touchdown_angle, touchdown_rate, _ = (float(v) for v in section_state)
+    s, touchdown_length = jax.tree.map(
+        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
+    )
     L0, alpha = float(s.L0), float(s.alpha)
     x = (
-        touchdown_length * np.cos(theta) - L0 * np.cos(alpha - theta)
-    ) * dtheta + leg_1_rate * np.sin(theta)
+        touchdown_length * np.cos(touchdown_angle) - L0 * np.cos(alpha - touchdown_angle)
+    ) * touchdown_rate + leg_1_rate * np.sin(touchdown_angle)
     z = -(
-        touchdown_length * np.sin(theta) + L0 * np.sin(alpha - theta)
-    ) * dtheta + leg_1_rate * np.cos(theta)
+        touchdown_length * np.sin(touchdown_angle) + L0 * np.sin(alpha - touchdown_angle)
+    ) * touchdown_rate + leg_1_rate * np.cos(touchdown_angle)
     return np.array([x, z])
 
 
 def differentiate_landing_foot_position(
     params: WheelParams, section_state: np.ndarray
 ) -> np.ndarray:
-    """Return the velocity (x, z) of the landing foot by central differences, accurate to
-    1e-11 m/s.
+    """Return the velocity (x, z) of the landing foot by central differences, accurate to 1e-11
+    m/s.
     """
     h = 1e-6  # The step is in s; the error is proportional to its square.
-    theta, dtheta, dL1 = (float(v) for v in section_state)
-    s, touchdown_length = jax.tree.map(float, _compute_touchdown(params, theta))
+    touchdown_angle, touchdown_rate, dL1 = (float(v) for v in section_state)
+    s, touchdown_length = jax.tree.map(
+        float, _compute_symbols_and_touchdown_length(params, touchdown_angle)
+    )
 
-    def compute_position(t: float) -> np.ndarray:
+    def compute_foot_position(t: float) -> np.ndarray:
         """Return the position (x, z) of the landing foot at the time t (s), m."""
-        angle, leg_length = theta + dtheta * t, touchdown_length + dL1 * t
-        hub_position = leg_length * np.array([np.sin(angle), np.cos(angle)])
-        landing_angle = angle - float(s.alpha)
+        wheel_angle, leg_length = touchdown_angle + touchdown_rate * t, touchdown_length + dL1 * t
+        hub_position = leg_length * np.array([np.sin(wheel_angle), np.cos(wheel_angle)])
+        landing_angle = wheel_angle - float(s.alpha)
         return hub_position - float(s.L0) * np.array([np.sin(landing_angle), np.cos(landing_angle)])
 
-    return (compute_position(h) - compute_position(-h)) / (2.0 * h)
+    return (compute_foot_position(h) - compute_foot_position(-h)) / (2.0 * h)

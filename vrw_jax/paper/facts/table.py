@@ -1,4 +1,6 @@
-"""Table of every fact that the paper publishes, with the computed value. Each fact can fail."""
+"""Table of every fact that the paper publishes, with the computed value and whether the two
+agree.
+"""
 
 import csv
 import itertools
@@ -7,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from vrw_jax.paper.facts.base import Evidence, Fact
+from vrw_jax.paper.facts.base import PaperEvidence, PaperFact
 from vrw_jax.paper.facts.claims import (
     ASSUMPTION_CLAIMS,
     DAMPING_CLAIMS,
@@ -17,7 +19,7 @@ from vrw_jax.paper.facts.claims import (
 from vrw_jax.paper.facts.misprints import MISPRINT_CLAIMS
 from vrw_jax.printing import format_markdown_table
 
-INTRODUCTION = (
+FACTS_PAGE_INTRODUCTION = (
     "The paper is *Modeling and analysis of passive viscoelastic-legged rimless wheel that "
     "generates measurable period of double-limb support*. “Independent code” is a solver in the "
     "paper's five constrained coordinates. It provides the reference if the paper prints no "
@@ -25,7 +27,7 @@ INTRODUCTION = (
     "table gives another reason."
 )
 
-CLAIM_GROUPS = (
+PAPER_CLAIM_GROUPS = (
     TYPICAL_GAIT_CLAIMS,
     DAMPING_CLAIMS,
     INDICATOR_CLAIMS,
@@ -34,67 +36,84 @@ CLAIM_GROUPS = (
 )
 
 
-def compute_facts(evidence: Evidence) -> list[Fact]:
+def compute_paper_facts(evidence: PaperEvidence) -> list[PaperFact]:
     """Return the facts of all groups of claims."""
-    return [fact for group in CLAIM_GROUPS for fact in group.make_facts(evidence)]
+    return [fact for claim_group in PAPER_CLAIM_GROUPS for fact in claim_group.make_facts(evidence)]
 
 
-def summarize_facts(facts: Sequence[Fact]) -> str:
+def summarize_paper_facts(paper_facts: Sequence[PaperFact]) -> str:
     """Return a sentence with the number of facts that hold and the sources of their numbers."""
-    n, n_from_code = len(facts), sum(fact.is_from_reference_code for fact in facts)
-    sources_text = f"{n - n_from_code} with published numbers, {n_from_code} with independent code"
-    return f"{sum(fact.holds for fact in facts)} of {n} facts hold: {sources_text}"
+    n_facts, n_facts_from_code = (
+        len(paper_facts),
+        sum(paper_fact.is_from_reference_code for paper_fact in paper_facts),
+    )
+    n_facts_that_hold = sum(paper_fact.holds for paper_fact in paper_facts)
+    return (
+        f"{n_facts_that_hold} of {n_facts} facts hold: {n_facts - n_facts_from_code} with "
+        f"published numbers, {n_facts_from_code} with independent code"
+    )
 
 
-def format_facts_page(facts: Sequence[Fact]) -> str:
+def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
     """Return the table of facts as a page of Markdown."""
-    failed_facts = [fact for fact in facts if not fact.holds]
+    failed_facts = [paper_fact for paper_fact in paper_facts if not paper_fact.holds]
     page_lines = [
         "# The paper's facts",
         "",
         "This page compares every number that the paper publishes with the computed number. "
         "`vrw reproduce --out results` computes this page and the figures.",
         "",
-        f"{summarize_facts(facts)}."
+        f"{summarize_paper_facts(paper_facts)}."
         + (
             ""
             if not failed_facts
-            else " Not: " + "; ".join(fact.claim for fact in failed_facts) + "."
+            else " Not: " + "; ".join(paper_fact.claim for paper_fact in failed_facts) + "."
         ),
         "",
-        INTRODUCTION,
+        FACTS_PAGE_INTRODUCTION,
         "",
         "Figure 10 uses the slope 0.30 rad. Section 5.2 prints 0.10, but at this slope the gaits "
         "do not agree with the numbers of the figure (last group). With Coulomb friction the rear "
         "foot would slip in the landing. In this model, as in the paper, it does not slip.",
     ]
-    for title, group in itertools.groupby(facts, lambda fact: fact.group):
+    for group_title, facts_of_group in itertools.groupby(
+        paper_facts, lambda paper_fact: paper_fact.group
+    ):
         table_rows = []
-        for fact in group:
-            verdict = fact.verdict if fact.holds else f"**{fact.verdict}**"
-            cells = (
-                fact.claim,
-                fact.source,
-                fact.published_value,
-                fact.computed,
-                verdict,
-                fact.tolerance_reason,
+        for paper_fact in facts_of_group:
+            verdict_text = paper_fact.verdict if paper_fact.holds else f"**{paper_fact.verdict}**"
+            cell_texts = (
+                paper_fact.claim,
+                paper_fact.source,
+                paper_fact.published_value,
+                paper_fact.computed,
+                verdict_text,
+                paper_fact.tolerance_reason,
             )
             # Minus signs replace the hyphens before numbers.
-            table_rows.append([re.sub(r"(?<![\w.])-(?=\d)", "−", cell_text) for cell_text in cells])
-        header = ("fact", "where", "published", "found", "", "tolerance")
-        page_lines += ["", f"## {title}", "", *format_markdown_table(header, table_rows)]
+            table_rows.append(
+                [re.sub(r"(?<![\w.])-(?=\d)", "−", cell_text) for cell_text in cell_texts]
+            )
+        column_headings = ("fact", "where", "published", "found", "", "tolerance")
+        page_lines += [
+            "",
+            f"## {group_title}",
+            "",
+            *format_markdown_table(column_headings, table_rows),
+        ]
     return "\n".join(page_lines) + "\n"
 
 
-def write_facts(facts: Sequence[Fact], folder: Path) -> list[Path]:
-    """Write the table as facts.md and facts.csv, and return the paths."""
+def write_facts_files(paper_facts: Sequence[PaperFact], folder: Path) -> list[Path]:
+    """Write the table of facts as facts.md and facts.csv, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / "facts.md", folder / "facts.csv"]
-    paths[0].write_text(format_facts_page(facts), encoding="utf-8")
-    with paths[1].open("w", newline="", encoding="utf-8") as csv_file:
-        fact_rows = [asdict(fact) | {"holds": fact.verdict} for fact in facts]
-        writer = csv.DictWriter(csv_file, fact_rows[0].keys())
-        writer.writeheader()
-        writer.writerows(fact_rows)
-    return paths
+    written_paths = [folder / "facts.md", folder / "facts.csv"]
+    written_paths[0].write_text(format_facts_page(paper_facts), encoding="utf-8")
+    with written_paths[1].open("w", newline="", encoding="utf-8") as csv_file:
+        fact_rows = [
+            asdict(paper_fact) | {"holds": paper_fact.verdict} for paper_fact in paper_facts
+        ]
+        csv_writer = csv.DictWriter(csv_file, fact_rows[0].keys())
+        csv_writer.writeheader()
+        csv_writer.writerows(fact_rows)
+    return written_paths
