@@ -680,7 +680,7 @@ def choose_combination(
         _evaluate_violation,
         *lax.stop_gradient((s, inertia, free_motion, friction)),
         allowed_modes,
-        tolerances,
+        lax.stop_gradient(tolerances),
     )
     uses_paper_rule = map_friction(lambda value: value == PAPER_RULE_SENTINEL, friction)
     if isinstance(uses_paper_rule, tuple):

@@ -1,10 +1,9 @@
-"""Steps of one wheel with unilateral contact, by the machine code of the batch kernel in JAX
-programs.
+"""Steps of one wheel with unilateral contact, by machine code or by diffrax in JAX programs.
 
 `build_contact_step_function` returns a function of one wheel that `jax.vmap` maps onto lanes. For
 derivatives, each tangent has one lane beside the lane of the motion. For samples of a step, a JAX
 program advances from event to event and records the start of each interval. Then every interval
-becomes a lane that is integrated again, sample by sample.
+is integrated again, sample by sample.
 """
 
 import functools
@@ -32,6 +31,7 @@ from vrw_jax.contact.contact_state import (
     pack_state,
     unpack_state,
 )
+from vrw_jax.contact.diffrax_interval import sample_by_diffrax
 from vrw_jax.contact.mechanics import WheelMotion, find_slots
 from vrw_jax.contact.walk_kernel import (
     STATUS_UNFINISHED,
@@ -46,7 +46,7 @@ from vrw_jax.contact.walk_kernel import (
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import ButcherTableau, load_explicit_tableau, sample_at_equal_times
 from vrw_jax.models import split_jacobian_by_leaf
-from vrw_jax.numerics import ForwardFunction, StepOptions, unbatch
+from vrw_jax.numerics import ForwardFunction, StepOptions, opaque_condition, unbatch
 from vrw_jax.runtime import compile_cached_lane_function
 from vrw_jax.wheel import stack_parameters
 
@@ -56,6 +56,21 @@ class ContactStepConfig(NamedTuple):
 
     argument_structure: Any  # tree structure of (wheel, params, x, options)
     is_detailed: bool
+    uses_diffrax: bool = False  # whether diffrax replaces the batch kernel
+    engine_name: str = "lanes"  # name of the engine in the results
+
+    def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the leaves with the tolerances of derivatives."""
+        *settings, options = jax.tree.unflatten(self.argument_structure, leaves)
+        return tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+
+    def compile_function(
+        self, function: Callable, make_template: Callable, key: tuple[Any, ...]
+    ) -> Callable:
+        """Return a function over lanes as a function of one wheel."""
+        if self.uses_diffrax:
+            return _add_lane_axis(function)
+        return unbatch(compile_cached_lane_function(function, make_template, key))
 
     def unpack_leaves(self, leaves: tuple[Array, ...]) -> tuple[Array, Array, Any]:
         """Return the lanes' input columns and section states, and (wheel, params, options)."""
@@ -70,8 +85,8 @@ class ContactStepConfig(NamedTuple):
     def make_walk_settings(self, step_settings: Any) -> BatchWalkSettings:
         """Return the settings of a batch of walks of one step each."""
         wheel, params, options = step_settings
-        tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # The caller has checked the solver.
+        tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
+        assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
         contact_rules = (
             wheel.max_events,
             wheel.has_one_sided_stoppers,
@@ -79,7 +94,9 @@ class ContactStepConfig(NamedTuple):
             self.is_detailed,
         )
         has_columns = wheel.uneven is not None, wheel.restitution is not None
-        return BatchWalkSettings(params.n_legs, 1, *contact_rules, options, tableau, *has_columns)
+        return BatchWalkSettings(
+            params.n_legs, 1, *contact_rules, options, tableau, *has_columns, self.engine_name
+        )
 
     def make_template(self, *leaves: Array) -> tuple:
         """Return zero arrays in the structure and shapes of `compute_outputs` for one wheel."""
@@ -115,6 +132,16 @@ class ContactStepConfig(NamedTuple):
         ], *_partition_result(walk_result)
 
 
+def _add_lane_axis(function: Callable) -> Callable:
+    """Return a function over lanes as a function of arrays without the axis of lanes."""
+
+    def evaluate_one_lane(*arrays: Any) -> Any:
+        outputs = function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
+        return jax.tree.map(lambda x: x[..., 0], outputs)
+
+    return evaluate_one_lane
+
+
 def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     """Return the results of a step, split into floats and other arrays.
 
@@ -132,41 +159,37 @@ def _partition_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
     return eqx.partition(step_result, eqx.is_inexact_array)
 
 
-def build_contact_step_function(argument_structure: Any, is_detailed: bool) -> ForwardFunction:
+def build_contact_step_function(config: ContactStepConfig) -> ForwardFunction:
     """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
 
     The results are split into floats and other arrays. The function is a forward rule from which
     all AD modes are built.
     """
-    config = ContactStepConfig(argument_structure, is_detailed)
-    cache_key = "step on real ground", str(argument_structure), is_detailed
-    return unbatch(
-        compile_cached_lane_function(config.compute_outputs, config.make_template, cache_key)
-    )
+    cache_key = "step on real ground", str(config.argument_structure), config.is_detailed
+    return config.compile_function(config.compute_outputs, config.make_template, cache_key)
 
 
 def build_contact_step_jacobian(
-    argument_structure: Any, is_detailed: bool, input_indices: tuple[int, ...]
+    config: ContactStepConfig, input_indices: tuple[int, ...]
 ) -> ForwardFunction:
     """Return a function that computes the Jacobian of the step of `build_contact_step_function`.
 
     The function returns (Jacobian with respect to the leaves at `input_indices`, float results) and
     the other results.
     """
-    config = ContactStepConfig(argument_structure, is_detailed)
 
     def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
         float_outputs, other_outputs = config.make_template(*leaves)
         return float_outputs, float_outputs, other_outputs
 
-    cache_key = "step on real ground along directions", str(argument_structure), is_detailed
+    structure_name = str(config.argument_structure)
+    cache_key = "step on real ground along directions", structure_name, config.is_detailed
     compute_tangents = unbatch(
         compile_cached_lane_function(config.compute_tangents, make_template, cache_key)
     )
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
-        *settings, options = jax.tree.unflatten(argument_structure, leaves)
-        leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+        leaves = config.tighten_tolerances(leaves)
         unit_tangents = np.eye(sum(np.size(leaves[i]) for i in input_indices))
         tangents, leaf_offset = [jnp.zeros_like(leaf) for leaf in leaves], 0
         for i in input_indices:
@@ -258,15 +281,14 @@ def sample_interval(
 
 @functools.cache
 def build_contact_step_sampler(
-    argument_structure: Any, n_samples: int
+    config: ContactStepConfig, n_samples: int
 ) -> Callable[..., SampledIntervals]:
     """Return a function from the leaves of (wheel, params, x, options) to the sampled motion of a
     step.
 
     The function has no derivatives.
     """
-    config = ContactStepConfig(argument_structure, True)
-    cache_key = str(argument_structure)
+    argument_structure, cache_key = config.argument_structure, str(config.argument_structure)
 
     def begin_lane(*leaves: Array) -> Any:
         input_columns, x, step_settings = config.unpack_leaves(leaves)
@@ -293,16 +315,28 @@ def build_contact_step_sampler(
             state, contact_state.contact_modes, contact_state.locked, lane_state.interval.time
         )
 
-    def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
+    def make_logged_dynamics(
+        leaves: tuple[Array, ...], log: IntervalLog
+    ) -> tuple[BatchWalkSettings, ModeDynamics]:
         input_columns, x, step_settings = config.unpack_leaves(leaves)
         walk_settings, no_leg_flags = config.make_walk_settings(step_settings), log.locked & False
         contact_state = ContactState(
             log.contact, log.locked, no_leg_flags, no_leg_flags, no_leg_flags
         )
-        motion, accumulators = unpack_state(log.state)
-        dynamics = walk_settings.make_dynamics(
+        return walk_settings, walk_settings.make_dynamics(
             walk_settings.replace_invalid(input_columns, x)[0], contact_state
         )
+
+    def sample_with_diffrax(leaves: tuple[Array, ...], log: IntervalLog) -> tuple:
+        walk_settings, dynamics = make_logged_dynamics(leaves, log)
+        return sample_by_diffrax(
+            dynamics, log.state, log.duration, n_samples, walk_settings.options
+        )
+
+    def sample_intervals(leaves: tuple[Array, ...], log: IntervalLog) -> Array:
+        walk_settings, dynamics = make_logged_dynamics(leaves, log)
+        motion, accumulators = unpack_state(log.state)
+        assert walk_settings.tableau is not None
         sampling_arguments = (
             jnp.stack(accumulators[1:]),
             log.duration,
@@ -330,7 +364,9 @@ def build_contact_step_sampler(
             )
             return lane_state, jax.tree.map(write_entry, interval_log, interval_entry)
 
-        should_continue = lambda state: state[0].outcome == STATUS_UNFINISHED
+        should_continue = lambda state: opaque_condition(
+            state[0].outcome == STATUS_UNFINISHED, state[0].counters.n_events
+        )
         lane_state, interval_log = lax.while_loop(
             should_continue,
             record_interval_end,
@@ -345,24 +381,19 @@ def build_contact_step_sampler(
         summary = walk_settings.summarize_step(
             final_state, lane_state.counters, lane_state.outcome, walk_settings.tilt(input_columns)
         )
-        sample_rows = jax.vmap(lambda interval_log: compiled_sampling(leaves, interval_log))(
-            interval_log
-        )
-        return SampledIntervals(
-            interval_log,
-            summary,
-            lane_state.outcome,
-            *_unpack_sample_rows(params.n_legs, interval_log, sample_rows),
-        )
+        if config.uses_diffrax:
+            samples = lax.map(lambda log: sample_with_diffrax(leaves, log), interval_log)
+        else:
+            sample_rows = jax.vmap(lambda log: compiled_sampling(leaves, log))(interval_log)
+            samples = _unpack_sample_rows(params.n_legs, interval_log, sample_rows)
+        return SampledIntervals(interval_log, summary, lane_state.outcome, *samples)
 
-    compiled_start = unbatch(
-        compile_cached_lane_function(begin_lane, begin_lane, ("start on real ground", cache_key))
+    compiled_start = config.compile_function(
+        begin_lane, begin_lane, ("start on real ground", cache_key)
     )
     make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
-    compiled_advance = unbatch(
-        compile_cached_lane_function(
-            advance_to_event, make_template, ("to the next event", cache_key)
-        )
+    compiled_advance = config.compile_function(
+        advance_to_event, make_template, ("to the next event", cache_key)
     )
     compiled_sampling = unbatch(
         compile_cached_lane_function(

@@ -1,9 +1,10 @@
-"""Walks of many wheels with unilateral contact, in lanes side by side.
+"""Event loop of walks with unilateral contact, for every engine.
 
-The laws are those of one wheel, elementwise over lanes. Each iteration resolves the events of all
-lanes at an event, then integrates all lanes further (`integrate_interval`). A landing of the
-foremost foot is an event like any other. On a CPU, all of this is one machine-code program in which
-few lanes are idle. Elsewhere XLA compiles the same source.
+The laws are elementwise over lanes. Each iteration resolves the events of all lanes at an event,
+then integrates all lanes further. A landing of the foremost foot is an event like any other. The
+batch kernel integrates many lanes (`integrate_interval`). On a CPU, its loop is one machine-code
+program in which few lanes are idle. Elsewhere XLA compiles the same source. diffrax integrates a
+single lane (`integrate_by_diffrax`).
 """
 
 from typing import Any, NamedTuple
@@ -36,6 +37,7 @@ from vrw_jax.contact.contact_state import (
     make_mode_dynamics,
     min_stopper_force,
 )
+from vrw_jax.contact.diffrax_interval import init_diffrax_interval, integrate_by_diffrax
 from vrw_jax.contact.mechanics import WheelMotion, landing_position, stop_gradients
 from vrw_jax.contact.section import pack_section_state, replace_invalid_start, unpack_section_state
 from vrw_jax.contact.step_record import (
@@ -54,7 +56,7 @@ from vrw_jax.contact.step_record import (
     record_interval,
 )
 from vrw_jax.integrator import ButcherTableau
-from vrw_jax.numerics import StepOptions, tree_where, zeros_like_output
+from vrw_jax.numerics import StepOptions, opaque_condition, tree_where, zeros_like_output
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
@@ -91,7 +93,7 @@ class BatchWalkResult(NamedTuple):
 
 
 def make_result_template(n: int, dtype: Any, is_detailed: bool) -> BatchWalkResult:
-    """Return zeros in the structure of the result of one wheel with `n` legs.
+    """Return zeros in the structure of the batch kernel's result for one wheel with `n` legs.
 
     - `is_detailed`: whether the step is a `UnilateralStep`.
     """
@@ -173,9 +175,10 @@ class BatchWalkSettings(NamedTuple):
     uses_paper_rule: bool
     is_detailed: bool  # whether a `UnilateralStep` is requested
     options: StepOptions
-    tableau: ButcherTableau
+    tableau: ButcherTableau | None  # tableau of the batch kernel; None if diffrax integrates
     is_uneven: bool = False  # whether the input has `N_UNEVEN_COLUMNS`; one step only
     has_restitution: bool = False  # whether the last input column is restitution
+    engine_name: str = "lanes"  # name of the engine in the results
 
     def make_dynamics(self, input_columns: Array, contact_state: ContactState) -> ModeDynamics:
         """Return the dynamics of the lanes in this contact state."""
@@ -213,7 +216,7 @@ class BatchWalkSettings(NamedTuple):
         """
         motion, contact_state = unpack_section_state(self.unpack_columns(input_columns)[0], x)
         dynamics = self.make_dynamics(input_columns, contact_state)
-        interval = zeros_like_output(lambda: init_interval(dynamics, motion, self.options.dt0))
+        interval = zeros_like_output(lambda: self.begin_interval(dynamics, motion))
         q, v = pack_coordinates(motion)
         point = IntervalPoint(q, v, jnp.full_like(interval.point.dynamics_rows, jnp.inf))
         interval = interval._replace(
@@ -225,6 +228,13 @@ class BatchWalkSettings(NamedTuple):
             interval.triggered_guard * 0,
             interval.triggered_guard * 0 + STATUS_UNFINISHED,
         )
+
+    def begin_interval(self, dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
+        """Return the lanes at the start of a contact state, without derivatives."""
+        dynamics, motion, dt0 = stop_gradients((dynamics, motion, self.options.dt0))
+        if self.tableau is None:
+            return init_diffrax_interval(dynamics, motion)
+        return init_interval(dynamics, motion, dt0)
 
     def _init_records(
         self, template: Array
@@ -318,9 +328,7 @@ class BatchWalkSettings(NamedTuple):
             contact_law, guard_layout, motion, contact_state, *event_arguments
         )
         dynamics = self.make_dynamics(input_columns, event_result.contact_state)
-        next_interval = init_interval(
-            *stop_gradients((dynamics, event_result.motion, self.options.dt0))
-        )
+        next_interval = self.begin_interval(dynamics, event_result.motion)
         q, v = pack_coordinates(event_result.motion)
         status = jnp.where(event_outcome != Outcome.STEPPED, event_outcome, next_interval.status)
         next_interval = next_interval._replace(
@@ -358,7 +366,7 @@ class BatchWalkSettings(NamedTuple):
                 lane_state.counters,
                 lane_state.details,
                 outcome,
-                "lanes",
+                self.engine_name,
                 tilt,
             )
         return self.summarize_step(final_state, lane_state.counters, outcome, tilt)
@@ -434,6 +442,15 @@ def process_and_integrate(
     - `waits_for_events`: whether every lane is integrated to its next event.
     """
     state_after_events = walk_settings.process_events(input_columns, lane_state)
+    tableau = walk_settings.tableau
+    if tableau is None:
+        interval = integrate_by_diffrax(
+            walk_settings.make_dynamics,
+            input_columns,
+            state_after_events.interval,
+            walk_settings.options,
+        )
+        return state_after_events, state_after_events._replace(interval=interval)
     has_unfinished_walk = state_after_events.outcome == STATUS_UNFINISHED
     dynamics_fn = lambda input_columns_at: walk_settings.make_dynamics(
         input_columns_at, state_after_events.interval.contact_state
@@ -445,7 +462,7 @@ def process_and_integrate(
         state_after_events.interval,
         has_unfinished_walk,
         walk_settings.options,
-        walk_settings.tableau,
+        tableau,
     )
     return state_after_events, state_after_events._replace(interval=interval)
 
@@ -456,7 +473,9 @@ def run_walks(walk_settings: BatchWalkSettings, input_columns: Array, x: Array) 
     run_iteration = lambda lane_state: process_and_integrate(
         walk_settings, input_columns, lane_state
     )[1]
-    should_continue = lambda lane_state: jnp.any(lane_state.outcome == STATUS_UNFINISHED)
+    should_continue = lambda lane_state: jnp.any(
+        opaque_condition(lane_state.outcome == STATUS_UNFINISHED, lane_state.counters.n_events)
+    )
     lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
     return BatchWalkResult(
         walk_settings.compute_result(lane_state, walk_settings.tilt(input_columns)),

@@ -171,6 +171,8 @@ def walk_with_tangents(
     Tangents are the first axis of `d_columns`, `d_x` and the returned tangents. Each lane has
     `n_tangents` of them.
     """
+    tableau = walk_settings.tableau
+    assert tableau is not None  # diffrax differentiates in another way.
     input_columns, x, is_valid = walk_settings.replace_invalid(input_columns, x)
     count_rows = lambda tree: len(_pack_rows(tree))
 
@@ -243,7 +245,7 @@ def walk_with_tangents(
             tangent_template.interval,
             is_unfinished,
             walk_settings.options,
-            walk_settings.tableau,
+            tableau,
         )
         interval, tangent_rows = _integrate_with_tangents(*integration_arguments)
         return next_state._replace(interval=interval), tangents._replace(tangent_rows=tangent_rows)
