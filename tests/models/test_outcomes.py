@@ -98,10 +98,6 @@ def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="if a landing leaves the wheel rolling backward, diffrax ends the step as FELL_BACK and "
-    "the lane engine continues: 9 of 64 wheels"
-)
 def test_wheels_with_unilateral_contact_come_to_rest_alike_by_both_engines():
     """A foot's slide and the rolling may end together; rounding must not decide the outcome."""
     params, starts = draw_wheels_on_gentle_slopes()

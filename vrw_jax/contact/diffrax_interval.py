@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax.contact.batch_integrator import (
@@ -41,6 +42,9 @@ from vrw_jax.contact.mechanics import WheelMotion, stop_gradients
 from vrw_jax.hybrid import MonitoredFunctions, integrate_in_units, sample_in_units
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import Outcome, compute_wheel_units
+
+ROLLING_INDEX = 2
+"""Index of the rolling rate among the rates (hub x, z, theta, lengths)."""
 
 
 def init_diffrax_interval(dynamics: ModeDynamics, motion: WheelMotion) -> IntervalState:
@@ -90,10 +94,17 @@ def integrate_by_diffrax(
     layout = make_guard_layout(dynamics.s.n, dynamics.is_one_sided)
     q, v = interval.point[:2]
     start_rows = evaluate_dynamics(*stop_gradients((dynamics, q, v)))
+    # As in `init_interval`, a wheel that an event leaves rolling backward continues if it
+    # accelerates forward. The guard is then the rise of the rate.
+    rate, acceleration = lax.stop_gradient(v[ROLLING_INDEX]), start_rows[ROLLING_INDEX]
+    guard_offset = jnp.zeros(layout.n_guards, q.dtype)
+    guard_offset = guard_offset.at[layout.rolling_rate].set(
+        jnp.where((rate < 0.0) & (acceleration > 0.0), rate, 0.0)
+    )
     end = integrate_in_units(
         partial(vector_field, dynamics),
         MonitoredFunctions(
-            partial(compute_guard_values, dynamics),
+            lambda state: compute_guard_values(dynamics, state) - guard_offset,
             layout.n_guards,
             guard_scales=compute_guard_scales(dynamics),
         ),
