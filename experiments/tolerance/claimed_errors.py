@@ -42,8 +42,8 @@ RESULT_FIELDS = (
     "values",
     "errors",
     "model_errors",
-    "rungs",
-    "hows",
+    "models",
+    "statuses",
     "n_steps",
     "states",
     "outcomes",
@@ -133,7 +133,7 @@ def compute_reference(
         if n_steps:
             ground = vrw.UnilateralWheel(friction[open_])
             x = np.asarray(vrw.step_batch(params, x, n_steps, model=ground).section_state)
-        gait = finder.near(np.column_stack([*own_values, friction[open_]]), x)
+        gait = finder.find_cycles_near(np.column_stack([*own_values, friction[open_]]), x)
         missed = np.abs(np.asarray(gait.section_state) - near[open_]).max(1)
         hit = np.asarray(gait.found) & (missed < SAME_GAIT_DISTANCE)
         exact[open_[hit]] = np.stack([np.asarray(getattr(gait, m)) for m in MEASURES], 1)[hit]
@@ -158,7 +158,7 @@ def gather_parts(folder: Path) -> None:
     result_by_name = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     lower = (
         result_by_name["values"]
-        + np.where(result_by_name["hows"] == 0, 0.0, result_by_name["model_errors"].T).T
+        + np.where(result_by_name["statuses"] == 0, 0.0, result_by_name["model_errors"].T).T
     )
     small = {
         "answered": np.isfinite(result_by_name["values"]).all(1),
@@ -166,7 +166,7 @@ def gather_parts(folder: Path) -> None:
         "effectivity": _divide(result_by_name["model_errors"], lower - result_by_name["exact"]),
         "model_error": lower - result_by_name["exact"],
         **{name: result_by_name[name] for name in (
-            "errors", "hows", "n_steps", "outcomes", "hostile", "friction", "tol", "damping",
+            "errors", "statuses", "n_steps", "outcomes", "hostile", "friction", "tol", "damping",
         )},
     }  # fmt: skip
     np.savez_compressed(CLOUD, **{name: x.astype(np.float32) for name, x in small.items()})
@@ -193,7 +193,7 @@ def find_best_model(cloud: Columns) -> np.ndarray:
     is the cost of the refinement with unilateral contact.
     """
     lower = np.all(np.abs(cloud["model_error"]) <= cloud["tol"][:, None], axis=1)
-    return np.where(lower & (cloud["hows"] <= 1), 1.0, cloud["n_steps"])
+    return np.where(lower & (cloud["statuses"] <= 1), 1.0, cloud["n_steps"])
 
 
 def count_results() -> None:
@@ -205,8 +205,8 @@ def count_results() -> None:
         answered = own_values["answered"] > 0
         # The error is infinite if there is no gait.
         ratio = np.nan_to_num(np.abs(own_values["wrong"]) / own_values["errors"], nan=np.inf).max(1)
-        lower = answered & (own_values["hows"] <= 1) & np.isfinite(ratio)
-        for which, rows in (("all", lower), ("of one step", lower & (own_values["hows"] == 0))):
+        lower = answered & (own_values["statuses"] <= 1) & np.isfinite(ratio)
+        for which, rows in (("all", lower), ("of one step", lower & (own_values["statuses"] == 0))):
             effect = own_values["effectivity"][rows][
                 np.abs(own_values["model_error"][rows]) > MIN_MODEL_ERROR
             ]
@@ -226,7 +226,8 @@ def count_results() -> None:
         for tol in TOLERANCES:
             values_here = answered & (np.abs(own_values["tol"] / tol - 1.0) < 1e-3)
             hows = [
-                np.sum(values_here & (own_values["hows"] == status)) for status in range(len(KINDS))
+                np.sum(values_here & (own_values["statuses"] == status))
+                for status in range(len(KINDS))
             ]
             outside = ratio[values_here & (ratio > 1.0)]
             finite = outside[np.isfinite(outside)]
@@ -254,7 +255,7 @@ def draw() -> None:
         wrong = np.maximum(np.abs(cloud["wrong"]), ends[0])
         outside = np.abs(cloud["wrong"]) > cloud["errors"]
         for status, kind in enumerate(KINDS):
-            selection = (cloud["hows"] == status)[:, None] & ~outside
+            selection = (cloud["statuses"] == status)[:, None] & ~outside
             axis.plot(cloud["errors"][selection], wrong[selection], ".", ms=1.5,
             color=COLOURS[status],
                       rasterized=True)  # fmt: skip
@@ -270,7 +271,7 @@ def draw() -> None:
             ("walked to", (2, 3), COLOURS[2]),
         )
         for name, hows, colour in groups:
-            retained = np.isin(cloud["hows"], hows)
+            retained = np.isin(cloud["statuses"], hows)
             values_here = [
                 retained & (np.abs(cloud["tol"] / tol - 1.0) < 1e-3) for tol in TOLERANCES
             ]

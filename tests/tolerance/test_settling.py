@@ -19,7 +19,7 @@ def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float
         lost_values = (failing_interval[0] < x[:, 0]) & (x[:, 0] < failing_interval[1])
         return StepQuantities(y, y, np.where(lost_values, int(vrw.Outcome.FELL_BACK), 0))
 
-    map_on_ground = Mock(GroundBatch, n_legs=1, take_steps=step, complete_states=lambda x: x)
+    map_on_ground = Mock(GroundBatch, n_legs=1, take_steps=step)
     map_on_ground.with_loose_steps.return_value = map_on_ground
     return walk_until_settled(map_on_ground, np.arange(1), np.array([[start, 0.0]]))
 

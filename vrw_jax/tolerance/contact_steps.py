@@ -1,17 +1,18 @@
-"""Batched steps with unilateral contact, without derivatives."""
+"""Batched steps with unilateral contact, and their derivatives."""
 
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.contact import (
     LOCKED_CODE_OFFSET,
-    ContactMode,
     UnilateralWheel,
     embed_section_states,
     min_bounce_height,
+    step_batch_with_jacobian,
     walk_batch,
 )
 from vrw_jax.numerics import StepOptions
@@ -94,27 +95,62 @@ class GroundBatch:
         end_states, durations, outcome, *_, step_length = walk_batch(
             parameter_columns, section_states, n_steps, self.model, self.options, self.n_legs
         )
-        quantities = np.column_stack([durations, step_length, end_states[:, self.plane_indices()]])
+        quantities = self._stack_quantities(durations, step_length, end_states)
         return StepQuantities(end_states, quantities, outcome)
+
+    def linearize_steps(
+        self, indices: np.ndarray, section_states: np.ndarray
+    ) -> tuple[StepQuantities, np.ndarray, np.ndarray]:
+        """Return the result of one step from full section states, and the Jacobians of the end
+        state and of the quantities with respect to these states.
+        """
+        parameter_columns = self.parameter_columns[:, indices]
+        n_columns = len(parameter_columns)
+        input_indices = range(n_columns, n_columns + section_states.shape[1])
+        step, step_jacobian = jax.tree.map(
+            np.asarray,
+            step_batch_with_jacobian(
+                parameter_columns,
+                section_states,
+                self.model,
+                self.options,
+                self.n_legs,
+                input_indices,
+            ),
+        )
+        quantities, quantity_jacobian = (
+            self._stack_quantities(tree.durations, tree.step_length, tree.section_state)
+            for tree in (step, step_jacobian)
+        )
+        return (
+            StepQuantities(step.section_state, quantities, step.outcome),
+            step_jacobian.section_state[:, :, n_columns:],
+            quantity_jacobian[:, :, n_columns:],
+        )
+
+    def _stack_quantities(self, durations: Any, step_length: Any, end_states: Any) -> np.ndarray:
+        """Return the quantities of steps, or their derivatives, along the second axis."""
+        plane_states = end_states[:, self.plane_indices()]
+        return np.concatenate([durations, step_length[:, None], plane_states], 1)
 
     def with_loose_steps(self) -> "GroundBatch":
         """Return the batch with looser step tolerances, for walks."""
         tolerance = self.tolerances.walk
-        options = StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
-        return dataclasses.replace(self, options=options)
+        return dataclasses.replace(
+            self, options=StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
+        )
 
     def list_with_other_tolerances(self) -> list["GroundBatch"]:
         """Return copies of the batch with other step tolerances, for comparison."""
-        is_very_tight = float(self.options.rtol) < 0.5 * self.tolerances.tight_tolerance
         comparison_tolerances = (
             self.tolerances.very_tight_comparisons
-            if is_very_tight
+            if float(self.options.rtol) < 0.5 * self.tolerances.tight_tolerance
             else self.tolerances.tight_comparisons
         )
-        options = [
-            StepOptions(rtol=tolerance, atol=tolerance) for tolerance in comparison_tolerances
+        return [
+            dataclasses.replace(self, options=StepOptions(rtol=tolerance, atol=tolerance))
+            for tolerance in comparison_tolerances
         ]
-        return [dataclasses.replace(self, options=step_options) for step_options in options]
 
     def min_resolved_contact_duration(self, indices: np.ndarray) -> np.ndarray:
         """Return the shortest duration of a contact that the solver resolves, s, for each selected
@@ -127,47 +163,6 @@ class GroundBatch:
         relative_height = float(min_bounce_height(jnp.ones(()), self.options))
         bounce_height = relative_height * get_parameter("locked_length")
         return np.sqrt(8.0 * bounce_height / get_parameter("gravity"))[indices]
-
-    def find_free_coordinates(self, section_states: np.ndarray) -> np.ndarray:
-        """Return whether each number of the section states is free, shape (elements, 4 + 2 n).
-
-        The other numbers follow from the free ones. The hub's rates follow from a sticking foot,
-        Leg 1's length from touchdown, and the lengths of legs on their stoppers from the stoppers.
-        """
-        n_legs = self.n_legs
-        contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
-        is_free = np.zeros((len(section_states), 4 + 2 * n_legs), bool)
-        is_free[:, :2] = is_free[:, 4 + n_legs] = True
-        is_free[:, 2] = contact_codes[:, 0] != ContactMode.STICK
-        is_free[:, 3] = is_free[:, 4] = contact_codes[:, 0] % LOCKED_CODE_OFFSET == 0
-        is_off_stopper = contact_codes[:, 1:] < LOCKED_CODE_OFFSET
-        is_free[:, 5 : 4 + n_legs], is_free[:, 5 + n_legs :] = is_off_stopper, is_off_stopper
-        return is_free
-
-    def complete_states(self, section_states: np.ndarray) -> np.ndarray:
-        """Return section states in which the numbers that are not free are recomputed; see
-        `find_free_coordinates`.
-        """
-        n_legs, section_states = self.n_legs, section_states.copy()
-        theta, hub_rate = section_states[:, 0], section_states[:, 1]
-        leg_1_code = np.round(section_states[:, 4 + 2 * n_legs]).astype(int)
-        foot_code = leg_1_code % LOCKED_CODE_OFFSET
-        # The landing leg determines the height of the hub.
-        height = section_states[:, 3 + n_legs] * np.cos(theta - 2.0 * np.pi / n_legs)
-        sin, cos, leg_1_rate = np.sin(theta), np.cos(theta), section_states[:, 4 + n_legs]
-        section_states[:, 4] = np.where(
-            (foot_code != 0) & (leg_1_code < LOCKED_CODE_OFFSET), height / cos, section_states[:, 4]
-        )
-        length = section_states[:, 4]
-        section_states[:, 2] = np.where(
-            foot_code == ContactMode.STICK,
-            leg_1_rate * sin + length * hub_rate * cos,
-            section_states[:, 2],
-        )
-        section_states[:, 3] = np.where(
-            foot_code != 0, leg_1_rate * cos - length * hub_rate * sin, section_states[:, 3]
-        )
-        return section_states
 
     def plane_indices(self) -> np.ndarray:
         """Return the indices of the paper's section state in a full section state."""

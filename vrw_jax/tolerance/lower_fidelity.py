@@ -57,7 +57,7 @@ def empty_gaits(n_elements: int) -> LowerFidelityGait:
     return LowerFidelityGait(
         np.full(n_elements, ModelIndex.NONE),
         np.zeros((n_elements, 3)),
-        np.zeros((n_elements, N_STEP_QUANTITIES)),
+        np.full((n_elements, N_STEP_QUANTITIES), np.nan),
         np.zeros((n_elements, 3, 3)),
         np.zeros((n_elements, N_STEP_QUANTITIES, 3)),
         np.zeros((n_elements, 3)),

@@ -51,7 +51,8 @@ class MeasureResult(AbstractPrintable):
     - `models`, `statuses`: indices of the models, and codes of the methods;
     - `states`: section states with unilateral contact near the gait, as starts for walks and
       searches;
-    - `n_steps`: number of steps with unilateral contact;
+    - `n_steps`: number of steps with unilateral contact, where a step with its Jacobian counts as
+      four steps;
     - `n_gaits`: number of gaits that the gait was selected from, 0 without a selection;
     - `outcomes`: STEPPED, or the reason why there is no gait;
     - `names`, `is_single`: the requested measures;

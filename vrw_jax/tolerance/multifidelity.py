@@ -25,7 +25,7 @@ from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import GroundBatch
 from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, ModelIndex, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult
-from vrw_jax.tolerance.refinement import BroydenIteration
+from vrw_jax.tolerance.refinement import estimate_measures
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
 from vrw_jax.tolerance.tolerance_request import check_batch, measure_to_tolerance
 from vrw_jax.validation import (
@@ -288,11 +288,15 @@ class _WheelSample(NamedTuple):
             )
             all_positions = np.arange(len(gait_indices))
             section_states = ground.embed_states(all_positions, lower_gaits.section_state)
-            iteration = BroydenIteration.from_states(
-                ground, all_positions, section_states, lower_gaits
-            )
-            estimate = iteration.update_and_estimate(
-                all_positions, ground.take_steps(all_positions, section_states), [self.measure_name]
+            estimate = estimate_measures(
+                ground,
+                all_positions,
+                section_states,
+                ground.take_steps(all_positions, section_states),
+                lower_gaits.newton_matrix,
+                lower_gaits.quantity_jacobian,
+                [self.measure_name],
+                ground.plane_indices(),
             )
             values = np.where(estimate.same_codes, estimate.values[:, 0], values)
         control_values[has_gait] = values

@@ -77,24 +77,19 @@ def walk_until_settled(
         if not len(active_positions):
             break
         walk_end.n_steps[active_positions] += n_steps
-        active_indices, current_states = (
-            indices[active_positions],
-            walk_end.section_states[active_positions],
-        )
+        active_indices = indices[active_positions]
         earlier_step = loose_ground.take_steps(active_indices, start_states, n_steps - 2)
         failed_positions = np.flatnonzero(earlier_step.outcome != Outcome.STEPPED)
-        if len(
-            failed_positions
-        ):  # A leap failed, or the tolerance of the first steps is too loose.
+        if len(failed_positions):
+            # A leap failed, or the tolerance of the first steps is too loose.
             retried_step = (loose_ground if round_index else ground).take_steps(
-                active_indices[failed_positions], current_states[failed_positions], n_steps - 2
+                active_indices[failed_positions],
+                walk_end.section_states[active_positions[failed_positions]],
+                n_steps - 2,
             )
-            merged_arrays = []
+            earlier_step = StepQuantities(*map(np.array, earlier_step))
             for step_array, retried_part in zip(earlier_step, retried_step, strict=True):
-                step_array = np.array(step_array)
                 step_array[failed_positions] = retried_part
-                merged_arrays.append(step_array)
-            earlier_step = StepQuantities(*merged_arrays)
         previous_step = loose_ground.take_steps(active_indices, earlier_step.section_states)
         current_step = loose_ground.take_steps(active_indices, previous_step.section_states)
         step_outcomes = np.stack(
@@ -123,9 +118,8 @@ def walk_until_settled(
             step_array[is_continued] for step_array in (active_positions, leap_vectors)
         )
         start_states = walk_end.section_states[active_positions]
-        has_leap = np.any(leap_vectors != 0.0, axis=1)
-        start_states[has_leap, :n_numbers] += leap_vectors[has_leap]
-        start_states[has_leap] = ground.complete_states(start_states[has_leap])
+        # A step places loaded feet on the slope, so that the end of a leap is a valid start.
+        start_states[:, :n_numbers] += leap_vectors
     return walk_end
 
 

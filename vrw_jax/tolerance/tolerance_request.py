@@ -3,9 +3,9 @@
 The lower model's gait takes one step with unilateral contact. The defect, propagated to the measure
 by the lower model's derivatives, is that model's error to second order. This is a dual-weighted
 residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
-finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise the
-same step is the first one of an iteration to the gait with unilateral contact. If the iteration
-does not contract, the gait is another one, and a walk leads to it.
+finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise
+Newton's method leads from the end of that step to the gait with unilateral contact. If that gait is
+far from the lower model's, a walk leads to another one.
 """
 
 import time
@@ -30,11 +30,7 @@ from vrw_jax.tolerance.lower_fidelity import (
     replace_gaits,
 )
 from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
-from vrw_jax.tolerance.refinement import (
-    BroydenIteration,
-    RefinementResult,
-    refine,
-)
+from vrw_jax.tolerance.refinement import RefinedGaits, estimate_measures, refine_gaits
 from vrw_jax.tolerance.settling import walk_until_settled
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
 from vrw_jax.validation import (
@@ -56,27 +52,18 @@ class RequestOptions:
     - `error_safety_factor`: factor from the error estimate of one step to its bound, chosen because
       the bound holds as long as corrections contract by 3/4;
     - `very_tight_below`: tolerance of a measure below which steps have the very tight tolerance;
-    - `n_exact_steps`: number of steps after a loose walk, before corrections, chosen because looser
-      steps may end in other contact modes;
-    - `n_stability_steps`: number of steps of a walk that must stay near a gait if the gait is far
-      from the end of the previous walk;
     - `n_cold_starts`: number of starts, slow ones first, for wheels without a lower gait. It is
       chosen because the first two starts lead 100 of 232 wheels to a gait, and the other starts
       none of the rest;
     - `max_distance_ratio`: largest distance of the gait with unilateral contact from the lower gait
       that it continues, in first corrections. It is chosen because a contraction by a half moves at
-      most so far;
-    - `n_steps_before_differences`: number of steps from a lower gait with its own derivatives,
-      before finite differences replace them.
+      most so far.
     """
 
     error_safety_factor: float = 4.0
     very_tight_below: float = 1e-7
-    n_exact_steps: int = 3
-    n_stability_steps: int = 60
     n_cold_starts: int = 2
     max_distance_ratio: float = 2.0
-    n_steps_before_differences: int = 3
 
 
 REQUEST_OPTIONS = RequestOptions()
@@ -139,10 +126,9 @@ def measure_to_tolerance(
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
     rank = None if which is None else parse_gait_choice(which)
-    uses_very_tight_steps = tol >= REQUEST_OPTIONS.very_tight_below
     tolerance = (
         STEP_TOLERANCES.tight_tolerance
-        if uses_very_tight_steps
+        if tol >= REQUEST_OPTIONS.very_tight_below
         else STEP_TOLERANCES.very_tight_tolerance
     )
     options = StepOptions(rtol=tolerance, atol=tolerance)
@@ -160,7 +146,6 @@ def measure_to_tolerance(
     else:
         request.select_by_rank(rank)
     results = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), request.results)
-    del results["speeds"]
     return MeasureResult(
         **results,
         names=names,
@@ -193,6 +178,10 @@ def check_batch(
     )
 
 
+RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "states")
+"""Names of the results that a gait determines."""
+
+
 class _MeasureRequest:
     """Request for measures of a batch of wheels, with the results so far."""
 
@@ -219,7 +208,6 @@ class _MeasureRequest:
             "n_steps": np.zeros(n_elements, int),
             "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
             "n_gaits": np.zeros(n_elements, int),
-            "speeds": np.full(n_elements, np.nan),
             "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
         }
 
@@ -267,55 +255,33 @@ class _MeasureRequest:
     def walk_to_gaits(self) -> None:
         """Walk to the gaits with unilateral contact of wheels without a result, and record them."""
         indices = self.find_indices_without_result
-        if not len(indices):
-            return
         has_lower_gait = self.lower_gaits.model_index[indices] != ModelIndex.NONE
-        start_states = self.ground.embed_states(
-            indices[has_lower_gait], self.lower_gaits.section_state[indices[has_lower_gait]]
-        )
-        self._walk_and_correct(
-            indices[has_lower_gait], start_states, MeasureStatus.REACHED_FROM_LOWER_GAIT
+        lower_states = self.lower_gaits.section_state[indices[has_lower_gait]]
+        self._walk_and_record(
+            indices[has_lower_gait], lower_states, MeasureStatus.REACHED_FROM_LOWER_GAIT
         )
         indices = indices[~has_lower_gait]
-        if not len(indices):
-            return
         for start in compute_walk_starts(self._take_wheels(indices))[: self.options.n_cold_starts]:
             has_no_result = self.results["models"][indices] == ModelIndex.NONE
-            start_states = self.ground.embed_states(indices[has_no_result], start[has_no_result])
-            self._walk_and_correct(
-                indices[has_no_result], start_states, MeasureStatus.REACHED_FROM_START
+            self._walk_and_record(
+                indices[has_no_result], start[has_no_result], MeasureStatus.REACHED_FROM_START
             )
 
     def select_by_rank(self, rank: int) -> None:
         """Record the gait of this rank, slowest first, among the ends of walks from all starts."""
-        indices, empty_results, results_of_starts = (
-            self.find_indices_without_result,
-            self.results,
-            [],
+        indices, starts = self.find_indices_without_result, compute_walk_starts(self.params)
+        gait_indices, gaits = self._walk_and_refine(
+            np.tile(indices, len(starts)), np.concatenate(starts)
         )
-        for start in compute_walk_starts(self.params):
-            self.results = {
-                name: starts_array.copy() for name, starts_array in empty_results.items()
-            }
-            self._walk_and_correct(
-                indices, self.ground.embed_states(indices, start), MeasureStatus.SELECTED_BY_RANK
-            )
-            results_of_starts.append(self.results)
-        self.results = empty_results
-        empty_results["n_steps"][:] = np.sum(
-            [results["n_steps"] for results in results_of_starts], axis=0
-        )
+        selected_positions: list[int] = []
         for index in indices:
-            distinct_gaits = _find_distinct_gaits(
-                [
-                    {name: starts_array[index] for name, starts_array in results.items()}
-                    for results in results_of_starts
-                ]
-            )
-            empty_results["n_gaits"][index] = len(distinct_gaits)
+            distinct_gaits = _find_distinct_gaits(gaits, np.flatnonzero(gait_indices == index))
+            self.results["n_gaits"][index] = len(distinct_gaits)
             if -len(distinct_gaits) <= rank < len(distinct_gaits):
-                for name in empty_results.keys() - {"n_steps", "n_gaits"}:
-                    empty_results[name][index] = distinct_gaits[rank][name]
+                selected_positions.append(distinct_gaits[rank])
+        self._record_gaits(
+            gait_indices, gaits, np.array(selected_positions, int), MeasureStatus.SELECTED_BY_RANK
+        )
 
     def _take_wheels(self, indices: np.ndarray) -> WheelParams:
         """Return the wheels at these indices."""
@@ -325,16 +291,21 @@ class _MeasureRequest:
         """Take one step with unilateral contact from the lower gaits, and correct further if
         `continues_iteration`.
         """
-        if not len(indices):
-            return
         lower_gaits = LowerFidelityGait(*(gait_array[indices] for gait_array in self.lower_gaits))
         section_states = self.ground.embed_states(
             indices, lower_gaits.section_state, lower_gaits.model_index == ModelIndex.RIGID
         )
-        iteration = BroydenIteration.from_states(self.ground, indices, section_states, lower_gaits)
-        all_positions = np.arange(len(indices))
-        first_step = iteration.step_elements(all_positions)
-        estimate = iteration.update_and_estimate(all_positions, first_step, self.names)
+        first_step = self.ground.take_steps(indices, section_states)
+        estimate = estimate_measures(
+            self.ground,
+            indices,
+            section_states,
+            first_step,
+            lower_gaits.newton_matrix,
+            lower_gaits.quantity_jacobian,
+            self.names,
+            self.ground.plane_indices(),
+        )
         values = evaluate_measures(self.names, lower_gaits.quantities)
         with np.errstate(all="ignore"):
             correction_effect = (
@@ -342,10 +313,7 @@ class _MeasureRequest:
                 + estimate.correction_effect
             )
             error = values - estimate.values
-            plane_indices = self.ground.plane_indices()
-            sensitivity = np.abs(
-                estimate.quantity_jacobian @ iteration.quantity_jacobian[:, :, plane_indices]
-            )
+            sensitivity = np.abs(estimate.measure_jacobian @ lower_gaits.quantity_jacobian)
             lower_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
             numerical_error = (
                 lower_defect_effect + estimate.numerical_error + estimate.missed_contact_error
@@ -363,104 +331,97 @@ class _MeasureRequest:
             indices[is_accepted],
             lower_gaits.model_index[is_accepted],
             MeasureStatus.CHECKED_BY_ONE_STEP,
-            {
-                "values": values[is_accepted],
-                "errors": error_bound[is_accepted],
-                "model_errors": error[is_accepted],
-                "numerical_errors": numerical_error[is_accepted],
-                "states": section_states[is_accepted],
-            },
+            values[is_accepted],
+            error_bound[is_accepted],
+            error[is_accepted],
+            numerical_error[is_accepted],
+            section_states[is_accepted],
         )
-        rejected_positions = np.flatnonzero(~is_accepted & estimate.same_codes)
-        if not continues_iteration or not len(rejected_positions):
-            return
-        max_distance = self.options.max_distance_ratio * np.linalg.norm(
-            iteration.correction[rejected_positions][:, plane_indices], axis=1
+        rejected_positions = np.flatnonzero(
+            continues_iteration & ~is_accepted & estimate.same_codes
         )
-        first_step_and_estimate = jax.tree.map(
-            lambda gait_array: gait_array[rejected_positions], (first_step, estimate)
-        )
-        refinement = refine(
-            iteration.select(rejected_positions),
+        gaits = refine_gaits(
+            self.ground,
+            indices[rejected_positions],
+            first_step.section_states[rejected_positions],
             self.names,
             self.compute_error_goal,
-            self.options.n_steps_before_differences,
-            first_step_and_estimate,
+            always_compares=False,
         )
-        is_near = (
-            np.linalg.norm(
-                (refinement.section_states - section_states[rejected_positions])[:, plane_indices],
-                axis=1,
-            )
-            <= max_distance
+        self.results["n_steps"][indices[rejected_positions]] += gaits.n_steps
+        distance = np.linalg.norm(
+            (gaits.section_states - section_states[rejected_positions])[
+                :, self.ground.plane_indices()
+            ],
+            axis=1,
+        )
+        max_distance = self.options.max_distance_ratio * np.linalg.norm(
+            estimate.correction[rejected_positions], axis=1
         )
         self._record_gaits(
             indices[rejected_positions],
-            refinement._replace(is_done=refinement.is_done & is_near),
+            gaits,
+            gaits.is_found & (distance <= max_distance),
             MeasureStatus.CONTINUES_LOWER_GAIT,
         )
 
-    def _walk_and_correct(
+    def _walk_and_record(
         self, indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
     ) -> None:
-        """Walk from the states, correct the ends of the walks, and record the gaits."""
-        walk_end = walk_until_settled(self.ground, indices, section_states)
-        self.results["n_steps"][indices] += walk_end.n_steps
+        """Walk from the paper's section states, and record the gaits that the walks reach."""
+        gait_indices, gaits = self._walk_and_refine(indices, section_states)
+        self._record_gaits(gait_indices, gaits, gaits.is_found & gaits.is_attracting, status)
+
+    def _walk_and_refine(
+        self, indices: np.ndarray, section_states: np.ndarray
+    ) -> tuple[np.ndarray, RefinedGaits]:
+        """Walk from the paper's section states, and refine the gaits at the ends of the walks.
+
+        Return the index of the element of each gait, and the gaits.
+        """
+        walk_end = walk_until_settled(
+            self.ground, indices, self.ground.embed_states(indices, section_states)
+        )
+        np.add.at(self.results["n_steps"], indices, walk_end.n_steps)
         # A step cannot begin if a wheel has turned more than once in flight.
-        is_walk_outcome = np.isin(walk_end.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT))
         self.results["outcomes"][indices] = np.where(
-            is_walk_outcome, Outcome.NO_CYCLE_FOUND, walk_end.outcome
+            np.isin(walk_end.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT)),
+            Outcome.NO_CYCLE_FOUND,
+            walk_end.outcome,
         )
-        section_states = walk_end.section_states[walk_end.is_settled]
-        indices = indices[walk_end.is_settled]
-        if not len(indices):
-            return
-        n_exact_steps = self.options.n_exact_steps
-        step = self.ground.take_steps(indices, section_states, n_exact_steps)
-        self.results["n_steps"][indices] += n_exact_steps
-        is_continued = step.outcome == Outcome.STEPPED
-        indices, section_states = indices[is_continued], step.section_states[is_continued]
-        iteration = BroydenIteration.from_states(self.ground, indices, section_states, None)
-        refinement = refine(iteration, self.names, self.compute_error_goal, 0)
-        refinement.is_done[refinement.is_done] = iteration.select(
-            refinement.is_done
-        ).is_attracting()
-        max_distance = iteration.options.max_gait_distance
-        far_positions = np.flatnonzero(
-            refinement.is_done & (iteration.max_distance_to(section_states) > max_distance)
+        gait_indices = indices[walk_end.is_settled]
+        gaits = refine_gaits(
+            self.ground,
+            gait_indices,
+            walk_end.section_states[walk_end.is_settled],
+            self.names,
+            self.compute_error_goal,
+            always_compares=True,
         )
-        n_stability_steps = self.options.n_stability_steps
-        refinement.is_done[far_positions] = iteration.select(far_positions).walk_stays_near(
-            n_stability_steps
-        )
-        refinement.n_steps[far_positions] += n_stability_steps
-        self._record_gaits(indices, refinement, status)
+        np.add.at(self.results["n_steps"], gait_indices, gaits.n_steps)
+        return gait_indices, gaits
 
     def _record_gaits(
-        self, indices: np.ndarray, refinement: RefinementResult, status: MeasureStatus
+        self,
+        gait_indices: np.ndarray,
+        gaits: RefinedGaits,
+        selected_positions: np.ndarray,
+        status: MeasureStatus,
     ) -> None:
-        """Record the results of gaits with unilateral contact."""
-        self.results["n_steps"][indices] += refinement.n_steps
-        indices = indices[refinement.is_done]
-        refinement = RefinementResult(
-            *(result_array[refinement.is_done] for result_array in refinement)
-        )
-        has_lower_gait = (self.lower_gaits.model_index[indices] != ModelIndex.NONE)[:, None]
-        values = evaluate_measures(
-            self.names, np.where(has_lower_gait, self.lower_gaits.quantities[indices], np.nan)
-        )
+        """Record the selected gaits with unilateral contact. `gait_indices` are the indices of
+        their elements.
+        """
+        indices = gait_indices[selected_positions]
+        gaits = RefinedGaits(*(gait_array[selected_positions] for gait_array in gaits))
         self._record(
             indices,
             np.full(len(indices), ModelIndex.UNILATERAL),
             status,
-            {
-                "values": refinement.values,
-                "errors": refinement.remaining_error + refinement.numerical_error,
-                "model_errors": values - refinement.values,
-                "numerical_errors": refinement.remaining_error + refinement.numerical_error,
-                "speeds": refinement.speed,
-                "states": refinement.section_states,
-            },
+            gaits.values,
+            gaits.errors,
+            evaluate_measures(self.names, self.lower_gaits.quantities[indices]) - gaits.values,
+            gaits.errors,
+            gaits.section_states,
         )
 
     def _record(
@@ -468,28 +429,26 @@ class _MeasureRequest:
         indices: np.ndarray,
         model_index: np.ndarray,
         status: MeasureStatus,
-        new_results: dict[str, np.ndarray],
+        *results: np.ndarray,
     ) -> None:
-        """Record results of some elements, with the model and the method."""
-        for name, values in new_results.items():
+        """Record results of some elements, in the order of RESULT_NAMES, with the model and the
+        method.
+        """
+        for name, values in zip(RESULT_NAMES, results, strict=True):
             self.results[name][indices] = values
         self.results["models"][indices], self.results["statuses"][indices] = model_index, status
         self.results["outcomes"][indices] = Outcome.STEPPED
 
 
-def _find_distinct_gaits(
-    results_of_starts: list[dict[str, np.ndarray]],
-) -> list[dict[str, np.ndarray]]:
-    """Return the gaits of one wheel that differ by more than their errors, slowest first."""
-    distinct_gaits: list[dict[str, np.ndarray]] = []
-    for candidate in results_of_starts:
-        is_distinct = (
-            np.any(
-                np.abs(candidate["values"] - other_gait["values"])
-                > candidate["errors"] + other_gait["errors"]
-            )
-            for other_gait in distinct_gaits
-        )
-        if candidate["models"] != ModelIndex.NONE and all(is_distinct):
-            distinct_gaits.append(candidate)
-    return sorted(distinct_gaits, key=lambda candidate: candidate["speeds"])
+def _find_distinct_gaits(gaits: RefinedGaits, candidate_positions: np.ndarray) -> list[int]:
+    """Return the positions of attracting gaits that differ by more than their errors, slowest
+    first.
+    """
+    distinct_positions: list[int] = []
+    is_candidate = (gaits.is_found & gaits.is_attracting)[candidate_positions]
+    for candidate in candidate_positions[is_candidate].tolist():
+        differences = np.abs(gaits.values[candidate] - gaits.values[distinct_positions])
+        errors = gaits.errors[candidate] + gaits.errors[distinct_positions]
+        if np.all(np.any(differences > errors, axis=1)):
+            distinct_positions.append(candidate)
+    return sorted(distinct_positions, key=lambda position: gaits.speed[position])
