@@ -16,7 +16,7 @@ from vrw_jax.cli.reports import write_branch_report
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
     FixedPointProblem,
-    continue_branches_from,
+    continue_from,
 )
 from vrw_jax.continuation.sign_changes import locate_zeros
 from vrw_jax.figures.branch_figures import branch_figure
@@ -86,7 +86,7 @@ def test_a_branch_linearized_outside_of_compiled_programs_is_the_same():
     ]
     (fold,) = (border.value for border in other.special_points if border.kind == "fold")
     assert fold == pytest.approx(0.0, abs=1e-9)
-    assert other.ends == one.ends
+    assert other.end_reasons == one.end_reasons
 
 
 def test_branches_continued_together_equal_single_ones_with_two_iterations_per_point():
@@ -103,7 +103,7 @@ def test_branches_continued_together_equal_single_ones_with_two_iterations_per_p
             jnp.asarray,
             (b[selection], z[selection], a[selection], (-1.0, 2.0), 0.0 * a[selection] + 1.0),
         )
-        return continue_branches_from(
+        return continue_from(
             FixedPointProblem(evaluate_henon), options, *given, jnp.asarray(wanted)
         )
 
@@ -264,7 +264,7 @@ def test_a_zero_is_located_to_its_width_even_at_a_jump():
     ends = np.array([-0.3, -1.0, -19.0]), np.array([0.7, 1e-3, 128.4])
     solution = locate_zeros(functions, ends, np.full(3, 1e-12))
     exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
-    np.testing.assert_allclose(solution.best, exact, atol=1e-12)
+    np.testing.assert_allclose(solution.best_locations, exact, atol=1e-12)
     assert np.all(functions(solution.left_bracket_ends, every) <= 0.0)
     assert not np.any(functions(solution.right_bracket_ends, every) < 0.0)
 

@@ -48,7 +48,7 @@ class MapTestFunction(AbstractTestFunction):
 
 
 def trace_curve(function, quantity, z, p, bounds, seconds, second):
-    """The curve through (p, second), as `border_curve` follows that of a gait."""
+    """The curve through (p, second), as `continue_special_point` does for a gait."""
     level = TestFunctionCurve(MapTestFunction(function, quantity), seconds)
     share = (second - seconds[0]) / (seconds[1] - seconds[0])
     lead = lambda x: jnp.asarray(x, float)[None]
@@ -62,7 +62,7 @@ def trace_curve(function, quantity, z, p, bounds, seconds, second):
 
 
 def evaluate_bowl(_, x, p):
-    """Its fixed point is as high as p is far from the origin, squared."""
+    """Return a map whose fixed point is the squared distance of p from the origin."""
     return 0.5 * x + 0.5 * (p @ p)
 
 
@@ -72,7 +72,7 @@ def test_a_closed_curve_is_continued_until_it_closes():
         evaluate_bowl, height, [0.5], 0.5, (-1.0, 1.0), (-1.0, 1.0), 0.5
     )
     np.testing.assert_allclose(first**2 + second**2, 0.5, atol=1e-9)
-    assert strand.ends[1] == ContinuationStatus.CURVE_CLOSED.meaning
+    assert strand.end_reasons[1] == ContinuationStatus.CURVE_CLOSED.meaning
     angle = np.unwrap(np.arctan2(second, first))
     assert 2.0 * np.pi < np.ptp(angle) < 2.2 * np.pi
 

@@ -374,7 +374,7 @@ def test_friction_is_swept_for_the_unilateral_and_the_automatic_model(model_name
     planned = scanning.plan_config_scan(result, None)
     assert planned.design.swept_parameters == ("friction", "slope")
     assert planned.requested_measures == ("slip", "d speed / d damping")
-    assert planned.evaluation_request.model.model_name == {"auto": "ladder"}.get(
+    assert planned.evaluation_request.wheel_model.model_name == {"auto": "ladder"}.get(
         model_name, model_name
     )
 

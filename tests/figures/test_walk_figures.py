@@ -41,7 +41,7 @@ def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, re
             known = walk[f"foot_{leg}_{letter}"].values  # round-off of metres
             np.testing.assert_allclose(motion.foot_positions[:, leg - 1, axis], known, atol=1e-12)
             np.testing.assert_array_equal(
-                motion.forces[:, leg - 1, axis], walk[f"lambda_{2 * leg - 1 + axis}"]
+                motion.foot_forces[:, leg - 1, axis], walk[f"lambda_{2 * leg - 1 + axis}"]
             )
     lengths = np.linalg.norm(motion.foot_positions - motion.hub_positions[:, None], axis=-1)
     np.testing.assert_allclose(lengths[:, 2:], 1.0, atol=1e-12)

@@ -62,7 +62,7 @@ def test_a_stored_scan_opens_with_xarray_alone(tmp_path: Path) -> None:
     single_result = xr.open_zarr(tmp_path / "s.zarr", consolidated=False, chunks=None)
     assert single_result.speed.dims == ("damping", "slope")
     assert single_result.speed.attrs["units"] == "m/s"
-    np.testing.assert_array_equal(single_result.damping, SMALL_GRID.values["damping"])
+    np.testing.assert_array_equal(single_result.damping, SMALL_GRID.values_by_parameter["damping"])
 
 
 def test_a_stored_list_of_samples_keeps_its_coordinates(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_settings_of_every_model_can_be_stored(wheel):
 
 def test_settings_are_stored_under_the_names_of_version_0_1() -> None:
     """Otherwise a scan would refuse a finished store of that version."""
-    settings = make_plan().settings
+    settings = make_plan().scan_settings
     assert settings["model"] == {
         "kind": "ViscoelasticWheel", "rung": "viscoelastic", "tells_contacts": False,
         "lanes": "phases", "legs_yield": True, "parameter_names": list(PARAMETER_NAMES),
@@ -236,7 +236,8 @@ def test_other_samples_or_measures_are_refused_by_naming_them(tmp_path: Path) ->
     store = tmp_path / "s.zarr"
     run_plan(make_plan(), store, evaluate=evaluate_arithmetically)
     design = designs.grid(
-        damping=SMALL_GRID.values["damping"] + 1.0, slope=SMALL_GRID.values["slope"]
+        damping=SMALL_GRID.values_by_parameter["damping"] + 1.0,
+        slope=SMALL_GRID.values_by_parameter["slope"],
     )
     with pytest.raises(ValueError, match="values of the swept parameters differ"):
         run_plan(plan_scan(design, SCANNED_MEASURES, chunk=4), store)
@@ -295,8 +296,8 @@ def test_chunks_are_slabs() -> None:
 
 def test_values_match_their_coordinates() -> None:
     scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
-    for damping in SMALL_GRID.values["damping"]:
-        for slope in SMALL_GRID.values["slope"]:
+    for damping in SMALL_GRID.values_by_parameter["damping"]:
+        for slope in SMALL_GRID.values_by_parameter["slope"]:
             value_at = scan_result.sel(damping=damping, slope=slope)
             assert value_at.dls_fraction == pytest.approx(
                 np.sin(damping) + np.sin(slope), abs=1e-15
@@ -509,7 +510,7 @@ from vrw_jax.scans.collocation_engine import CollocationScanEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning
-engine = CollocationScanEngine(scanning.make_plan().request)
+engine = CollocationScanEngine(scanning.make_plan().evaluation_request)
 columns = scanning.SMALL_GRID.select_samples((slice(None), slice(None)))
 size = SCAN_BATCH_SIZE + scanning.SMALL_GRID.size
 results = engine({{name: np.resize(column, size) for name, column in columns.items()}})

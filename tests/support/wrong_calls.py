@@ -84,7 +84,7 @@ def register_wrong_calls() -> None:
     for name in ("damping", "slope", "leg_mass"):
         bad = not_numbers | {
             "nan": (float("nan"), "ValueError"), "negative": (-9.0, "ValueError"),
-            "huge": (1e12, "ValueError"), "a list with text": ([1.0, "a"], "TypeError"),
+            "huge": (1e70, "ValueError"), "a list with text": ([1.0, "a"], "TypeError"),
         }  # fmt: skip
         add_wrong_calls(
             f"WheelParams {name}", lambda v, n=name: vrw.WheelParams(**{n: v}), bad, name

@@ -12,8 +12,8 @@ import vrw_jax as vrw
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: vrw.WheelParams(damping=-1.0), ("damping is -1", "[0, 1e+09) N s/m")),
-        (lambda: vrw.WheelParams(leg_mass=0.0), ("leg_mass is 0", "[1e-15, 1e+09) kg")),
+        (lambda: vrw.WheelParams(damping=-1.0), ("damping is -1", "[0, 1e+60) N s/m")),
+        (lambda: vrw.WheelParams(leg_mass=0.0), ("leg_mass is 0", "[1e-15, 1e+60) kg")),
         (lambda: vrw.WheelParams(slope=2.0), ("slope is 2", "1.5708", "rad")),
         (lambda: vrw.WheelParams(stiffness=float("nan")), ("stiffness is nan",)),
         (lambda: vrw.WheelParams(leg_com=1.5), ("leg_com is 1.5", "leg_com < locked_length")),

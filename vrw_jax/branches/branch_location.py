@@ -236,9 +236,7 @@ def _continue_in_both_directions(
         repeat_for_both_directions(is_branch_requested),
     )
     continue_all = (
-        arclength.continue_branches_from
-        if continuation.problem.is_traceable
-        else continue_many_from
+        arclength.continue_from if continuation.problem.is_traceable else continue_many_from
     )
     continue_all = functools.partial(
         continue_all, continuation.problem, continuation.arclength_options

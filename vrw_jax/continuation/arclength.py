@@ -792,7 +792,7 @@ def make_continuation_result(branch_batch: BranchBatch) -> ContinuationResult:
 
 
 @eqx.filter_jit
-def continue_branches_from(
+def continue_from(
     problem: AbstractContinuationProblem,
     options: ArclengthOptions,
     args_by_branch: Any,
@@ -812,7 +812,7 @@ def continue_branches_from(
     """
     if p.ndim == 0:
         add_axis = lambda tree: jax.tree.map(lambda x: x[None], tree)
-        result = continue_branches_from(
+        result = continue_from(
             problem,
             options,
             add_axis(args_by_branch),

@@ -177,7 +177,7 @@ def continue_many_from(
     direction_signs: Float[Array, " branches"],
     is_branch_requested: Bool[Array, " branches"],
 ) -> ContinuationResult:
-    """Continue branches as `arclength.continue_branches_from` does, outside of compiled code.
+    """Continue branches as `arclength.continue_from` does, outside of compiled code.
 
     Return all points.
     """
