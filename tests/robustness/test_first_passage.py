@@ -176,7 +176,7 @@ def test_failures_are_counted_if_few_sampled_walks_dominate():
     # Importance sampling alone gives 5754 steps with a stated error of 16 %.
     params = vrw.WheelParams(damping=113.217253, stiffness=515.611361, slope=0.31709696)
     passage = vrw.first_passage(params, 0.014743410)
-    # `experiments.shared.failure_counts` counts 309 failures in 1,016,657 steps.
+    # A separate count of 1,016,657 steps contains 309 failures.
     counted_mean, counted_error = 3290.0, 0.147 * 3290.0
     error = float(passage.error)
     assert error < 0.2 * float(passage.mean_steps)
