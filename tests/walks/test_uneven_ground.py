@@ -358,7 +358,7 @@ def test_derivatives_with_unilateral_contact_are_differences_of_complementarity(
         ({"n_steps": 4}, r"slope has shape \(3, 3\), but there are 3 states and 4 steps: give one"),
         ({"n_steps": 1}, r"for each and 1 or 2 of each over its steps"),
         ({"params": vrw.WheelParams(damping=[1.0, 2.0])}, r"damping has shape \(2,\), but there"),
-        ({"derivatives": ("slope",), "engine": "diffrax"}, "derivatives: leave engine"),
+        ({"derivatives": ("slope",), "engine": "diffrax"}, "batches with contact need 'lanes'"),
         ({"model": None, "engine": "collocation"}, "which takes one slope, but slope is an array"),
     ],
 )
