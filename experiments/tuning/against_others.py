@@ -173,7 +173,7 @@ def by_tune(problem: TuneProblem, u: np.ndarray, scales: np.ndarray) -> MethodHi
     began = time.perf_counter()
     tuned = tune(
         problem.make_wheel(u),
-        problem.objective_and_constraints.objective,
+        problem.objective_and_constraints.objective_function,
         problem.free_parameters,
         dict(
             zip(
