@@ -32,7 +32,9 @@ GAIT_OF_TABLE_1 = ((-0.6827, 1.0492), (0.4343, 0.3330, 0.0497))
 SURFACE_PATH = Path(surface.__file__).with_name("surface.npz")
 
 
-def find_gaits_by_continuation(problem: search.CollocationSystem, parameters: jax.Array) -> object:
+def find_gaits_by_continuation(
+    problem: search.CollocationSystem, parameters: jax.Array
+) -> search.CycleSearchResult:
     """Return gaits found by a homotopy of the parameters from Table 1."""
 
     def search_from_table_1(parameters: jax.Array) -> search.CycleSearchResult:
@@ -45,7 +47,7 @@ def find_gaits_by_continuation(problem: search.CollocationSystem, parameters: ja
         table_1_parameters = jnp.broadcast_to(table_1_parameters, parameters.shape)
         stages = jnp.int32(N_STAGES)
         pending = jnp.ones(lanes, bool)
-        limit = problem.options.max_newton_iterations
+        limit = problem.cycle_options.max_newton_iterations
         return search.run_newton_iterations(
             problem, parameters, start, table_1_parameters, stages, limit, pending
         )
@@ -66,12 +68,12 @@ def main() -> None:
     for name, (low, high) in PARAMETER_BOX.items():
         parameters[PARAMETER_NAMES.index(name)] = generator.uniform(low, high, N_WHEELS)
     search_result = find_gaits_by_continuation(problem, jnp.asarray(parameters))
-    is_found = np.asarray(search_result.located.found) > 0.5
-    solution = search_result.located.solution
+    is_found = np.asarray(search_result.collocation_state.has_cycle) > 0.5
+    solution = search_result.collocation_state.solution
     time_unit = float(surface.compute_time_unit(table_1))  # L0 = 1 m in Table 1.
     rows = [
-        solution.section[0],
-        solution.section[1] * time_unit,
+        solution.section_state[0],
+        solution.section_state[1] * time_unit,
         *(solution.durations[0] / time_unit),
     ]
     for block in solution.accelerations:

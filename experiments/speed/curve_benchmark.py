@@ -29,7 +29,7 @@ def main() -> None:
     )
     begin = lambda: find_seeds_on_parallel_lines(tracer, vrw.WheelParams())
     seeds = begin()
-    curves = [one.curve for one in tracer.trace_curves(seeds, ())]
+    curves = [traced.special_point_curve for traced in tracer.trace_curves(seeds, ())]
     n = sum(len(curve.values) for curve in curves)
     print(f"{len(curves)} curves, {n} points, {sum(len(c.codim2_points) for c in curves)} meetings")
     with use_one_core():
