@@ -341,7 +341,11 @@ def _compile_for_rows(
 
     if simd.is_machine_code_available():
         return compile_cached_lane_program(
-            evaluate_section_function, [], n_rows, dtype, ("on real ground", function_name, n)
+            evaluate_section_function,
+            [],
+            n_rows,
+            dtype,
+            ("with unilateral contact", function_name, n),
         )
     return _compile_with_xla(evaluate_section_function)
 
@@ -537,6 +541,6 @@ def _compile_walk(
             scalar_dtypes,
             sum(config.input_row_counts()),
             dtype,
-            ("walk on real ground", config),
+            ("walk with unilateral contact", config),
         )
     return _compile_with_xla(run_compiled_walk)

@@ -165,7 +165,7 @@ def build_contact_step_function(config: ContactStepConfig) -> ForwardFunction:
     The results are split into floats and other arrays. The function is a forward rule from which
     all AD modes are built.
     """
-    cache_key = "step on real ground", str(config.argument_structure), config.is_detailed
+    cache_key = "step with unilateral contact", str(config.argument_structure), config.is_detailed
     return config.compile_function(config.compute_outputs, config.make_template, cache_key)
 
 
@@ -183,7 +183,7 @@ def build_contact_step_jacobian(
         return float_outputs, float_outputs, other_outputs
 
     structure_name = str(config.argument_structure)
-    cache_key = "step on real ground along directions", structure_name, config.is_detailed
+    cache_key = "step with unilateral contact along directions", structure_name, config.is_detailed
     compute_tangents = unbatch(
         compile_cached_lane_function(config.compute_tangents, make_template, cache_key)
     )
@@ -389,7 +389,7 @@ def build_contact_step_sampler(
         return SampledIntervals(interval_log, summary, lane_state.outcome, *samples)
 
     compiled_start = config.compile_function(
-        begin_lane, begin_lane, ("start on real ground", cache_key)
+        begin_lane, begin_lane, ("start with unilateral contact", cache_key)
     )
     make_template = lambda leaves, lane: (lane, IntervalLog(*(lane.interval.time,) * 4))
     compiled_advance = config.compile_function(
@@ -399,7 +399,7 @@ def build_contact_step_sampler(
         compile_cached_lane_function(
             sample_intervals,
             lambda leaves, log: log.duration,
-            ("samples on real ground", cache_key, n_samples),
+            ("samples with unilateral contact", cache_key, n_samples),
         )
     )
     return jax.jit(sample_whole_step)

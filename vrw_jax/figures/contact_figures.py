@@ -96,31 +96,24 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
         foot_positions = np.stack([walk.foot_x.values, walk.foot_z.values], -1)
         foot_forces = np.stack([walk.tangential.values, walk.normal.values], -1)
         contact_modes = walk.contact.values
-        return HubAndFootMotion(
-            walk.time.values,
-            hub_positions,
-            foot_positions,
-            foot_forces,
-            contact_modes,
-            walk.step.values,
+    else:
+        n_legs = int(walk.attrs["parameter_n_legs"])
+        leg_angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
+        leg_lengths = np.full(leg_angles.shape, walk.attrs["parameter_locked_length"])
+        leg_lengths[:, 0] = walk.L1.values
+        leg_lengths[:, 1] = walk.L2.values
+        foot_positions = hub_positions[:, None] - leg_lengths[..., None] * np.stack(
+            [np.sin(leg_angles), np.cos(leg_angles)], -1
         )
-    n_legs = int(walk.attrs["parameter_n_legs"])
-    leg_angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
-    leg_lengths = np.full(leg_angles.shape, walk.attrs["parameter_locked_length"])
-    leg_lengths[:, 0] = walk.L1.values
-    leg_lengths[:, 1] = walk.L2.values
-    foot_positions = hub_positions[:, None] - leg_lengths[..., None] * np.stack(
-        [np.sin(leg_angles), np.cos(leg_angles)], -1
-    )
-    foot_forces = np.zeros_like(foot_positions)
-    for leg_number in (1, 2):
-        force_names = f"lambda_{2 * leg_number - 1}", f"lambda_{2 * leg_number}"
-        foot_forces[:, leg_number - 1] = np.stack(
-            [walk[force_name].values for force_name in force_names], -1
-        )
-    contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
-    contact_modes[:, 0] = ContactMode.STICK
-    contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
+        foot_forces = np.zeros_like(foot_positions)
+        for leg_number in (1, 2):
+            force_names = f"lambda_{2 * leg_number - 1}", f"lambda_{2 * leg_number}"
+            foot_forces[:, leg_number - 1] = np.stack(
+                [walk[force_name].values for force_name in force_names], -1
+            )
+        contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
+        contact_modes[:, 0] = ContactMode.STICK
+        contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
     return HubAndFootMotion(
         walk.time.values,
         hub_positions,
@@ -180,9 +173,8 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
     is_touching = foot_motion.contact_modes != ContactMode.OFF
     touching_legs = _select_marked_legs(is_touching)
     moving_legs = _select_marked_legs(is_touching | ~walk.on_stopper.values.astype(bool))
-    landing_indices = (
-        np.flatnonzero(np.diff(foot_motion.step)) + 1
-    )  # At landings the legs are relabeled.
+    # At landings the legs are relabeled.
+    landing_indices = np.flatnonzero(np.diff(foot_motion.step)) + 1
     insert_landing_gaps = lambda leg_values: np.insert(
         np.asarray(leg_values, float), landing_indices, np.nan
     )

@@ -43,9 +43,8 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
     path_dataset = tuned.path
     n_constraints = path_dataset.sizes["constraint"]
-    figure_height_inches = max(
-        3.2, 0.19 * n_constraints + 1.0
-    )  # Each constraint has one row of text.
+    # Each constraint has one row of text.
+    figure_height_inches = max(3.2, 0.19 * n_constraints + 1.0)
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height_inches))
     panel_axes = figure.subplot_mosaic(
         [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]

@@ -74,9 +74,8 @@ def find_cache_folder() -> Any:
     """Return the folder of JAX's compilation cache, or None if no folder is set or the folder is
     not trusted."""
     jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if not jax_cache_folder or "://" in str(
-        jax_cache_folder
-    ):  # Only JAX can read a storage bucket.
+    # Only JAX can read a storage bucket.
+    if not jax_cache_folder or "://" in str(jax_cache_folder):
         return None
     distrust_reason = describe_untrusted_folder(Path(jax_cache_folder))
     if distrust_reason:
@@ -119,13 +118,10 @@ def make_cache_folder(code_folder: Path) -> None:
 
 def load_bytes(record_name: str) -> bytes | None:
     """Return the content of the record `record_name`, or None if no usable record exists."""
-    record_path = (
-        find_cache_folder() and Path(find_cache_folder()) / f"{record_name}{CACHE_RECORD_SUFFIX}"
-    )
-    if not record_path or not re.fullmatch(
-        r"\w+", record_name
-    ):  # Some names are read from a record.
+    # Some names are read from a record.
+    if not (cache_folder := find_cache_folder()) or not re.fullmatch(r"\w+", record_name):
         return None
+    record_path = Path(cache_folder) / f"{record_name}{CACHE_RECORD_SUFFIX}"
     # Without this flag the call would block if the file were a pipe.
     open_without_blocking = lambda record_path, flags: os.open(
         record_path, flags | getattr(os, "O_NONBLOCK", 0)
