@@ -634,9 +634,8 @@ def rename_special_point(
     """Return the name under which a special point of a curve or branch is continued, given its
     gait.
     """
-    if (
-        special_point_name == BRANCH_POINT_KIND
-    ):  # A curve of folds need not turn back at its special points.
+    # A curve of folds need not turn back at its special points.
+    if special_point_name == BRANCH_POINT_KIND:
         return "fold"
     if (
         special_point_name not in ("lambda_4_plus", DLS_VANISHING_NAME, INITIAL_FORCE_FALL_NAME)

@@ -101,9 +101,8 @@ class CollocationSolution(NamedTuple):
 
     section_state: LaneArray  # (section_size, batch), at the start of the first gait step
     durations: LaneArray  # (n, n_phases, batch), s
-    accelerations: tuple[
-        LaneArray, ...
-    ]  # for each phase, (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
+    # for each phase, (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
+    accelerations: tuple[LaneArray, ...]
 
 
 class CycleLinearization(NamedTuple):
@@ -114,12 +113,10 @@ class CycleLinearization(NamedTuple):
         # derivatives with respect to each requested parameter, on a leading axis
         CollocationSolution
     )
-    step_ends: (
-        LaneArray  # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
-    )
-    step_end_tangents: (
-        LaneArray  # their derivatives with respect to each requested parameter, on a leading axis
-    )
+    # (n, 2 n_coordinates, batch): corrected coordinates and rates at each step's end
+    step_ends: LaneArray
+    # their derivatives with respect to each requested parameter, on a leading axis
+    step_end_tangents: LaneArray
     monodromy: LaneArray  # (row, column, batch): Jacobian of the return map on the section
 
 

@@ -118,9 +118,8 @@ class IntervalState(NamedTuple):
     contact_state: ContactState
     guard_values: Array  # at the point, (guards, lanes)
     guard_offset: Array  # initial value of an initiating guard, minus round-off; else 0
-    interval_accumulators: (
-        Array | None
-    )  # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    # integrals since the last event, (N_ACCUMULATOR_ROWS, lanes)
+    interval_accumulators: Array | None
     h: Array  # of the next attempt, s
     time: Array  # since the last event, s
     event_bracket: EventBracket

@@ -221,9 +221,8 @@ class CorrectorState(NamedTuple):
     z: ProblemUnknowns
     fraction: Scalar
     correction_norm: Scalar
-    tangent: (
-        ProblemUnknowns  # derivative of z with respect to the parameter as a fraction of its range
-    )
+    # derivative of z with respect to the parameter as a fraction of its range
+    tangent: ProblemUnknowns
     jacobian: Float[Array, "n n"]
 
 

@@ -157,10 +157,9 @@ class CollocationState(NamedTuple):
     is_phase_active: LaneArray  # (n, n_phases, lanes): 1 if the phase takes place, else 0
     # (lanes,): 1 for a limit cycle; 0 if there is none and other numbers replace the solution
     has_cycle: LaneArray
-    failed_check: (
-        LaneArray  # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
-    )
+    # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
     # plus HOMOTOPY_OFFSET for a root of a wheel on the homotopy; a NewtonFailure; else 0
+    failed_check: LaneArray
     step_end_states: LaneArray  # (n, 4, lanes): theta, L1 and their rates at the end of each step
 
 

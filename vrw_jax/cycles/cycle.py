@@ -101,9 +101,8 @@ class AbstractCycle(AbstractPrintable):
         Derivatives by `params` are then NaN too.
         """
         nan_without_gait = jnp.where(self.found, 0.0, jnp.nan)
-        nan_weight = 1.0 + nan_without_gait * sum(
-            jax.tree.leaves(params)
-        )  # The parameters are included, so that derivatives are NaN too.
+        # The parameters are included, so that derivatives are NaN too.
+        nan_weight = 1.0 + nan_without_gait * sum(jax.tree.leaves(params))
 
         def apply_nan_weight(x: Array) -> Array:
             return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
@@ -119,9 +118,8 @@ class AbstractCycle(AbstractPrintable):
 
         After `replace_missing_gaits_by_nan` the result is NaN, also in derivatives.
         """
-        return jnp.where(
-            self.found, gait_value, 0.0 * self.monodromy_value[..., 0, 0]
-        )  # The derivative of this zero is zero.
+        # The derivative of this zero is zero.
+        return jnp.where(self.found, gait_value, 0.0 * self.monodromy_value[..., 0, 0])
 
     def reduce_over_steps(
         self, step_values: Array, reduce_values: Callable[[Array, int], Array]

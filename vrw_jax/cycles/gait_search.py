@@ -350,9 +350,8 @@ def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCyc
         get_failure_reason(retried_cycle),
     )
     select_values: Any = jnp.where
-    if not is_traced(
-        (first_failure_reason, last_failure_reason)
-    ):  # NumPy compiles nothing for a new batch size.
+    # NumPy compiles nothing for a new batch size.
+    if not is_traced((first_failure_reason, last_failure_reason)):
         first_failure_reason, last_failure_reason = jax.tree.map(
             np.asarray, (first_failure_reason, last_failure_reason)
         )

@@ -700,9 +700,8 @@ def _propose_event_time(
     guard = jnp.where(
         jnp.any(proposed_lengths < jnp.inf), jnp.argmin(proposed_lengths), lowest_guard
     ).astype(jnp.int32)
-    is_rising = (guard_values == 0.0) & (
-        guard_rates > 0.0
-    )  # This happens at the start of the step.
+    # This happens at the start of the step.
+    is_rising = (guard_values == 0.0) & (guard_rates > 0.0)
     is_before_event = jnp.all(
         jnp.where(event_search.is_crossing, (guard_values > 0.0) | is_rising, True)
     )

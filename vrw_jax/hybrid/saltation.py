@@ -106,9 +106,8 @@ def _make_event_determinant_function(mode: Mode, guard: Guard, options: StepOpti
         end_state = sample_phase(
             flow_with_divergence, jnp.append(start, jnp.zeros(2)), duration, 2, options
         )[-1]
-        is_end_reached = (
-            jnp.abs(end_state[-1] - duration) <= 1e-9 * duration
-        )  # Otherwise the solver steps were exhausted.
+        # Otherwise the solver steps were exhausted.
+        is_end_reached = jnp.abs(end_state[-1] - duration) <= 1e-9 * duration
         reset_jacobian = jax.jacfwd(guard.reset)(state_before)
         guard_gradient = jax.jacfwd(guard.value)(state_before)
         flow_before = mode.field(state_before)

@@ -104,9 +104,8 @@ def _integrate_flow_segments(
             [state, jnp.eye(n_tangents, n_coordinates).ravel(), jnp.zeros(n_tangents + 2)]
         )
         end_state = sample_phase(flow_with_tangents, start_state, segment_duration, 2, options)[-1]
-        is_reached = (
-            jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
-        )  # Otherwise the solver steps were exhausted.
+        # Otherwise the solver steps were exhausted.
+        is_reached = jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
         tangents = end_state[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
         growth_factors = jnp.exp(
             end_state[n_state_and_tangents : n_state_and_tangents + n_tangents]

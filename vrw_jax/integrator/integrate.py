@@ -94,9 +94,8 @@ class _IntegratorState(NamedTuple):
     middle_values: Vector  # guards at the middle stage of the crossing step
     end_values: Vector
     n_tried_steps: Array
-    iterations_until_half_ended: (
-        Array  # number of iterations after which half of the batch had ended
-    )
+    # number of iterations after which half of the batch had ended
+    iterations_until_half_ended: Array
     n_iterations: Array
     minima: MinimaState | None
     tangents: Array | None  # tangents of the state, (directions, components, batch), see `tangents`

@@ -279,9 +279,8 @@ def compute_real_stability_limit(tableau: ButcherTableau) -> float:
         np.ones(len(tableau.nodes)),
         1.0,
     )
-    for matrix_power in range(
-        1, len(stage_values) + 1
-    ):  # R is the polynomial 1 - z w (1 - z A + ...).
+    # R is the polynomial 1 - z w (1 - z A + ...).
+    for matrix_power in range(1, len(stage_values) + 1):
         stability_polynomial = stability_polynomial + (-z) ** matrix_power * (
             tableau.matrix[-1] @ stage_values
         )

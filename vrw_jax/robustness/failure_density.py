@@ -67,9 +67,8 @@ class GaussianMixture:
 
     component_weights: np.ndarray  # (components,), sum 1
     component_means: np.ndarray  # (components, dimensions)
-    covariance_cholesky_factors: (
-        np.ndarray
-    )  # Cholesky factors of the covariances, (components, dimensions, dimensions)
+    # Cholesky factors of the covariances, (components, dimensions, dimensions)
+    covariance_cholesky_factors: np.ndarray
 
     @classmethod
     def make_isotropic_gaussian(
@@ -194,9 +193,8 @@ def fit_gaussian_mixture(
     for _ in range(density_options.n_em_iterations):
         log_densities = gaussian_mixture.compute_component_log_densities(slope_deviations)
         membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
-        effective_component_sizes = (
-            np.sum(membership_probabilities, 1) + 1.0
-        )  # One more sample prevents an empty Gaussian.
+        # One more sample prevents an empty Gaussian.
+        effective_component_sizes = np.sum(membership_probabilities, 1) + 1.0
         component_means = (
             membership_probabilities @ slope_deviations + gaussian_mixture.component_means
         ) / effective_component_sizes[:, None]

@@ -97,9 +97,8 @@ class SampledPassage(NamedTuple):
     quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
     fraction_by_outcome: dict[str, float]
     n_sampled_steps: int
-    walk_density: (
-        GaussianMixture  # of the slope deviations of walks that may fail in their last step
-    )
+    # of the slope deviations of walks that may fail in their last step
+    walk_density: GaussianMixture
 
 
 class WalkerGroups:

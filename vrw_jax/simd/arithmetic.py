@@ -117,9 +117,8 @@ def _emit_llvm_quotient(
     y: LlvmValue,
 ) -> LlvmValue:
     """Emit the quotient x / y of two floats and return its value."""
-    _require_float_dtype(
-        "div", operand_dtype
-    )  # An integer division by zero would stop the process.
+    # An integer division by zero would stop the process.
+    _require_float_dtype("div", operand_dtype)
     if _equals_llvm_constant(y, 1):
         return x
     x, y = value_emitter.to_scalars_or_vectors(x, y)

@@ -132,9 +132,8 @@ class _ForceExtrema(NamedTuple):
     time: np.ndarray  # s
     force: np.ndarray  # N
     is_maximum: np.ndarray
-    max_rate_after_first_peak: (
-        np.ndarray
-    )  # largest maximum of the rate after the first peak, N/s; one number
+    # largest maximum of the rate after the first peak, N/s; one number
+    max_rate_after_first_peak: np.ndarray
 
 
 def _find_force_extrema(

@@ -88,9 +88,8 @@ def _is_single_number(given_value: object) -> bool:
         else "O"
     )
     if isinstance(given_value, jax.Array | np.ndarray) and np.ndim(given_value) == 0:
-        dtype_kind = getattr(
-            given_value.dtype, "kind", "O"
-        )  # The dtype of random keys has no kind.
+        # The dtype of random keys has no kind.
+        dtype_kind = getattr(given_value.dtype, "kind", "O")
     return dtype_kind in "fiu"
 
 
