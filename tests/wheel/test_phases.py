@@ -98,7 +98,7 @@ def test_forces_agree_with_the_equations_of_motion():
 def test_guards_have_meanings_and_margins_have_names(index, stop_at_lift_off):
     phase, q, v = make_state_at(index, stop_at_lift_off=stop_at_lift_off)
     current_value = PhaseInstant(phase, phase.motion_at(q, v), None)
-    guards, margins = phase.guards(current_value), phase.margins(current_value)
+    guards, margins = phase.guards(current_value), phase.evaluate_margins(current_value)
     assert len(guards) == len(phase.all_guard_outcomes)
     assert phase.all_guard_outcomes[0] == Outcome.STEPPED
     assert guards[0] == phase.end_guard(current_value)

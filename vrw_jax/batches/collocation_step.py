@@ -804,7 +804,7 @@ def take_collocation_step(
     is_valid_lane = is_valid_start_state(params, x)
     params, x = replace_invalid_inputs(is_valid_lane, params, x, PAPER_START_STATE)
     wheel_units = compute_wheel_units(params.symbols())
-    state_units: tuple[Any, ...] = (1.0, wheel_units.rate, wheel_units.speed)
+    state_units: tuple[Any, ...] = (1.0, wheel_units.rate, wheel_units.velocity)
     params = convert_to_wheel_units(params)
     x = tuple(state_component / unit for state_component, unit in zip(x, state_units, strict=True))
     expected_durations = tuple(

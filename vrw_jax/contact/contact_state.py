@@ -350,7 +350,7 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's units of (hub x, z, theta, lengths) and of their rates."""
     units, angle_unit = compute_wheel_units(s), jnp.ones_like(s.L0)
     position_units = [units.length, units.length, angle_unit, *[units.length] * s.n]
-    rate_units = [units.speed, units.speed, units.rate, *[units.speed] * s.n]
+    rate_units = [units.velocity, units.velocity, units.rate, *[units.velocity] * s.n]
     return jnp.stack(position_units), jnp.stack(rate_units)
 
 

@@ -38,8 +38,8 @@ def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
     Angles and codes have the unit 1.
     """
     angle_unit = units.length / units.length
-    hub_units = [angle_unit, units.rate, units.speed, units.speed]
-    return [*hub_units, *[units.length] * n, *[units.speed] * n, *[angle_unit] * n]
+    hub_units = [angle_unit, units.rate, units.velocity, units.velocity]
+    return [*hub_units, *[units.length] * n, *[units.velocity] * n, *[angle_unit] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:

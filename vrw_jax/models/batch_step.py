@@ -136,9 +136,9 @@ def make_batch_phase(
             complete_stage_motion(stage), right_hand_side
         ),
     )
-    evaluate_margins = lambda stage: phase.margins(make_phase_instant(stage))
+    evaluate_stage_margins = lambda stage: phase.evaluate_margins(make_phase_instant(stage))
     recorded_margins = (
-        MarginFunctions(evaluate_margins, phase.margins_counted_at_start)
+        MarginFunctions(evaluate_stage_margins, phase.margins_counted_at_start)
         if records_margins
         else None
     )

@@ -194,7 +194,7 @@ class AbstractWheel(eqx.Module):
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the wheel's unit of each entry of a section state."""
-        return [units.length / units.length, units.rate, units.speed]
+        return [units.length / units.length, units.rate, units.velocity]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
         """Return the section state of this model for `x`, which may be the paper's three

@@ -78,7 +78,7 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
         return jnp.stack(
             [
                 *phase.guards(phase_instant),
-                *(phase.margins(phase_instant) if records_margins else ()),
+                *(phase.evaluate_margins(phase_instant) if records_margins else ()),
             ]
         )
 

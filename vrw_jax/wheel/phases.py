@@ -160,7 +160,7 @@ class AbstractPhase(abc.ABC):
         """Return the wheel's units of the phase's coordinates, then of their rates."""
         units = compute_wheel_units(self.s)
         position_units = jnp.ones_like(units.length), units.length, units.length
-        rate_units = units.rate, units.speed, units.speed
+        rate_units = units.rate, units.velocity, units.velocity
         return *position_units[: self.n_dof], *rate_units[: self.n_dof]
 
     def motion_at(self, q: Vector, v: Vector) -> Motion:
@@ -189,7 +189,7 @@ class AbstractPhase(abc.ABC):
             SHARED_FAILURE_OUTCOMES if self.stop_at_lift_off else SHARED_FAILURE_OUTCOMES[:-1]
         )
 
-    def margins(self, instant: "PhaseInstant") -> Vector:
+    def evaluate_margins(self, instant: "PhaseInstant") -> Vector:
         """Return all margins, in the order of `PhaseMargins`."""
         s, m = self.s, instant.motion
         locked_stopper_force = dynamics.stopper_force(s, m, instant.acceleration, range(3, s.n + 1))

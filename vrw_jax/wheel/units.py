@@ -43,8 +43,8 @@ class WheelUnits(NamedTuple):
         return self.length**length * self.time**time * self.mass**mass
 
     @property
-    def speed(self) -> Elementwise:
-        """Return the unit of a speed, m/s."""
+    def velocity(self) -> Elementwise:
+        """Return the unit of a velocity, m/s."""
         return self.length / self.time
 
     @property
@@ -55,12 +55,12 @@ class WheelUnits(NamedTuple):
     @property
     def acceleration(self) -> Elementwise:
         """Return the unit of an acceleration, m/s^2."""
-        return self.speed / self.time
+        return self.velocity / self.time
 
     @property
     def energy(self) -> Elementwise:
         """Return the unit of an energy, J."""
-        return self.mass * self.speed * self.speed
+        return self.mass * self.velocity * self.velocity
 
     def scale_times(self, options: StepOptions) -> StepOptions:
         """Return the options with times in seconds, from options with times in the wheel's unit."""
