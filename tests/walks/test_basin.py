@@ -6,12 +6,9 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.figures.branch_figures import basin_figure
+from vrw_jax.measures import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
 from vrw_jax.simulation.attractors import PeriodicWalkEnds, find_distinct_orbits
-from vrw_jax.simulation.basins import (
-    POST_LANDING_COMPONENT_NAMES,
-    PRE_TOUCHDOWN_COMPONENT_NAMES,
-    compute_walk_end_fractions,
-)
+from vrw_jax.simulation.basins import compute_walk_end_fractions
 
 OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 

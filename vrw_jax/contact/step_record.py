@@ -4,6 +4,7 @@ A step is a sequence of events, each followed by an interval in which no contact
 event is the opening landing. The step is complete when the foremost foot lands.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,7 +26,6 @@ from vrw_jax.contact.impacts import (
 )
 from vrw_jax.contact.mechanics import WheelMotion, landing_position
 from vrw_jax.contact.section import FullState, pack_section_state
-from vrw_jax.measures import STOPPER_MARGIN_MEASURES
 from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions, tree_where
 from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
@@ -334,7 +334,8 @@ class UnilateralStep(AbstractContactStep):
     def model_measures(self) -> dict[str, Array]:
         """Return the measures of contact steps and the stopper margins, by name."""
         return AbstractContactStep.model_measures(self) | {
-            name: getattr(self.margins, name) for name in STOPPER_MARGIN_MEASURES
+            field.name: getattr(self.margins, field.name)
+            for field in dataclasses.fields(self.margins)
         }
 
 

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
@@ -171,6 +172,11 @@ class AbstractCycle(AbstractPrintable):
     def spectral_radius(self) -> Array:
         """Return the largest modulus of a Floquet multiplier; the gait is stable below 1."""
         return floquet.compute_spectral_radius(self.monodromy)
+
+    @property
+    def spectral_radius_value(self) -> Array:
+        """Return the spectral radius without derivatives."""
+        return floquet.compute_spectral_radius(lax.stop_gradient(self.monodromy_value))
 
     @property
     def spectral_margin(self) -> Array:

@@ -24,8 +24,7 @@ from vrw_jax.figures.style import (
     require_variables_of_datasets,
     typeset_greek_symbols,
 )
-from vrw_jax.measures import MEASURES, describe_violation
-from vrw_jax.simulation import PRE_TOUCHDOWN_COMPONENT_NAMES
+from vrw_jax.measures import MEASURES, PRE_TOUCHDOWN_COMPONENT_NAMES, describe_violation
 from vrw_jax.validation import check_type
 from vrw_jax.wheel import Outcome
 

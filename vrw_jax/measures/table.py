@@ -212,6 +212,12 @@ STOPPER_MARGIN_MEASURES = _index_measures_by_name(
 """Margins of a step with unilateral contact and stoppers that hold legs in the air, negative if
 violated."""
 
+PRE_TOUCHDOWN_COMPONENT_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
+"""Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
+
+POST_LANDING_COMPONENT_NAMES = ("theta_post_impact", "dtheta_post_impact")
+"""Names of the components of a state just after a landing on both feet, in rad, rad/s."""
+
 SHARED_STEP_MEASURE_NAMES = tuple(name for name,
     measure in STEP_MEASURES.items() if measure.is_shared)
 """Names of the `STEP_MEASURES` that the steps of every model have."""

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.batches import step_batch
-from vrw_jax.continuation import floquet
 from vrw_jax.cycles import AbstractCycle, limit_cycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
@@ -69,7 +68,7 @@ class StableGait(NamedTuple):
                 f"this wheel has no gait that could have a basin: {cycle.why} Take a wheel for "
                 "which vrw.limit_cycle finds a gait."
             )
-        spectral_radius = float(floquet.compute_spectral_radius(cycle.monodromy_value))
+        spectral_radius = float(cycle.spectral_radius_value)
         if not spectral_radius < 1.0:
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "

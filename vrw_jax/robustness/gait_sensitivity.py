@@ -7,10 +7,8 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.continuation import floquet
 from vrw_jax.cycles import (
     CycleGuess,
     CycleOptions,
@@ -158,15 +156,12 @@ def gait_sensitivity(
     zero_without_gait = lambda value: jnp.where(
         limit_cycle_result.outcome == Outcome.STEPPED, value, 0.0
     )
-    spectral_radius = floquet.compute_spectral_radius(
-        lax.stop_gradient(limit_cycle_result.monodromy_value)
-    )
     return GaitSensitivity(
         norm=zero_without_gait(sensitivity_norms.norms),
         ending_step=zero_without_gait(sensitivity_norms.ending_step_response),
         beginning_step=zero_without_gait(sensitivity_norms.beginning_step_response),
         later_steps=zero_without_gait(sensitivity_norms.later_steps_response),
-        spectral_radius=zero_without_gait(spectral_radius),
+        spectral_radius=zero_without_gait(limit_cycle_result.spectral_radius_value),
         outcome=limit_cycle_result.outcome,
         measures=measure_names,
     )

@@ -1,11 +1,6 @@
 """Simulation of one step, a walk, a trajectory, attractors and basins."""
 
-from vrw_jax.simulation.basins import (
-    POST_LANDING_COMPONENT_NAMES,
-    PRE_TOUCHDOWN_COMPONENT_NAMES,
-    basin,
-    invert_landing_map,
-)
+from vrw_jax.simulation.basins import basin, invert_landing_map
 from vrw_jax.simulation.force_peaks import SAMPLED_FORCE_PEAK_MEASURES, force_peaks
 from vrw_jax.simulation.stepping import (
     ModelLike,

@@ -10,7 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES, measure_attrs, provenance
+from vrw_jax.measures import (
+    MARGIN_MEASURES,
+    MEASURES,
+    POST_LANDING_COMPONENT_NAMES,
+    PRE_TOUCHDOWN_COMPONENT_NAMES,
+    measure_attrs,
+    provenance,
+)
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.runtime import with_default_jax_settings
@@ -34,12 +41,6 @@ from vrw_jax.validation import (
     raise_for_renamed_arguments,
 )
 from vrw_jax.wheel import Outcome, WheelParams, transitions
-
-PRE_TOUCHDOWN_COMPONENT_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
-"""Names of the components of a section state just before touchdown, in rad, rad/s, m/s."""
-
-POST_LANDING_COMPONENT_NAMES = ("theta_post_impact", "dtheta_post_impact")
-"""Names of the components of a state just after a landing on both feet, in rad, rad/s."""
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """Values of each component of a start, by name. A single number is not an axis."""
