@@ -1,4 +1,4 @@
-"""The wheel at which a second force peak appears is a special point of branches."""
+"""The wheel at which a second force peak appears is a special point of branches and curves."""
 
 import dataclasses
 
@@ -21,12 +21,12 @@ def gait():
     return vrw.limit_cycle(SOFT, options=FINE)
 
 
-def reference_rate(stiffness, gait):
+def reference_rate(stiffness, gait, damping=100.0):
     """The largest maximum of the fore foot's force rate in SLS-I and SLS-II, N/s, by the reference.
 
     The gait is a fixed point of the reference's own step.
     """
-    params = dataclasses.replace(SOFT, stiffness=np.asarray(stiffness))
+    params = dataclasses.replace(SOFT, stiffness=np.asarray(stiffness), damping=np.asarray(damping))
     numbers = {f.name: getattr(params, f.name) for f in dataclasses.fields(params)}
     numbers = {name: float(value) for name, value in numbers.items()} | {"n_legs": 8}
     x = np.asarray(vrw.limit_cycle(params, guess=gait, options=FINE).section_state)
@@ -56,6 +56,27 @@ def test_a_branch_locates_where_the_second_peak_disappears(gait):
     assert abs(point.value / expected - 1.0) < 1e-9
     counts = branch.dataset.n_force_peaks.values
     np.testing.assert_array_equal(counts, np.where(branch.values > point.value, 2.0, 1.0))
+
+
+@pytest.mark.slow  # a branch and a curve compile for minutes
+def test_the_curve_of_the_second_peak_is_that_of_the_reference(gait):
+    """Compared with bisection along the stiffness, at both ends and in the middle of the curve."""
+    bounds = {"stiffness": (840.0, 910.0), "damping": (85.0, 115.0)}
+    curve = vrw.continue_special_point(NAME, ("stiffness", "damping"), gait, bounds=bounds)
+    values = np.asarray(curve.values)
+    assert np.ptp(values[:, 1]) > 5.0
+    for stiffness, damping in values[[0, len(values) // 2, -1]]:
+        bracket = stiffness - 0.5, stiffness + 0.5
+        expected = brentq(reference_rate, *bracket, (gait, damping), xtol=1e-10)
+        assert abs(stiffness / expected - 1.0) < 1e-9
+
+
+@pytest.mark.slow  # branches on two meshes compile for more than a minute
+def test_a_branch_refines_the_mesh_on_which_its_first_gait_does_not_repeat():
+    branch = vrw.continue_branch(SOFT, "stiffness", (895.0, 905.0))
+    assert branch.outcome == vrw.Outcome.STEPPED
+    assert np.ptp(branch.values) == 10.0
+    assert np.max(branch.dataset.closure) < 1e-7
 
 
 def test_a_model_without_collocation_raises_one_sentence():

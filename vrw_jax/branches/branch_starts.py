@@ -91,16 +91,14 @@ class LimitCycleFinder:
 
 
 def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: Any) -> BranchStart:
-    """Return the starts of branches from limit cycles by collocation, given or found."""
+    """Return the starts of branches from limit cycles by collocation, given or found.
+
+    Without cycle options the mesh of the branch is not coarser than that of the limit cycles.
+    """
     params, parameter_name, period_n = (
         branch_request.params,
         branch_request.parameter_name,
         branch_request.period_n,
-    )
-    cycle_options = (
-        CycleOptions.tight()
-        if branch_request.cycle_options is None
-        else branch_request.cycle_options
     )
     # The start may have a coarser mesh and larger errors than the branch.
     start_cycle = given_cycle
@@ -111,6 +109,12 @@ def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: 
             f"cycle is a {type(start_cycle).__name__}, but the paper's branch starts from a "
             "LimitCycle: give vrw.limit_cycle(params)."
         )
+    cycle_options = branch_request.cycle_options
+    if cycle_options is None:
+        cycle_options = CycleOptions.tight()
+        start_mesh = start_cycle.system.cycle_options.mesh_intervals
+        dls, sls1, sls2 = map(max, cycle_options.mesh_intervals, start_mesh)
+        cycle_options = dataclasses.replace(cycle_options, mesh_intervals=(dls, sls1, sls2))
     gait_finder: Any = make_finder(
         branch_request.model, params.n_legs, period_n=period_n, cycle_options=cycle_options
     )

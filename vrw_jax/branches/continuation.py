@@ -421,10 +421,12 @@ def _continue_gait_branches(
             branch_start.make_cycle_finder,
             is_finest_mesh,
         )
-        if is_finest_mesh or not any(
-            single_branch_data is not None and single_branch_data.is_mesh_limited
-            for single_branch_data in branch_data_by_wheel
-        ):
+        # If a gait exists but no branch starts from it, its step does not repeat on this mesh.
+        needs_finer_mesh = (
+            gait_exists if branch_data is None else branch_data.is_mesh_limited
+            for gait_exists, branch_data in zip(has_start, branch_data_by_wheel, strict=True)
+        )
+        if is_finest_mesh or not any(needs_finer_mesh):
             break
         branch_request = branch_request._replace(cycle_options=branch_start.finer_cycle_options)
         start_cycle = branch_start.start_cycles

@@ -31,6 +31,7 @@ from vrw_jax.branches.gait_test_functions import (
     CONTINUED_QUANTITIES,
     DISCONTINUOUS_QUANTITIES,
     DLS_VANISHING_NAME,
+    FORCE_QUANTITY_NAMES,
     INITIAL_FORCE_FALL_NAME,
     LINEAR_MARGIN_SUBSTITUTES,
     GaitTestFunction,
@@ -48,7 +49,7 @@ from vrw_jax.continuation import (
     TestFunctionCurve,
     TestFunctionPoint,
 )
-from vrw_jax.cycles import CollocationSystem, transfer_solution_to_mesh
+from vrw_jax.cycles import CollocationSystem, LimitCycle, transfer_solution_to_mesh
 from vrw_jax.measures import MARGIN_MEASURES, measure_attrs, provenance
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
@@ -215,6 +216,7 @@ class CurveTracer(NamedTuple):
     step_options: StepOptions
     report_stage_to: Callable[[str], None] | None = None
     tracing_options: CurveTracingOptions = CURVE_TRACING_OPTIONS
+    measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
 
     def report_stage(self, stage: str) -> None:
         """Call `report_stage_to`, if it is given, with a description of the next stage."""
@@ -231,14 +233,25 @@ class CurveTracer(NamedTuple):
         """Return both parameters, on the last axis, as fractions of their ranges."""
         return (values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
 
-    def find_seeds(self, parameter_index: int, params: WheelParams) -> list[CurveSeed]:
-        """Return seeds at the special points on branches of the wheels along one parameter."""
+    def find_seeds(
+        self, parameter_index: int, params: WheelParams, start_cycles: LimitCycle | None = None
+    ) -> list[CurveSeed]:
+        """Return seeds at the special points on branches of the wheels along one parameter.
+
+        `start_cycles` contains the gaits of the wheels, or is None if they are unknown.
+        """
         parameter_name, curve_seeds = self.parameter_names[parameter_index], []
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
         self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
-        for branch in continue_branches(
-            params, parameter_name, (lower_bound, upper_bound), model=self.model
-        ):
+        branches = continue_branches(
+            params,
+            parameter_name,
+            (lower_bound, upper_bound),
+            cycle=start_cycles,
+            model=self.model,
+            force_peaks=self.measures_force_peaks,
+        )
+        for branch in branches:
             for special_point in branch.special_points:
                 if can_continue_special_point(special_point.name):
                     curve_seeds.append(self._make_seed(special_point))
@@ -651,7 +664,13 @@ def rename_special_point(
 
 def can_continue_special_point(special_point_name: str) -> bool:
     """Return whether `GaitTestFunction` can continue the special point of this name as a curve."""
+    continued_names = (
+        *BIFURCATION_NAMES,
+        *DISCONTINUOUS_QUANTITIES,
+        DLS_VANISHING_NAME,
+        *FORCE_QUANTITY_NAMES,
+    )
     return (
-        special_point_name in (*BIFURCATION_NAMES, *DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        special_point_name in continued_names
         or special_point_name.partition("[")[0] in MARGIN_MEASURES
     )

@@ -14,7 +14,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.branches.continuation import DOUBLE_SUPPORT_INDICATOR_NAMES, GaitContinuation
+from vrw_jax.branches.continuation import (
+    DOUBLE_SUPPORT_INDICATOR_NAMES,
+    SECOND_PEAK_RATE_NAME,
+    GaitContinuation,
+)
 from vrw_jax.branches.continuation_problems import (
     BranchWheel,
     CollocationProblem,
@@ -33,6 +37,7 @@ from vrw_jax.cycles import (
     CollocationState,
     CollocationSystem,
     compute_correction_norm,
+    compute_force_peaks,
     compute_takeoff_acceleration,
     init_search_flags,
 )
@@ -79,6 +84,10 @@ CONTINUED_QUANTITIES = (
 """Quantities of the collocated gait itself, which are also defined beyond the special point."""
 
 
+FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
+"""Quantities of the force in a gait, whose extrema are located on its collocation."""
+
+
 @dataclass(frozen=True)
 class TestFunctionOptions:
     """Options of the test functions of gaits.
@@ -119,6 +128,7 @@ def find_test_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
     quantity_groups = (
         BIFURCATION_NAMES,
         CONTINUED_QUANTITIES,
+        FORCE_QUANTITY_NAMES,
         tuple(name for name in step_quantities if name not in CONTINUED_QUANTITIES),
     )
     return next(
@@ -261,10 +271,13 @@ class GaitTestFunction(AbstractTestFunction):
         )
 
     def measure_step(self, branch_wheel: BranchWheel, z: CollocationSolution, p: Array) -> Array:
-        """Return the quantities of an event-driven step from the gait, in the order of
-        `quantity_names`.
+        """Return the quantities of the gait's force or of an event-driven step from the gait, in
+        the order of `quantity_names`.
         """
         params = self.with_parameters(branch_wheel, p).params
+        if self.quantity_names == FORCE_QUANTITY_NAMES:
+            force_peaks = compute_force_peaks(self.system, stack_parameters(params), z)
+            return jnp.stack([force_peaks[name] for name in FORCE_QUANTITY_NAMES])
         section_state = self.gait_problem.read_gait_state(
             branch_wheel._replace(params=params), z, p[0]
         )[0]

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import numpy as np
 
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, CurveTracer
+from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
-from vrw_jax.numerics import StepOptions
+from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_names, check_range, check_type
 from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, wheel_from_parameters
@@ -38,13 +38,13 @@ def continue_special_point(
     """Return the curve of the special point `name` over two parameters, near a gait of one step.
 
     `name` is that of a `SpecialPoint`: an indicator, a phase's duration, a margin (of a locked leg
-    as "locked_stopper_force[5]") or "fold", "period_doubling", "neimark_sacker". The special point
-    is searched for along the first parameter from the gait, then along the second. The curve is
-    continued through turning points, within `bounds` of the two parameters. The default bounds are
-    `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The curve ends when it closes or
-    leaves the bounds, or when the gaits end. Each point is accurate to 1e-9. `codim2_points` are
-    the points at which other special points occur. On the curve of an indicator these are other
-    indicators and bifurcations, on other curves also margins.
+    as "locked_stopper_force[5]"), "second_peak_rate" of the force, or "fold", "period_doubling",
+    "neimark_sacker". The special point is searched for along the first parameter from the gait,
+    then along the second. The curve is continued through turning points, within `bounds` of the two
+    parameters. The default bounds are `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The
+    curve ends when it closes or leaves the bounds, or when the gaits end. Each point is accurate to
+    1e-9. `codim2_points` are the points at which other special points occur. On the curve of an
+    indicator these are other indicators and bifurcations, on other curves also margins.
 
     Args:
         name: name of the special point.
@@ -121,13 +121,20 @@ def continue_special_points(
     step_options = StepOptions.tight() if step_options is None else step_options
     check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
-    curve_tracer = CurveTracer(parameters, parameter_ranges, cycle.model, options, step_options)
+    curve_tracer = CurveTracer(
+        parameters,
+        parameter_ranges,
+        cycle.model,
+        options,
+        step_options,
+        measures_force_peaks=not set(names).isdisjoint(FORCE_QUANTITY_NAMES),
+    )
     params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
     seeds_by_name: dict[str, CurveSeed] = {}
     for parameter_index, parameter in enumerate(parameters):
         if set(names) - set(seeds_by_name):
             curve_seeds = curve_tracer.find_seeds(
-                parameter_index, jax.tree.map(lambda x: x[None], params)
+                parameter_index, *take_rows((params, cycle), None)
             )
             start_value = float(getattr(params, parameter))
             distance_order = np.argsort(
