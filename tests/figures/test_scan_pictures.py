@@ -55,3 +55,13 @@ def test_colors_show_why_there_is_no_gait(code):
     (figure,) = scan_figures(make_scan(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert OUTCOME_LABELS_AND_COLORS[code][0] in names
+
+
+def test_mean_numbers_of_steps_have_a_logarithmic_color_scale():
+    scan = make_scan(np.zeros((3, 2), int), np.ones((3, 2)), np.full((3, 2), 0.5))
+    mean_steps = np.logspace(1.0, 11.0, 6).reshape(3, 2)
+    scan = scan.assign(mean_steps=(("damping", "slope"), mean_steps))
+    (figure,) = scan_figures(scan).values()
+    mesh = figure.axes[0].collections[0]
+    shades = np.linspace(0.0, 1.0, 6).reshape(3, 2).T
+    np.testing.assert_allclose(mesh.norm(mean_steps.T), shades, atol=1e-12)

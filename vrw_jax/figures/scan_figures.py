@@ -1,5 +1,6 @@
-"""Figures of scans: DLS fraction, speed and outcome over parameters, with zero lines of margins."""
+"""Figures of scans: measures and outcomes over parameters, with zero lines of margins."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -7,6 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
@@ -50,6 +52,13 @@ DRAWN_MARGIN_NAMES = (
     "landing_friction_fore", "hit_planted_impulse",
 )  # fmt: skip
 """Margins whose zero lines are drawn."""
+
+SHOWN_MEASURE_NAMES = ("mean_steps", "dls_fraction", "speed")
+"""Names of the measures that figures show, if the scan has them."""
+
+LOGARITHMIC_MEASURE_NAMES = ("mean_steps",)
+"""Names of the measures on a logarithmic scale, chosen because these measures vary by powers of
+ten."""
 
 MAX_PANEL_COLUMNS = 4
 """Largest number of columns of panels, chosen because more columns leave no space for labels."""
@@ -123,8 +132,8 @@ def draw_scan_slices(
 ) -> Figure:
     """Return a figure over the parameters (x, y), with one column per value of `column_parameter`.
 
-    The figure shows DLS fraction, speed and outcome. All other parameters have their middle value,
-    which the title states. Gray cells have no gait.
+    The figure shows outcomes and the measures of `SHOWN_MEASURE_NAMES`. All other parameters have
+    their middle value, which the title states. Gray cells have no gait.
     """
     cut_indices = {
         n_column_values: scan.sizes[n_column_values] // 2
@@ -166,17 +175,18 @@ def draw_scan_slices(
             for column_dataset in column_datasets
         ]
         color_limits = _find_color_limits(column_values, is_stable)
+        color_scale = _make_color_scale(measure_name, color_limits)
         for axes, column_dataset, cell_values in zip(
             axes_of_row, column_datasets, column_values, strict=True
         ):
             cell_image = _draw_measure_cells(
-                axes, column_dataset[x].values, column_dataset[y].values, cell_values, color_limits
+                axes, column_dataset[x].values, column_dataset[y].values, cell_values, color_scale
             )
         extended_ends = _find_extended_color_bar_ends(column_values, color_limits)
         color_bar = figure.colorbar(
             cell_image, ax=axes_of_row.tolist(), aspect=12, pad=0.01, extend=extended_ends
         )
-        color_bar.set_label(format_axis_label(measure_name, "{name}"))
+        color_bar.set_label(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
     outcome_codes = np.unique(
         [_get_outcome_codes(column_dataset).values for column_dataset in column_datasets]
     )
@@ -250,9 +260,10 @@ def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figur
 def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
     """Return a figure of samples over each pair of parameters.
 
-    The figure shows the DLS fraction below the diagonal and the outcome above it. The diagonal
-    shows the fraction of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples
-    are drawn, which are spread as evenly as all samples.
+    The figure shows a measure below the diagonal and the outcome above it. The measure is the first
+    of `SHOWN_MEASURE_NAMES` that the scan has. The diagonal shows the fraction of samples with a
+    stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are drawn, which are spread as evenly
+    as all samples.
     """
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     measure_name = next(iter(_list_shown_measures(scan)), None)
@@ -304,7 +315,7 @@ def _draw_measure_samples(
     collection of points."""
     dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
-    min_value, max_value = _find_color_limits(
+    color_limits = _find_color_limits(
         [measure_values], [_get_outcome_codes(scan).values == Outcome.STEPPED]
     )
     x_values, y_values = scan[x].values, scan[y].values
@@ -313,8 +324,7 @@ def _draw_measure_samples(
         x_values[has_gait],
         y_values[has_gait],
         c=measure_values[has_gait],
-        vmin=min_value,
-        vmax=max_value,
+        norm=_make_color_scale(measure_name, color_limits),
         **dot_style,
     )
 
@@ -404,7 +414,9 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 
 @figure_style()
 def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
-    """Return a figure of DLS fraction and speed along one parameter; gray cells have no gait."""
+    """Return a figure of the measures of `SHOWN_MEASURE_NAMES` along one parameter; gray cells have
+    no gait.
+    """
     scan = scan.isel(
         {
             parameter_name: 0
@@ -419,7 +431,8 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
     has_failed = scan.outcome.values != Outcome.STEPPED
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
-        axes.set_ylabel(format_axis_label(measure_name, "{name}"))
+        axes.set_yscale("log" if measure_name in LOGARITHMIC_MEASURE_NAMES else "linear")
+        axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
         for cell_index in np.flatnonzero(has_failed):
             axes.axvspan(
                 cell_edges[cell_index],
@@ -434,7 +447,7 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
 
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
     """Return the names of those measures of a scan that figures show."""
-    return [measure_name for measure_name in ("dls_fraction", "speed") if measure_name in scan]
+    return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
 
 
 def _find_color_limits(
@@ -457,6 +470,13 @@ def _find_color_limits(
         if len(values_in_range)
         else (0.0, 1.0)
     )
+
+
+def _make_color_scale(measure_name: str, color_limits: tuple[float, float]) -> Normalize:
+    """Return the linear or logarithmic scale of the colors of a measure."""
+    if measure_name in LOGARITHMIC_MEASURE_NAMES and color_limits[0] > 0.0:
+        return LogNorm(*color_limits)
+    return Normalize(*color_limits)
 
 
 def _find_extended_color_bar_ends(
@@ -483,7 +503,7 @@ def _draw_measure_cells(
     x: np.ndarray,
     y: np.ndarray,
     cell_values: np.ndarray,
-    color_limits: tuple[float, float],
+    color_scale: Normalize,
 ) -> AxesImage:
     """Draw one colored cell per sample, without interpolation, and return the image."""
     axes.set_facecolor(LIGHT_GRAY_COLOR)
@@ -493,8 +513,7 @@ def _draw_measure_cells(
         _find_cell_edges(y),
         masked_values,
         cmap="viridis",
-        vmin=color_limits[0],
-        vmax=color_limits[1],
+        norm=color_scale,
     )
     cell_image.set_rasterized(True)
     return cell_image  # type: ignore[return-value]  # A color bar accepts it.
