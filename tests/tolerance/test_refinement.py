@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
 from vrw_jax.tolerance.refinement import REFINEMENT_OPTIONS, refine_gaits
 
 FIXED_VALUE = 0.3
@@ -39,18 +39,23 @@ def refine_fixed_point(start_offset, tol, add_terms, slopes=SLOPES):
         return take_steps(indices, states), return_jacobian, quantity_jacobian
 
     ground = Mock(
-        GroundBatch,
+        ContactWheelBatch,
         n_legs=1,
-        options=vrw.StepOptions(rtol=1e-10, atol=1e-10),
+        step_options=vrw.StepOptions(rtol=1e-10, atol=1e-10),
         take_steps=take_steps,
         linearize_steps=linearize_steps,
-        list_with_other_tolerances=list,
-        min_resolved_contact_duration=lambda indices: np.zeros(len(indices)),
+        make_comparison_batches=list,
+        compute_min_contact_duration=lambda indices: np.zeros(len(indices)),
     )
     start = np.append(np.array([FIXED_VALUE, 0.0]) + start_offset, 0.0)[None]
     error_goal = lambda values: np.full_like(values, tol)
     return refine_gaits(
-        ground, np.arange(1), start, ("theta_touchdown",), error_goal, always_compares=False
+        ground,
+        np.arange(1),
+        start,
+        ("theta_touchdown",),
+        error_goal,
+        always_compares_tolerances=False,
     )
 
 
@@ -60,7 +65,7 @@ def test_the_error_bound_holds_next_to_a_jump_of_the_map(side):
     gaits = refine_fixed_point(np.array([side * 2e-6, 4e-6]), 1e-2, add_jump)
     assert gaits.is_found[0]
     assert gaits.is_attracting[0]
-    assert abs(gaits.values[0, 0] - FIXED_VALUE) <= gaits.errors[0, 0] <= 1e-2
+    assert abs(gaits.measure_values[0, 0] - FIXED_VALUE) <= gaits.error_bounds[0, 0] <= 1e-2
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-4, 1e-6])
@@ -69,8 +74,8 @@ def test_one_jacobian_serves_corrections_whose_remaining_error_is_bounded(tol):
     add_curvature = lambda offset: (offset[:, 0] ** 2, 2.0 * offset[:, 0])
     gaits = refine_fixed_point(np.array([0.02, 0.01]), tol, add_curvature)
     assert gaits.is_found[0]
-    assert abs(gaits.values[0, 0] - FIXED_VALUE) <= gaits.errors[0, 0] <= tol
-    n_chord_steps = gaits.n_steps[0] - REFINEMENT_OPTIONS.jacobian_cost
+    assert abs(gaits.measure_values[0, 0] - FIXED_VALUE) <= gaits.error_bounds[0, 0] <= tol
+    n_chord_steps = gaits.n_steps[0] - REFINEMENT_OPTIONS.jacobian_cost_in_steps
     assert 0 < n_chord_steps <= 7
 
 

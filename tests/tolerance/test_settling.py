@@ -5,7 +5,7 @@ from unittest.mock import Mock
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
 from vrw_jax.tolerance.settling import LEAP_OPTIONS, walk_until_settled
 
 
@@ -19,28 +19,28 @@ def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float
         lost_values = (failing_interval[0] < x[:, 0]) & (x[:, 0] < failing_interval[1])
         return StepQuantities(y, y, np.where(lost_values, int(vrw.Outcome.FELL_BACK), 0))
 
-    map_on_ground = Mock(GroundBatch, n_legs=1, take_steps=step)
-    map_on_ground.with_loose_steps.return_value = map_on_ground
+    map_on_ground = Mock(ContactWheelBatch, n_legs=1, take_steps=step)
+    map_on_ground.make_batch_for_walks.return_value = map_on_ground
     return walk_until_settled(map_on_ground, np.arange(1), np.array([[start, 0.0]]))
 
 
 def test_a_walk_that_drifts_for_a_thousand_steps_settles_in_ninety():
     walk = walk_scalar_map(lambda x: 0.3 + 0.995 * (x - 0.3), 1.3)
-    assert walk.is_settled[0]
+    assert walk.has_settled[0]
     fixed_point = 0.3
-    assert abs(walk.section_states[0, 0] - fixed_point) < LEAP_OPTIONS.settled_drift
+    assert abs(walk.section_states[0, 0] - fixed_point) < LEAP_OPTIONS.max_settled_drift
     max_steps = LEAP_OPTIONS.n_warmup_steps + LEAP_OPTIONS.max_leaps * LEAP_OPTIONS.steps_per_leap
     assert walk.n_steps[0] <= max_steps
 
 
 def test_divergent_and_alternating_walks_never_settle():
-    assert not walk_scalar_map(lambda x: 1.003 * x, 1e-2).is_settled[0]
-    assert not walk_scalar_map(lambda x: -x, 1e-2).is_settled[0]
+    assert not walk_scalar_map(lambda x: 1.003 * x, 1e-2).has_settled[0]
+    assert not walk_scalar_map(lambda x: -x, 1e-2).has_settled[0]
 
 
 def test_a_leap_to_a_state_without_a_step_is_undone():
     walk = walk_scalar_map(lambda x: x - 1e-3, 0.6, failing_interval=(-9.0, 0.5))
-    assert walk.outcome[0] == vrw.Outcome.STEPPED
+    assert walk.walk_outcomes[0] == vrw.Outcome.STEPPED
     assert abs(walk.section_states[0, 0] - (0.6 - 1e-3 * walk.n_steps[0])) < 1e-12
 
 

@@ -1,4 +1,5 @@
-"""Gaits of the simpler models, with the matrices that propagate a defect to measures."""
+"""Gaits of the rigid model and of the paper's model, with matrices that propagate a defect of the
+return map to the measures."""
 
 import enum
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from vrw_jax.wheel import Outcome, WheelParams
 
 
 class ModelIndex(enum.IntEnum):
-    """Index of the model of a gait, in the order of fidelity."""
+    """Index of a wheel model, in the order of fidelity."""
 
     NONE = 0
     RIGID = 1
@@ -27,9 +28,9 @@ class ModelIndex(enum.IntEnum):
 
 MODEL_NAMES = (
     "none",
-    *(entry.model_name for entry in (RigidWheel, ViscoelasticWheel, UnilateralWheel)),
+    *(model_class.model_name for model_class in (RigidWheel, ViscoelasticWheel, UnilateralWheel)),
 )
-"""Names of the models by index."""
+"""Names of the models, in the order of `ModelIndex`."""
 
 SECTION_STATE_NAME = "section_state"
 
@@ -39,80 +40,92 @@ solution has another order of phases, only 3 reach a gait by a walk.
 """
 
 
-class LowerFidelityGait(NamedTuple):
-    """Gait of each element, of a model with the paper's section state; the batch axis is first."""
+class LowerFidelityGaits(NamedTuple):
+    """Gait of each wheel by a model with the paper's section state; the batch axis is first."""
 
     model_index: np.ndarray  # a ModelIndex, NONE if there is no gait
-    section_state: np.ndarray  # (elements, 3)
-    quantities: np.ndarray  # (elements, 7): quantities of the step from the section state
-    newton_matrix: np.ndarray  # (elements, 3, 3): (I - DP)^-1
-    # (elements, 7, 3): derivatives of the quantities with respect to the section state
-    quantity_jacobian: np.ndarray
-    defect: np.ndarray  # (elements, 3): numerical defect of the gait times `newton_matrix`
-    outcome: np.ndarray
+    section_states: np.ndarray  # (wheels, 3)
+    step_quantities: np.ndarray  # (wheels, 7): quantities of the step from the section state
+    newton_matrix: np.ndarray  # (wheels, 3, 3): (I - DP)^-1
+    # (wheels, 7, 3): derivatives of the step quantities with respect to the section state
+    step_quantity_jacobian: np.ndarray
+    section_state_error: (
+        np.ndarray
+    )  # (wheels, 3): `newton_matrix` times the defect of the return map
+    search_outcomes: np.ndarray
 
 
-def empty_gaits(n_elements: int) -> LowerFidelityGait:
-    """Return gaits without content for a batch of `n_elements`."""
-    return LowerFidelityGait(
-        np.full(n_elements, ModelIndex.NONE),
-        np.zeros((n_elements, 3)),
-        np.full((n_elements, N_STEP_QUANTITIES), np.nan),
-        np.zeros((n_elements, 3, 3)),
-        np.zeros((n_elements, N_STEP_QUANTITIES, 3)),
-        np.zeros((n_elements, 3)),
-        np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
+def make_empty_gaits(n_wheels: int) -> LowerFidelityGaits:
+    """Return the result for `n_wheels` wheels without a gait."""
+    return LowerFidelityGaits(
+        np.full(n_wheels, ModelIndex.NONE),
+        np.zeros((n_wheels, 3)),
+        np.full((n_wheels, N_STEP_QUANTITIES), np.nan),
+        np.zeros((n_wheels, 3, 3)),
+        np.zeros((n_wheels, N_STEP_QUANTITIES, 3)),
+        np.zeros((n_wheels, 3)),
+        np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
     )
 
 
 def replace_gaits(
-    gaits: LowerFidelityGait, indices: np.ndarray, new_gaits: LowerFidelityGait
+    gaits_with_steps: LowerFidelityGaits,
+    replaced_indices: np.ndarray,
+    new_gaits: LowerFidelityGaits,
 ) -> None:
-    """Replace the gaits at these indices by new ones, in place."""
-    for all_values, new_values in zip(gaits, new_gaits, strict=True):
-        all_values[indices] = new_values
+    """Replace the gaits at the indices `replaced_indices` by new gaits, in place."""
+    for gait_array, new_gait_array in zip(gaits_with_steps, new_gaits, strict=True):
+        gait_array[replaced_indices] = new_gait_array
 
 
-def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelityGait:
-    """Return the gaits of the paper's model by collocation, with derivatives from one step by
-    machine code.
+def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
+    """Return the gaits of the paper's model by collocation.
+
+    The derivatives are those of one step by machine code.
     """
-
-    finder = make_finder(None, params.n_legs)
-    cycles = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
-    section_states, outcome = np.array(cycles.section_state), np.array(cycles.outcome)
-    (missing_indices,) = np.nonzero(~np.isin(outcome, FINAL_OUTCOMES))
-    if len(missing_indices):  # One mesh for all elements makes the digits independent of the batch.
-        cycles = retry_from_walks(
-            finder, *jax.device_put(take_rows((params, cycles), missing_indices))
+    cycle_finder = make_finder(None, params.n_legs)
+    limit_cycles = map_in_batches(cycle_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
+    section_states = np.array(limit_cycles.section_state)
+    search_outcomes = np.array(limit_cycles.outcome)
+    (unsolved_indices,) = np.nonzero(~np.isin(search_outcomes, FINAL_OUTCOMES))
+    if len(
+        unsolved_indices
+    ):  # One mesh for all elements makes the digits independent of the batch.
+        limit_cycles = retry_from_walks(
+            cycle_finder, *jax.device_put(take_rows((params, limit_cycles), unsolved_indices))
         )
-        section_states[missing_indices], outcome[missing_indices] = (
-            cycles.section_state,
-            cycles.outcome,
-        )
-    all_gaits = empty_gaits(len(section_states))
-    all_gaits.outcome[:] = outcome
-    (found_indices,) = np.nonzero(outcome == Outcome.STEPPED)
+        section_states[unsolved_indices] = limit_cycles.section_state
+        search_outcomes[unsolved_indices] = limit_cycles.outcome
+    all_gaits = make_empty_gaits(len(section_states))
+    all_gaits.search_outcomes[:] = search_outcomes
+    (found_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)
     if not len(found_indices):
         return all_gaits
     found_params = jax.device_put(take_rows(params, found_indices))
-    step = step_batch(
+    gait_step = step_batch(
         found_params,
         section_states[found_indices],
-        options=options,
+        options=step_options,
         derivatives=[SECTION_STATE_NAME],
     )
-    step_jacobian = jax.tree.map(np.asarray, step.derivatives[SECTION_STATE_NAME])
-    end_states, durations = np.asarray(step.section_state), np.asarray(step.durations)
-    has_stepped = np.asarray(step.outcome) == Outcome.STEPPED
+    step_jacobian = jax.tree.map(np.asarray, gait_step.derivatives[SECTION_STATE_NAME])
+    step_end_states = np.asarray(gait_step.section_state)
+    step_durations = np.asarray(gait_step.durations)
+    has_stepped = np.asarray(gait_step.outcome) == Outcome.STEPPED
     # The feet's distance at touchdown is L0 sin(alpha) / cos(theta-), m.
     leg_span = np.asarray(found_params.locked_length) * np.sin(found_params.leg_angle)
-    foot_distance = leg_span / np.cos(end_states[:, 0])
-    zeros = np.zeros(len(found_indices))
-    quantities = np.column_stack(
-        [durations[:, 0], durations[:, 1] + durations[:, 2], zeros, foot_distance, end_states]
+    foot_distance = leg_span / np.cos(step_end_states[:, 0])
+    zero_durations = np.zeros(len(found_indices))
+    step_quantities = np.column_stack(
+        [
+            step_durations[:, 0],
+            step_durations[:, 1] + step_durations[:, 2],
+            zero_durations,
+            foot_distance,
+            step_end_states,
+        ]
     )
-    length_jacobian = (foot_distance * np.tan(end_states[:, 0]))[
+    step_length_jacobian = (foot_distance * np.tan(step_end_states[:, 0]))[
         :, None
     ] * step_jacobian.section_state[:, 0]
     dls_jacobian, sls1_jacobian, sls2_jacobian = np.moveaxis(step_jacobian.durations, 1, 0)
@@ -120,95 +133,129 @@ def find_paper_gaits(params: WheelParams, options: StepOptions) -> LowerFidelity
         dls_jacobian,
         sls1_jacobian + sls2_jacobian,
         0.0 * dls_jacobian,
-        length_jacobian,
+        step_length_jacobian,
     ]
-    quantity_jacobian = np.concatenate([np.stack(jacobian_rows, 1), step_jacobian.section_state], 1)
-    gaits = _make_gaits(
+    step_quantity_jacobian = np.concatenate(
+        [np.stack(jacobian_rows, 1), step_jacobian.section_state], 1
+    )
+    gaits_with_steps = _make_lower_fidelity_gaits(
         ModelIndex.VISCOELASTIC,
         section_states[found_indices],
-        end_states,
-        quantities,
+        step_end_states,
+        step_quantities,
         step_jacobian.section_state,
-        quantity_jacobian,
+        step_quantity_jacobian,
     )
     replace_gaits(
         all_gaits,
         found_indices[has_stepped],
-        LowerFidelityGait(*(gait_array[has_stepped] for gait_array in gaits)),
+        LowerFidelityGaits(*(gait_array[has_stepped] for gait_array in gaits_with_steps)),
     )
-    all_gaits.outcome[found_indices[~has_stepped]] = np.asarray(step.outcome)[~has_stepped]
+    all_gaits.search_outcomes[found_indices[~has_stepped]] = np.asarray(gait_step.outcome)[
+        ~has_stepped
+    ]
     return all_gaits
 
 
-def find_rigid_gaits(params: WheelParams) -> LowerFidelityGait:
-    """Return the rigid gaits in closed form, with the classic landing, in which the rear foot
-    leaves.
+def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
+    """Return the gaits of the rigid model in closed form, with the classic landing.
 
-    Stiff legs with unilateral contact approach this gait. The paper's landing, whose rear foot is
-    held, has a gait half as fast again.
+    The rear foot leaves the ground at the classic landing. Gaits of stiff legs with unilateral
+    contact approach this gait. If the rear foot is held at landing, as in the paper, the gait is
+    half as fast again.
     """
-    section_states, end_states, step_length, duration, jacobian, duration_jacobian = map(
-        np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
+    (
+        section_states,
+        step_end_states,
+        step_length,
+        step_duration,
+        return_map_jacobian,
+        duration_jacobian,
+    ) = map(np.asarray, map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params))
+    zero_durations = np.zeros_like(step_duration)
+    step_quantities = np.column_stack(
+        [zero_durations, step_duration, zero_durations, step_length, step_end_states]
     )
-    zeros = np.zeros_like(duration)
-    quantities = np.column_stack([zeros, duration, zeros, step_length, end_states])
-    zero_row = 0.0 * duration_jacobian
-    quantity_jacobian = np.concatenate(
-        [np.stack([zero_row, duration_jacobian, zero_row, zero_row], 1), jacobian], 1
+    zero_jacobian_row = 0.0 * duration_jacobian
+    step_quantity_jacobian = np.concatenate(
+        [
+            np.stack(
+                [zero_jacobian_row, duration_jacobian, zero_jacobian_row, zero_jacobian_row], 1
+            ),
+            return_map_jacobian,
+        ],
+        1,
     )
-    return _make_gaits(
-        ModelIndex.RIGID, section_states, end_states, quantities, jacobian, quantity_jacobian
+    return _make_lower_fidelity_gaits(
+        ModelIndex.RIGID,
+        section_states,
+        step_end_states,
+        step_quantities,
+        return_map_jacobian,
+        step_quantity_jacobian,
     )
 
 
-def compute_static_contraction(params: WheelParams) -> np.ndarray:
-    """Return the relative static contraction of a leg, the order of magnitude of the rigid
-    model's error.
+def compute_static_leg_contraction(params: WheelParams) -> np.ndarray:
+    """Return the contraction of a leg under the wheel's weight, relative to the leg length.
+
+    The relative error of the rigid model has this order of magnitude.
     """
     s = jax.tree.map(np.asarray, params.symbols())
     return s.Mt * s.g / (np.asarray(params.stiffness) * s.L0)
 
 
-def _make_gaits(
+def _make_lower_fidelity_gaits(
     model_index: int,
     section_states: np.ndarray,
-    end_states: np.ndarray,
-    quantities: np.ndarray,
-    jacobian: np.ndarray,
-    quantity_jacobian: np.ndarray,
-) -> LowerFidelityGait:
-    """Return the gaits of one model from the states and derivatives of their steps."""
+    step_end_states: np.ndarray,
+    step_quantities: np.ndarray,
+    return_map_jacobian: np.ndarray,
+    step_quantity_jacobian: np.ndarray,
+) -> LowerFidelityGaits:
+    """Return the gaits of one model, given the section states and derivatives of their steps."""
     with np.errstate(all="ignore"):
-        newton_matrix = np.linalg.inv(np.eye(3) - jacobian)
-    defect = np.einsum("ijk,ik->ij", newton_matrix, end_states - section_states)
-    outcomes = np.full(len(section_states), int(Outcome.STEPPED))
-    return LowerFidelityGait(
+        newton_matrix = np.linalg.inv(np.eye(3) - return_map_jacobian)
+    section_state_error = np.einsum("ijk,ik->ij", newton_matrix, step_end_states - section_states)
+    search_outcomes = np.full(len(section_states), int(Outcome.STEPPED))
+    return LowerFidelityGaits(
         np.full(len(section_states), model_index),
         section_states,
-        quantities,
+        step_quantities,
         newton_matrix,
-        quantity_jacobian,
-        defect,
-        outcomes,
+        step_quantity_jacobian,
+        section_state_error,
+        search_outcomes,
     )
 
 
 @jax.jit
 def _compute_rigid_gaits(params: WheelParams) -> tuple:
-    """Return states, step length, m, duration, s, and their Jacobians of the rigid gaits of a
-    batch.
+    """Return section states, step lengths (m), durations (s) and Jacobians of the gaits of rigid
+    wheels.
+
+    The result is (section states, section states after one step, step lengths, durations,
+    Jacobians of the return map, Jacobians of the durations).
     """
-    model, options = RigidWheel(stop_at_lift_off=False), StepOptions()
+    rigid_model, step_options = RigidWheel(stop_at_lift_off=False), StepOptions()
 
     def compute_rigid_gait(params: WheelParams) -> tuple:
-        def evaluate_step(x: jax.Array) -> tuple:
-            step = model.take_step(params, x, options)
-            return step.section_state, step.step_length, jnp.sum(step.durations)
+        def take_rigid_step(x: jax.Array) -> tuple:
+            gait_step = rigid_model.take_step(params, x, step_options)
+            return gait_step.section_state, gait_step.step_length, jnp.sum(gait_step.durations)
 
-        section_state = model.default_start(params)
-        (next_section_state, step_length, duration), (jacobian, _, duration_jacobian) = (
-            value_and_jacobian(evaluate_step, section_state)
+        section_state = rigid_model.default_start(params)
+        (
+            (next_section_state, step_length, step_duration),
+            (return_map_jacobian, _, duration_jacobian),
+        ) = value_and_jacobian(take_rigid_step, section_state)
+        return (
+            section_state,
+            next_section_state,
+            step_length,
+            step_duration,
+            return_map_jacobian,
+            duration_jacobian,
         )
-        return section_state, next_section_state, step_length, duration, jacobian, duration_jacobian
 
     return jax.vmap(compute_rigid_gait)(params)

@@ -20,7 +20,7 @@ from vrw_jax.wheel import Outcome
 
 
 class MeasureStatus(StatusCode):
-    """Method by which a measure was computed."""
+    """Code of the method by which a measure was computed."""
 
     CHECKED_BY_ONE_STEP = 0, "checked by one step with unilateral contact"
     CONTINUES_LOWER_GAIT = 1, "the gait that continues the lower model's"
@@ -37,25 +37,27 @@ class MeasureStatus(StatusCode):
 
 
 MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral contact")
-"""Labels of the models by index."""
+"""Labels of the models in printed results, in the order of `ModelIndex`."""
 
 
 class MeasureResult(AbstractPrintable):
     """Measures of a gait and bounds of their errors; for a batch, every property has the batch
     axis.
 
-    For one measure a property is a value, for several a dictionary by name. If there is no gait,
-    the value is NaN and the error infinite.
+    If one measure was requested by its name, a property is a number or an array. Otherwise a
+    property is a dictionary by names of measures. Without a gait, the measure is NaN and the error
+    infinite.
 
-    - `values`, `errors`, `model_errors`, `numerical_errors`: measures on the last axis;
-    - `models`, `statuses`: indices of the models, and codes of the methods;
+    - `values`, `errors`, `model_errors`, `numerical_errors`: measures, bounds of their errors,
+      errors of the lower model, and bounds of numerical errors, with the measures on the last axis;
+    - `models`, `statuses`: a `ModelIndex` and a `MeasureStatus` of each element;
     - `states`: section states with unilateral contact near the gait, as starts for walks and
       searches;
     - `n_steps`: number of steps with unilateral contact, where a step with its Jacobian counts as
       four steps;
-    - `n_gaits`: number of gaits that the gait was selected from, 0 without a selection;
+    - `n_gaits`: number of gaits from which the gait was selected, 0 without a selection;
     - `outcomes`: STEPPED, or the reason why there is no gait;
-    - `names`, `is_single`: the requested measures;
+    - `names`, `is_single`: names of the measures, and whether the request was a single name;
     - `seconds`: time of the whole call, s.
 
     Examples:
@@ -79,49 +81,53 @@ class MeasureResult(AbstractPrintable):
     is_single: bool = eqx.field(static=True)
     seconds: float = eqx.field(static=True)  # time of the whole call, s
 
-    def _by_name(self, values: np.ndarray) -> Any:
-        """Return the values by name of the measure, or the values of the only measure."""
-        values_by_name = {
-            name: values[..., measure_index] for measure_index, name in enumerate(self.names)
+    def _index_by_measure_name(self, measure_values: np.ndarray) -> Any:
+        """Return a dictionary of arrays by measure name, or one array if the request was a single
+        name.
+        """
+        values_by_measure_name = {
+            measure_name: measure_values[..., measure_index]
+            for measure_index, measure_name in enumerate(self.names)
         }
         if not self.models.ndim:
-            values_by_name = {
-                name: float(number)  # type: ignore[misc]
-                for name, number in values_by_name.items()
+            values_by_measure_name = {
+                measure_name: float(measure_value)  # type: ignore[misc]
+                for measure_name, measure_value in values_by_measure_name.items()
             }
-        return values_by_name[self.names[0]] if self.is_single else values_by_name
+        return values_by_measure_name[self.names[0]] if self.is_single else values_by_measure_name
 
     @property
     def value(self) -> Any:
-        """Return the value from the selected model, in the measure's unit."""
-        return self._by_name(self.values)
+        """Return the measure by the selected model, in the measure's unit."""
+        return self._index_by_measure_name(self.values)
 
     @property
     def error(self) -> Any:
-        """Return a bound of the error of the value, from all sources, in the measure's unit."""
-        return self._by_name(self.errors)
+        """Return a bound of the error of the measure, from all sources, in the measure's unit."""
+        return self._index_by_measure_name(self.errors)
 
     @property
     def model_error(self) -> Any:
-        """Return the lower model's error, with sign, relative to unilateral contact.
+        """Return the lower model's measure minus the measure with unilateral contact, in the
+        measure's unit.
 
-        The value contains this error if the lower model is selected, and not if unilateral contact
-        is. The error is NaN if the lower model has no gait.
+        The result `value` contains this error only if the lower model is selected. The error is NaN
+        if the lower model has no gait.
         """
-        return self._by_name(self.model_errors)
+        return self._index_by_measure_name(self.model_errors)
 
     @property
     def numerical_error(self) -> Any:
-        """Return a bound of the error due to tolerances, meshes and iterations, in the measure's
-        unit.
+        """Return a bound of the measure's error due to tolerances, meshes and iterations, in the
+        measure's unit.
         """
-        return self._by_name(self.numerical_errors)
+        return self._index_by_measure_name(self.numerical_errors)
 
     @property
     def model(self) -> Any:
         """Return the name of the selected model."""
-        names = np.asarray(MODEL_NAMES)[self.models]
-        return names if self.models.ndim else str(names)
+        selected_model_names = np.asarray(MODEL_NAMES)[self.models]
+        return selected_model_names if self.models.ndim else str(selected_model_names)
 
     @property
     def found(self) -> Any:
@@ -150,63 +156,73 @@ class MeasureResult(AbstractPrintable):
     @property
     def title(self) -> str:
         if self.models.ndim:
-            milliseconds = _format_rounded(1e3 * self.seconds)
+            milliseconds = _format_rounded_number(1e3 * self.seconds)
             return f"MeasureResult, {self.models.size} wheels, {milliseconds} ms"
-        measures_text = "; ".join(self._format_measure(i) for i in range(len(self.names)))
-        return f"{measures_text}: {self.why}. {_format_rounded(1e3 * self.seconds)} ms"
+        measures_text = "; ".join(
+            self._format_measure_value(measure_index) for measure_index in range(len(self.names))
+        )
+        return f"{measures_text}: {self.why}. {_format_rounded_number(1e3 * self.seconds)} ms"
 
     def summary_rows(self) -> list[LabelAndText]:
         if not self.models.ndim:
             return []
-        model_names = [str(name) for name in self.model]
-        counts_text = ", ".join(
-            f"{model_names.count(name)} {MODEL_LABELS[i]}" for i, name in enumerate(MODEL_NAMES)
+        model_names = [str(measure_name) for measure_name in self.model]
+        model_counts_text = ", ".join(
+            f"{model_names.count(measure_name)} {MODEL_LABELS[measure_index]}"
+            for measure_index, measure_name in enumerate(MODEL_NAMES)
         )
-        max_error = lambda i: np.max(self.errors[self.found][:, i], initial=0.0)
+        compute_max_error = lambda measure_index: np.max(
+            self.errors[self.found][:, measure_index], initial=0.0
+        )
         error_rows = [
-            (f"largest error of {n}", _format_rounded(max_error(i)))
-            for i, n in enumerate(self.names)
+            (
+                f"largest error of {measure_name}",
+                _format_rounded_number(compute_max_error(measure_index)),
+            )
+            for measure_index, measure_name in enumerate(self.names)
         ]
         return [
-            ("models", counts_text),
+            ("models", model_counts_text),
             ("outcomes", format_outcome_counts(self.outcomes, Outcome)),
             *error_rows,
         ]
 
-    def _format_measure(self, measure_index: int) -> str:
-        """Return a measure with its unit and errors as text."""
+    def _format_measure_value(self, measure_index: int) -> str:
+        """Return the text of a measure with its unit and errors."""
         measure = MEASURES[self.names[measure_index]]
         if not self.found:
             return f"no {measure.name}"
-        value, error = float(self.values[measure_index]), float(self.errors[measure_index])
-        digits = max(0, math.ceil(-math.log10(max(error, 1e-15))))
-        value_text = f"{value:.{digits}f} {measure.display_unit}".strip()
-        parts_text = f"numerical {_format_rounded(self.numerical_errors[measure_index])}"
+        measure_value = float(self.values[measure_index])
+        error_bound = float(self.errors[measure_index])
+        n_decimals = max(0, math.ceil(-math.log10(max(error_bound, 1e-15))))
+        value_text = f"{measure_value:.{n_decimals}f} {measure.display_unit}".strip()
+        error_parts_text = (
+            f"numerical {_format_rounded_number(self.numerical_errors[measure_index])}"
+        )
         if MODEL_NAMES[int(self.models)] != MODEL_NAMES[-1]:
-            parts_text = (
-                f"model {_format_rounded(abs(self.model_errors[measure_index]))}, {parts_text}"
-            )
-        return f"{value_text} ± {_format_rounded(error)} ({parts_text})"
+            model_error_text = _format_rounded_number(abs(self.model_errors[measure_index]))
+            error_parts_text = f"model {model_error_text}, {error_parts_text}"
+        return f"{value_text} ± {_format_rounded_number(error_bound)} ({error_parts_text})"
 
 
 def _describe_selection(
-    model_index: int, status: int, n_steps: int, outcome: int, n_gaits: int
+    model_index: int, status: int, n_steps: int, search_outcome: int, n_gaits: int
 ) -> str:
-    """Return a sentence on the selected model of one element."""
-    meaning = MeasureStatus(int(status)).meaning
+    """Return a sentence on the selected model and method of one element."""
+    status_meaning = MeasureStatus(int(status)).meaning
     if status == MeasureStatus.NO_GAIT:
-        gaits_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
-        return f"{meaning}: {Outcome(int(outcome)).meaning[:-1]}{gaits_text}"
+        gait_count_text = f"; gaits that attract: {n_gaits}" if n_gaits else ""
+        return f"{status_meaning}: {Outcome(int(search_outcome)).meaning[:-1]}{gait_count_text}"
     if status == MeasureStatus.SELECTED_BY_RANK:
-        meaning = f"{meaning}, {n_gaits} in all"
+        status_meaning = f"{status_meaning}, {n_gaits} in all"
     if status == MeasureStatus.CHECKED_BY_ONE_STEP:
-        return f"{MODEL_LABELS[int(model_index)]}, {meaning}"
-    return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {meaning}"
+        return f"{MODEL_LABELS[int(model_index)]}, {status_meaning}"
+    return f"{MODEL_LABELS[int(model_index)]}, {n_steps} steps, {status_meaning}"
 
 
-def _format_rounded(value: float) -> str:
-    """Return a value as one digit and a power of ten, or as a number of up to three digits."""
-    if value == 0.0 or 0.1 <= abs(value) < 1e4:
-        return f"{value:.3g}"
-    digit, exponent = f"{value:.0e}".split("e")
-    return f"{digit}e{int(exponent)}"
+def _format_rounded_number(measure_value: float) -> str:
+    """Return the text of a number with one digit and a power of ten, or with three digits."""
+    if measure_value == 0.0 or 0.1 <= abs(measure_value) < 1e4:
+        return f"{measure_value:.3g}"
+    mantissa_text, exponent_text = f"{measure_value:.0e}".split("e")
+    return f"{mantissa_text}e{int(exponent_text)}"

@@ -22,12 +22,12 @@ from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.tolerance.contact_steps import GroundBatch
-from vrw_jax.tolerance.lower_fidelity import LowerFidelityGait, ModelIndex, find_paper_gaits
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch
+from vrw_jax.tolerance.lower_fidelity import LowerFidelityGaits, ModelIndex, find_paper_gaits
 from vrw_jax.tolerance.measure_result import MeasureResult
 from vrw_jax.tolerance.refinement import estimate_measures
 from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
-from vrw_jax.tolerance.tolerance_request import check_batch, measure_to_tolerance
+from vrw_jax.tolerance.tolerance_request import broadcast_params_and_friction, measure_to_tolerance
 from vrw_jax.validation import (
     check_choice,
     check_int,
@@ -44,14 +44,15 @@ class SamplingOptions:
     """Options of the sampling of a mean.
 
     - `n_standard_errors`: number of standard errors in the stated error of a mean;
-    - `gait_error_share`: fraction of the mean's error that is allowed for each gait;
-    - `min_pilot_gaits`: smallest number of wheels with a gait for an estimate of the variance;
-    - `singular_value_tolerance`: fraction of the largest singular value below which the pilot does
-      not determine a direction.
+    - `gait_error_fraction`: fraction of the mean's allowed error that is allowed for each gait;
+    - `min_pilot_gaits`: smallest number of wheels with a gait in the pilot sample, which an
+      estimate of the variance needs;
+    - `singular_value_tolerance`: fraction of the largest singular value below which a singular
+      value of the control columns counts as zero.
     """
 
     n_standard_errors: float = 2.0
-    gait_error_share: float = 0.1
+    gait_error_fraction: float = 0.1
     min_pilot_gaits: int = 8
     singular_value_tolerance: float = 1e-12
 
@@ -60,21 +61,21 @@ SAMPLING_OPTIONS = SamplingOptions()
 """Options of `vrw.multifidelity_mean`."""
 
 
-class _Control(NamedTuple):
-    """Control variate: its name, and its cost in steps with unilateral contact."""
+class _ControlVariate(NamedTuple):
+    """Control variate of a mean; its cost per wheel is in steps with unilateral contact."""
 
-    name: str
-    cost: float
+    control_name: str
+    cost_in_steps: float
 
 
-CONTROLS = (
-    _Control("no control", 0.0),
-    _Control("the paper's gaits", 1.0),
-    _Control("the paper's gaits with one contact step", 2.0),
+CONTROL_VARIATES = (
+    _ControlVariate("no control", 0.0),
+    _ControlVariate("the paper's gaits", 1.0),
+    _ControlVariate("the paper's gaits with one contact step", 2.0),
 )
-"""Control variates, of which the cheapest is used. In batches the paper's gait costs as much as
-one step.
-"""
+"""Control variates. The sampling uses the one with the cheapest plan.
+
+In batches, the paper's gait costs as much as one step with unilateral contact."""
 
 
 class MultifidelityMean(AbstractPrintable):
@@ -85,10 +86,12 @@ class MultifidelityMean(AbstractPrintable):
     - `error`: two standard errors of the mean, plus the mean error of the gaits;
     - `n_gaits`: number of sampled wheels with a gait with unilateral contact;
     - `n_high_fidelity`: number of wheels computed with unilateral contact, the pilot included;
-    - `control`: name of the control variate for the others;
-    - `weight`: weight of the control;
-    - `cost`: number of steps with unilateral contact, including the equivalent cost of the control;
-    - `cost_high_fidelity_only`: expected cost of a mean of the same error without a control.
+    - `control`: name of the control variate;
+    - `weight`: weight of the control variate;
+    - `cost`: number of steps with unilateral contact, including the equivalent cost of the control
+      variate;
+    - `cost_high_fidelity_only`: expected cost of a mean of the same error without a control
+      variate.
 
     Examples:
         >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
@@ -109,7 +112,7 @@ class MultifidelityMean(AbstractPrintable):
 
     @property
     def ending(self) -> str:
-        """Return how many wheels were computed with unilateral contact, as a sentence."""
+        """Return a sentence with the number of wheels computed with unilateral contact."""
         return (
             f"{self.n_high_fidelity:.0f} wheels were computed with unilateral contact; "
             f"{self.n_gaits:.0f} of them have a gait."
@@ -129,12 +132,12 @@ class MultifidelityMean(AbstractPrintable):
 
 
 class _SamplingPlan(NamedTuple):
-    """Sampling plan for a mean with one of the control variates."""
+    """Plan of the sampling for a mean with one of the control variates."""
 
-    expected_cost: float  # expected cost in steps with unilateral contact
-    n_wheels: int  # number of wheels to draw
-    weights: np.ndarray  # weights of the control's value, and of the flag that it has one
-    control_index: int
+    expected_cost_in_steps: float  # expected cost in steps with unilateral contact
+    n_drawn_wheels: int  # number of wheels to draw
+    control_weights: np.ndarray  # (2,): weights of the two control columns
+    control_index: int  # index in `CONTROL_VARIATES`
 
 
 @with_default_jax_settings
@@ -180,132 +183,163 @@ def multifidelity_mean(
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     check_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    options, min_pilot_gaits = SAMPLING_OPTIONS, SAMPLING_OPTIONS.min_pilot_gaits
+    sampling_options, min_pilot_gaits = SAMPLING_OPTIONS, SAMPLING_OPTIONS.min_pilot_gaits
     tol = check_positive("tol", tol)
     pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
-    params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(
+        params, convert_friction(friction)
+    )
     n_wheels = len(friction_by_wheel)
-    if not shape or n_wheels <= pilot:
+    if not batch_shape or n_wheels <= pilot:
         raise ValueError(
             f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
             "than its pilot: give a batch, params.damping of shape (1000,), say."
         )
-    wheels = _WheelSample(measure, params, friction_by_wheel, stoppers)
-    permutation = np.random.default_rng(seed).permutation(n_wheels)
-    pilot_indices, other_indices = permutation[:pilot], permutation[pilot:]
-    gait_tol = options.gait_error_share * tol
-    pilot_results = wheels.measure_wheels(pilot_indices, gait_tol)
-    is_found = pilot_results.found
-    if np.sum(is_found) < min_pilot_gaits:
+    measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
+    wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
+    pilot_indices, other_indices = wheel_permutation[:pilot], wheel_permutation[pilot:]
+    gait_tolerance = sampling_options.gait_error_fraction * tol
+    pilot_results = measured_wheels.measure_selected_wheels(pilot_indices, gait_tolerance)
+    has_pilot_gait = pilot_results.found
+    if np.sum(has_pilot_gait) < min_pilot_gaits:
         raise ValueError(
-            f"{np.sum(is_found)} of the pilot's {pilot} wheels have a gait with contact, but a "
-            f"mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
+            f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
+            f"a mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
         )
     pilot_sample = _SampledMeasures.from_results(pilot_results)
     control_columns = [
-        _stack_control_columns(wheels.evaluate_control(pilot_indices, control))
-        for control in range(len(CONTROLS))
+        _stack_control_columns(
+            measured_wheels.evaluate_control_variate(pilot_indices, control_index)
+        )
+        for control_index in range(len(CONTROL_VARIATES))
     ]
     sampling_plans = [
-        _plan_sampling(control_index, pilot_sample, x, tol, len(other_indices), options)
+        _plan_sampling(control_index, pilot_sample, x, tol, len(other_indices), sampling_options)
         for control_index, x in enumerate(control_columns)
     ]
-    plan = min(sampling_plans, key=lambda plan: plan.expected_cost)
-    drawn_results = wheels.measure_wheels(other_indices[: plan.n_wheels], gait_tol)
-    value, standard_error = _estimate_mean(
-        plan,
+    sampling_plan = min(
+        sampling_plans, key=lambda sampling_plan: sampling_plan.expected_cost_in_steps
+    )
+    drawn_results = measured_wheels.measure_selected_wheels(
+        other_indices[: sampling_plan.n_drawn_wheels], gait_tolerance
+    )
+    mean_value, standard_error = _estimate_mean(
+        sampling_plan,
         pilot_sample,
         _SampledMeasures.from_results(drawn_results),
-        _stack_control_columns(wheels.evaluate_control(other_indices, plan.control_index)),
+        _stack_control_columns(
+            measured_wheels.evaluate_control_variate(other_indices, sampling_plan.control_index)
+        ),
     )
-    gait_errors = np.concatenate(
-        [pilot_results.error[is_found], drawn_results.error[drawn_results.found]]
+    gait_error_bounds = np.concatenate(
+        [pilot_results.error[has_pilot_gait], drawn_results.error[drawn_results.found]]
     )
     return MultifidelityMean(
-        value=value,
-        error=options.n_standard_errors * standard_error + float(np.mean(gait_errors)),
-        n_gaits=float(len(gait_errors)),
-        n_high_fidelity=float(pilot + plan.n_wheels),
-        weight=float(plan.weights[0]),
+        value=mean_value,
+        error=sampling_options.n_standard_errors * standard_error
+        + float(np.mean(gait_error_bounds)),
+        n_gaits=float(len(gait_error_bounds)),
+        n_high_fidelity=float(pilot + sampling_plan.n_drawn_wheels),
+        weight=float(sampling_plan.control_weights[0]),
         cost=float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
-        + CONTROLS[plan.control_index].cost * n_wheels,
-        cost_high_fidelity_only=pilot_sample.mean_cost * pilot + sampling_plans[0].expected_cost,
+        + CONTROL_VARIATES[sampling_plan.control_index].cost_in_steps * n_wheels,
+        cost_high_fidelity_only=pilot_sample.mean_steps_per_wheel * pilot
+        + sampling_plans[0].expected_cost_in_steps,
         measure=measure,
-        control=CONTROLS[plan.control_index].name,
+        control=CONTROL_VARIATES[sampling_plan.control_index].control_name,
     )
 
 
 class _SampledMeasures(NamedTuple):
-    """Measures of the wheels of a sample."""
+    """Measures of the wheels of a sample, with unilateral contact."""
 
-    values: np.ndarray  # values of the measure, zero if there is no gait
+    measure_values: np.ndarray  # measure of each wheel, zero if the wheel has no gait
     has_gait: np.ndarray  # whether the wheel has a gait
-    mean_cost: float  # mean number of steps per wheel
+    mean_steps_per_wheel: float  # mean number of steps per wheel
 
     @classmethod
-    def from_results(cls, results: MeasureResult) -> "_SampledMeasures":
-        """Return the sampled measures of these results."""
-        has_gait = results.found.astype(float)
+    def from_results(cls, measure_results: MeasureResult) -> "_SampledMeasures":
+        """Return the sampled measures, given the results of `measure_to_tolerance`."""
+        has_gait = measure_results.found.astype(float)
         return cls(
-            np.where(results.found, results.value, 0.0), has_gait, float(np.mean(results.n_steps))
+            np.where(measure_results.found, measure_results.value, 0.0),
+            has_gait,
+            float(np.mean(measure_results.n_steps)),
         )
 
 
-class _WheelSample(NamedTuple):
-    """Wheels of a sample, and the measure that is evaluated."""
+class _MeasuredWheels(NamedTuple):
+    """All wheels of a mean, and the measure that is evaluated."""
 
     measure_name: str
     params: WheelParams
-    friction: np.ndarray
+    friction_coefficients: np.ndarray
     stoppers: str
 
-    def take_wheels(self, indices: np.ndarray) -> WheelParams:
+    def take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
         """Return the wheels at these indices."""
-        return jax.device_put(take_rows(self.params, indices))
+        return jax.device_put(take_rows(self.params, wheel_indices))
 
-    def measure_wheels(self, indices: np.ndarray, tol: float) -> MeasureResult:
-        """Return the measure with unilateral contact of these wheels, to within `tol`."""
-        arguments = self.measure_name, self.take_wheels(indices), tol
+    def measure_selected_wheels(
+        self, wheel_indices: np.ndarray, measure_tolerance: float
+    ) -> MeasureResult:
+        """Return the measure of the selected wheels with unilateral contact."""
+        measure_arguments = self.measure_name, self.take_wheels(wheel_indices), measure_tolerance
         return measure_to_tolerance(
-            *arguments, friction=self.friction[indices], stoppers=self.stoppers
+            *measure_arguments,
+            friction=self.friction_coefficients[wheel_indices],
+            stoppers=self.stoppers,
         )
 
-    def evaluate_control(self, indices: np.ndarray, control_index: int) -> np.ndarray:
-        """Return the values of a control variate, NaN for wheels without one."""
-        control_values = np.full(len(indices), np.nan)
+    def evaluate_control_variate(self, wheel_indices: np.ndarray, control_index: int) -> np.ndarray:
+        """Return a control variate of the selected wheels, NaN for wheels without a gait of the
+        paper's model.
+        """
+        control_values = np.full(len(wheel_indices), np.nan)
         if not control_index:
             return control_values
-        options = StepOptions()
-        lower_gaits = find_paper_gaits(self.take_wheels(indices), options)
-        (has_gait,) = np.nonzero(lower_gaits.model_index != ModelIndex.NONE)
-        lower_gaits = LowerFidelityGait(*(gait_array[has_gait] for gait_array in lower_gaits))
-        values = evaluate_measures([self.measure_name], lower_gaits.quantities)[:, 0]
-        if control_index == len(CONTROLS) - 1:
-            gait_indices = indices[has_gait]
-            ground = GroundBatch.from_params(
-                self.take_wheels(gait_indices), self.friction[gait_indices], self.stoppers, options
+        step_options = StepOptions()
+        paper_gaits = find_paper_gaits(self.take_wheels(wheel_indices), step_options)
+        (found_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
+        paper_gaits = LowerFidelityGaits(*(gait_array[found_indices] for gait_array in paper_gaits))
+        measure_values = evaluate_measures([self.measure_name], paper_gaits.step_quantities)[:, 0]
+        if control_index == len(CONTROL_VARIATES) - 1:
+            wheel_indices_of_gaits = wheel_indices[found_indices]
+            wheel_batch = ContactWheelBatch.from_params(
+                self.take_wheels(wheel_indices_of_gaits),
+                self.friction_coefficients[wheel_indices_of_gaits],
+                self.stoppers,
+                step_options,
             )
-            all_positions = np.arange(len(gait_indices))
-            section_states = ground.embed_states(all_positions, lower_gaits.section_state)
-            estimate = estimate_measures(
-                ground,
-                all_positions,
+            gait_positions = np.arange(len(wheel_indices_of_gaits))
+            section_states = wheel_batch.embed_paper_states(
+                gait_positions, paper_gaits.section_states
+            )
+            measure_estimates = estimate_measures(
+                wheel_batch,
+                gait_positions,
                 section_states,
-                ground.take_steps(all_positions, section_states),
-                lower_gaits.newton_matrix,
-                lower_gaits.quantity_jacobian,
+                wheel_batch.take_steps(gait_positions, section_states),
+                paper_gaits.newton_matrix,
+                paper_gaits.step_quantity_jacobian,
                 [self.measure_name],
-                ground.plane_indices(),
+                wheel_batch.list_paper_state_indices(),
             )
-            values = np.where(estimate.same_codes, estimate.values[:, 0], values)
-        control_values[has_gait] = values
+            measure_values = np.where(
+                measure_estimates.has_same_leg_codes,
+                measure_estimates.measure_values[:, 0],
+                measure_values,
+            )
+        control_values[found_indices] = measure_values
         return control_values
 
 
 def _stack_control_columns(control_values: np.ndarray) -> np.ndarray:
-    """Return the control's value of each wheel, zero if it has none, and whether it has one,
-    (wheels, 2).
+    """Return the two columns of a control variate, (wheels, 2).
+
+    The first column is the control variate, or zero for a wheel without a finite control variate.
+    The second column is 1 for a finite control variate and 0 otherwise.
     """
     has_value = np.isfinite(control_values)
     return np.column_stack([np.where(has_value, control_values, 0.0), has_value])
@@ -315,72 +349,94 @@ def _plan_sampling(
     control_index: int,
     pilot_sample: _SampledMeasures,
     control_columns: np.ndarray,
-    tol: float,
-    n_other: int,
-    options: SamplingOptions,
+    mean_tolerance: float,
+    n_other_wheels: int,
+    sampling_options: SamplingOptions,
 ) -> _SamplingPlan:
-    """Return weights and number of wheels from the pilot, for a mean to within `tol`.
+    """Return the sampling plan of a control variate for a mean to within a tolerance.
 
-    The mean M is over the wheels with a gait, which is a ratio. The controlled quantity is each
-    wheel's measure minus M, and zero for a wheel without a gait. Its sum over all wheels is zero.
+    The weights of the control columns and the number of wheels follow from the pilot sample. The
+    mean M is over the wheels with a gait, so that it is a ratio. The controlled quantity is the
+    wheel's measure minus M, or zero for a wheel without a gait. The sum of this quantity over all
+    wheels is zero.
     """
-    gait_share = float(np.mean(pilot_sample.has_gait))
+    share_with_gait = float(np.mean(pilot_sample.has_gait))
     centered_values = (
-        pilot_sample.values - np.mean(pilot_sample.values) / gait_share * pilot_sample.has_gait
+        pilot_sample.measure_values
+        - np.mean(pilot_sample.measure_values) / share_with_gait * pilot_sample.has_gait
     )
     centered_columns = control_columns - np.mean(control_columns, axis=0)
-    weights, _, rank, _ = np.linalg.lstsq(
-        centered_columns, centered_values, rcond=options.singular_value_tolerance
+    control_weights, _, matrix_rank, _ = np.linalg.lstsq(
+        centered_columns, centered_values, rcond=sampling_options.singular_value_tolerance
     )
-    sum_of_squares = float(
-        np.sum((centered_values - centered_columns @ weights) ** 2)
-    ) + _variance_of_unseen_wheel(pilot_sample, centered_values)
-    residual_variance = sum_of_squares / (len(centered_values) - 1 - int(rank))
-    sampling_tol = (1.0 - options.gait_error_share) * tol
-    n_required = residual_variance * (options.n_standard_errors / (sampling_tol * gait_share)) ** 2
-    n_wheels = min(
-        n_other, max(options.min_pilot_gaits, math.ceil(n_required / (1.0 + n_required / n_other)))
+    residual_sum_of_squares = float(
+        np.sum((centered_values - centered_columns @ control_weights) ** 2)
+    ) + _compute_unseen_wheel_variance(pilot_sample, centered_values)
+    residual_variance = residual_sum_of_squares / (len(centered_values) - 1 - int(matrix_rank))
+    sampling_tolerance = (1.0 - sampling_options.gait_error_fraction) * mean_tolerance
+    n_required_wheels = (
+        residual_variance
+        * (sampling_options.n_standard_errors / (sampling_tolerance * share_with_gait)) ** 2
+    )
+    n_drawn_wheels = min(
+        n_other_wheels,
+        max(
+            sampling_options.min_pilot_gaits,
+            math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_other_wheels)),
+        ),
     )
     return _SamplingPlan(
-        n_wheels * pilot_sample.mean_cost + CONTROLS[control_index].cost * n_other,
-        n_wheels,
-        weights,
+        n_drawn_wheels * pilot_sample.mean_steps_per_wheel
+        + CONTROL_VARIATES[control_index].cost_in_steps * n_other_wheels,
+        n_drawn_wheels,
+        control_weights,
         control_index,
     )
 
 
 def _estimate_mean(
-    plan: _SamplingPlan,
+    sampling_plan: _SamplingPlan,
     pilot_sample: _SampledMeasures,
     drawn_sample: _SampledMeasures,
     control_columns: np.ndarray,
 ) -> tuple[float, float]:
-    """Return the mean and its standard error.
+    """Return the mean of a measure and its standard error.
 
-    `control_columns` are those of all wheels except the pilot's, of which the first belong to the
-    drawn wheels.
+    - `control_columns`: control columns of all wheels except the pilot's wheels. The drawn wheels
+      come first.
     """
-    n_wheels, control_values = len(control_columns), control_columns @ plan.weights
-    gait_count = np.sum(pilot_sample.has_gait) + n_wheels * np.mean(drawn_sample.has_gait)
-    differences = drawn_sample.values - control_values[: plan.n_wheels]
-    mean = (
-        np.sum(pilot_sample.values) + n_wheels * (np.mean(control_values) + np.mean(differences))
-    ) / gait_count
-    sum_of_squares = plan.n_wheels * np.var(differences - mean * drawn_sample.has_gait)
-    sum_of_squares += _variance_of_unseen_wheel(
-        pilot_sample, pilot_sample.values - mean * pilot_sample.has_gait
+    n_other_wheels = len(control_columns)
+    control_values = control_columns @ sampling_plan.control_weights
+    n_gaits_in_all = np.sum(pilot_sample.has_gait) + n_other_wheels * np.mean(drawn_sample.has_gait)
+    control_differences = (
+        drawn_sample.measure_values - control_values[: sampling_plan.n_drawn_wheels]
     )
-    variance = (
-        sum_of_squares / (plan.n_wheels - 1) / plan.n_wheels * (1.0 - plan.n_wheels / n_wheels)
+    measure_mean = (
+        np.sum(pilot_sample.measure_values)
+        + n_other_wheels * (np.mean(control_values) + np.mean(control_differences))
+    ) / n_gaits_in_all
+    residual_sum_of_squares = sampling_plan.n_drawn_wheels * np.var(
+        control_differences - measure_mean * drawn_sample.has_gait
     )
-    return float(mean), float(n_wheels / gait_count * math.sqrt(variance))
+    residual_sum_of_squares += _compute_unseen_wheel_variance(
+        pilot_sample, pilot_sample.measure_values - measure_mean * pilot_sample.has_gait
+    )
+    mean_variance = (
+        residual_sum_of_squares
+        / (sampling_plan.n_drawn_wheels - 1)
+        / sampling_plan.n_drawn_wheels
+        * (1.0 - sampling_plan.n_drawn_wheels / n_other_wheels)
+    )
+    return float(measure_mean), float(n_other_wheels / n_gaits_in_all * math.sqrt(mean_variance))
 
 
-def _variance_of_unseen_wheel(pilot_sample: _SampledMeasures, centered_values: np.ndarray) -> float:
-    """Return the variance due to one additional wheel that the control predicts wrongly, if gaits
-    are lost.
+def _compute_unseen_wheel_variance(
+    pilot_sample: _SampledMeasures, centered_values: np.ndarray
+) -> float:
+    """Return the variance due to one more wheel whose control variate is wrong, or zero if all
+    wheels of the pilot sample have a gait.
 
-    A small sample may contain no wheel that has a gait of the paper's model and none with
-    unilateral contact.
+    A wheel may have a gait of the paper's model and no gait with unilateral contact. A small sample
+    may contain no such wheel.
     """
     return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_values))

@@ -3,7 +3,7 @@
 One step with unilateral contact from a state x gives the defect r = P(x) - x. Multiplied by the
 inverse of I - DP, it is Newton's correction d. The gait's quantities are near those of this step
 plus their change along d. The exact Jacobian of one step serves several corrections (chord
-iteration). If corrections contract slowly or the legs' codes change, it is computed again.
+iteration). The Jacobian is computed again if corrections contract slowly or the legs' codes change.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.cycles import solve_linear_systems
-from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
 from vrw_jax.tolerance.step_quantities import (
     N_DURATIONS,
     N_STEP_QUANTITIES,
@@ -27,239 +27,303 @@ from vrw_jax.wheel import Outcome
 class RefinementOptions:
     """Options of the refinement of gaits; section states are in rad, rad/s, m, m/s.
 
-    - `max_jacobians`: largest number of Jacobians for one gait;
-    - `max_corrections`: largest number of corrections by one Jacobian, chosen because so many
-      corrections reach round-off at `max_contraction_rate`;
+    - `max_jacobians_per_gait`: largest number of Jacobians for one gait;
+    - `max_corrections_per_jacobian`: largest number of corrections by one Jacobian, chosen because
+      so many corrections reach round-off at `max_contraction_rate`;
     - `max_contraction_rate`: contraction rate of corrections above which the Jacobian is computed
       again;
-    - `max_correction`: longest accepted correction, chosen because the linearization is unknown
-      beyond it;
-    - `stall_level`: length of a correction, in tolerances of the step, below which corrections that
-      contract slowly are at the level of the integrator's errors;
-    - `safety_factor`: bound of the remaining error over the effect of the last correction, and of
-      the numerical error over the difference between steps at two tolerances. It is chosen because
-      a factor of four was too small for 4 of 10,365 results;
-    - `step_error_factor`: error of a step over the tolerance of its solver steps, chosen because 99
-      of 100 errors are within a third of it;
+    - `max_correction_length`: length of the longest accepted correction, chosen because the
+      linearization is unknown beyond this length;
+    - `stall_length_in_tolerances`: length of a correction, in tolerances of the step, below which
+      corrections that contract slowly are at the level of the integrator's errors;
+    - `error_safety_factor`: bound of the remaining error over the effect of the last correction. It
+      is also the bound of the numerical error over the difference between steps at two tolerances.
+      It is chosen because a factor of four was too small for 4 of 10,365 results;
+    - `step_error_in_tolerances`: bound of the error of a step, in tolerances of its solver steps,
+      chosen because 99 of 100 errors are within a third of this bound;
     - `n_presumed_missed_contacts`: number of shortest contacts of a foot that a step may miss or
       add;
-    - `max_presumed_error_fraction`: largest fraction of the allowed error that is assumed for such
-      contacts; otherwise their error is measured;
-    - `jacobian_cost`: cost of a step with its Jacobian, in steps, chosen because it takes 3.7 times
-      the CPU time of a step.
+    - `max_presumed_error_fraction`: largest fraction of the allowed error that is presumed for
+      missed contacts. If the fraction is larger, steps at other tolerances measure the error;
+    - `jacobian_cost_in_steps`: cost of a step with its Jacobian, in steps, chosen because this step
+      takes 3.7 times the CPU time of a step without derivatives.
     """
 
-    max_jacobians: int = 4
-    max_corrections: int = 20
+    max_jacobians_per_gait: int = 4
+    max_corrections_per_jacobian: int = 20
     max_contraction_rate: float = 0.3
-    max_correction: float = 1.0
-    stall_level: float = 1e4
-    safety_factor: float = 6.0
-    step_error_factor: float = 30.0
+    max_correction_length: float = 1.0
+    stall_length_in_tolerances: float = 1e4
+    error_safety_factor: float = 6.0
+    step_error_in_tolerances: float = 30.0
     n_presumed_missed_contacts: float = 3.0
     max_presumed_error_fraction: float = 0.1
-    jacobian_cost: int = 4
+    jacobian_cost_in_steps: int = 4
 
 
 REFINEMENT_OPTIONS = RefinementOptions()
 """Options of the refinement for all measures."""
 
 
-class StepEstimate(NamedTuple):
-    """Estimates of gaits' measures from one step with unilateral contact; the batch axis is first.
+class MeasureEstimates(NamedTuple):
+    """Estimates of the measures of gaits, each from one step with unilateral contact.
 
-    - `same_codes`: whether the step does not change the legs' codes;
-    - `correction`: Newton's correction of these coordinates of the section state;
-    - `values`: estimated measures of the gait, (elements, measures), as are the errors below;
-    - `correction_effect`: sum of the absolute effects of the correction on the measures;
-    - `measure_jacobian`: derivatives with respect to the step's quantities, (elements, measures,
-      7);
-    - `numerical_error`: bound of the integrator's error;
-    - `missed_contact_error`: bound of the error due to contacts that are too short to be resolved.
+    - `has_same_leg_codes`: whether the legs have the same codes before and after the step,
+      (gaits,);
+    - `newton_correction`: Newton's correction of the section state, (gaits, coordinates);
+    - `measure_values`: estimated measures of the gaits, (gaits, measures);
+    - `correction_effect_on_measures`: sum of the absolute effects of the correction's coordinates
+      on each measure, (gaits, measures);
+    - `measure_jacobian`: derivatives of the measures with respect to the step quantities, (gaits,
+      measures, 7);
+    - `numerical_error_bound`: bound of the measures' error due to the integrator, (gaits,
+      measures);
+    - `missed_contact_error_bound`: bound of the measures' error due to contacts that are too short
+      to be resolved, (gaits, measures).
     """
 
-    same_codes: np.ndarray
-    correction: np.ndarray
-    values: np.ndarray
-    correction_effect: np.ndarray
+    has_same_leg_codes: np.ndarray
+    newton_correction: np.ndarray
+    measure_values: np.ndarray
+    correction_effect_on_measures: np.ndarray
     measure_jacobian: np.ndarray
-    numerical_error: np.ndarray
-    missed_contact_error: np.ndarray
+    numerical_error_bound: np.ndarray
+    missed_contact_error_bound: np.ndarray
 
 
 def estimate_measures(
-    ground: GroundBatch,
-    indices: np.ndarray,
+    wheel_batch: ContactWheelBatch,
+    wheel_indices: np.ndarray,
     section_states: np.ndarray,
-    step: StepQuantities,
+    contact_step: StepQuantities,
     newton_matrix: np.ndarray,
-    quantity_jacobian: np.ndarray,
-    names: Sequence[str],
-    coordinates: Any = slice(None),
-    options: RefinementOptions = REFINEMENT_OPTIONS,
-) -> StepEstimate:
-    """Return estimates of the measures of gaits near section states, from one step of each.
+    step_quantity_jacobian: np.ndarray,
+    measure_names: Sequence[str],
+    section_coordinates: Any = slice(None),
+    refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
+) -> MeasureEstimates:
+    """Return estimates of the measures of gaits near section states, each from one step.
 
     Args:
-        ground: the batch of wheels.
-        indices: index of the wheel of each element.
-        section_states: full section states at the start of the step.
-        step: result of the step.
-        newton_matrix: inverse of I - DP in some coordinates of the section state.
-        quantity_jacobian: derivatives of the quantities, (elements, 7, coordinates).
-        names: names of the measures.
-        coordinates: indices of these coordinates, all by default.
-        options: options of the bounds.
+        wheel_batch: batch of wheels.
+        wheel_indices: index of the wheel of each gait.
+        section_states: full section states at the start of the steps, (gaits, 4 + 3 n).
+        contact_step: section states and quantities after the steps.
+        newton_matrix: inverse of I - DP in the section coordinates.
+        step_quantity_jacobian: derivatives of the step quantities, (gaits, 7, coordinates).
+        measure_names: names of the measures.
+        section_coordinates: indices of the corrected coordinates of a section state.
+        refinement_options: options of the bounds.
     """
-    n_numbers = section_states.shape[1] - ground.n_legs
-    same_codes = np.all(
-        section_states[:, n_numbers:] == step.section_states[:, n_numbers:], axis=1
-    ) & (step.outcome == Outcome.STEPPED)
-    defect = (step.section_states - section_states)[:, coordinates] * same_codes[:, None]
+    n_continuous = section_states.shape[1] - wheel_batch.n_legs
+    has_same_leg_codes = np.all(
+        section_states[:, n_continuous:] == contact_step.section_states[:, n_continuous:], axis=1
+    ) & (contact_step.step_outcomes == Outcome.STEPPED)
+    section_state_defect = (contact_step.section_states - section_states)[
+        :, section_coordinates
+    ] * has_same_leg_codes[:, None]
     with np.errstate(all="ignore"):
-        correction = np.einsum("ijk,ik->ij", newton_matrix, defect)
-        quantities = step.quantities + np.einsum("ijk,ik->ij", quantity_jacobian, correction)
-        measure_jacobian = compute_measure_derivatives(names, quantities)
-        state_sensitivity = np.abs(measure_jacobian @ quantity_jacobian)
-        correction_effect = np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction))
-        step_error = options.step_error_factor * float(ground.options.rtol)
-        total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
-            state_sensitivity @ np.abs(newton_matrix), axis=-1
+        newton_correction = np.einsum("ijk,ik->ij", newton_matrix, section_state_defect)
+        gait_quantities = contact_step.step_quantities + np.einsum(
+            "ijk,ik->ij", step_quantity_jacobian, newton_correction
         )
-        # A contact that is not resolved moves time from one duration to another.
+        measure_jacobian = compute_measure_derivatives(measure_names, gait_quantities)
+        section_state_sensitivity = np.abs(measure_jacobian @ step_quantity_jacobian)
+        correction_effect_on_measures = np.einsum(
+            "ijk,ik->ij", section_state_sensitivity, np.abs(newton_correction)
+        )
+        step_error_bound = refinement_options.step_error_in_tolerances * float(
+            wheel_batch.step_options.rtol
+        )
+        total_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
+            section_state_sensitivity @ np.abs(newton_matrix), axis=-1
+        )
+        # An unresolved contact adds its time to one duration and takes the time from another.
         duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
         missed_contact_duration = (
-            options.n_presumed_missed_contacts * ground.min_resolved_contact_duration(indices)
+            refinement_options.n_presumed_missed_contacts
+            * wheel_batch.compute_min_contact_duration(wheel_indices)
         )
-        return StepEstimate(
-            same_codes,
-            correction,
-            evaluate_measures(names, quantities),
-            correction_effect,
+        return MeasureEstimates(
+            has_same_leg_codes,
+            newton_correction,
+            evaluate_measures(measure_names, gait_quantities),
+            correction_effect_on_measures,
             measure_jacobian,
-            step_error * total_sensitivity,
+            step_error_bound * total_sensitivity,
             missed_contact_duration[:, None] * duration_sensitivity_range,
         )
 
 
 class RefinedGaits(NamedTuple):
-    """Gaits with unilateral contact and their measures, for each element."""
+    """Gaits with unilateral contact and their measures, after the refinement."""
 
-    is_found: np.ndarray
-    is_attracting: np.ndarray
-    values: np.ndarray  # (elements, measures)
-    errors: np.ndarray  # (elements, measures): bound of the errors of iteration and integrator
-    n_steps: np.ndarray  # number of steps, where a Jacobian counts as `jacobian_cost` steps
-    section_states: np.ndarray  # (elements, 4 + 3 n)
-    speed: np.ndarray  # speed in the last step, m/s
+    is_found: np.ndarray  # whether the iteration has converged
+    is_attracting: np.ndarray  # whether all multipliers are inside the unit circle
+    measure_values: np.ndarray  # (gaits, measures)
+    error_bounds: np.ndarray  # (gaits, measures)
+    n_steps: np.ndarray  # number of steps; a Jacobian counts as `jacobian_cost_in_steps` steps
+    section_states: np.ndarray  # (gaits, 4 + 3 n)
+    walking_speed: np.ndarray  # mean speed of the last step, m/s
 
 
 def refine_gaits(
-    ground: GroundBatch,
-    indices: np.ndarray,
+    wheel_batch: ContactWheelBatch,
+    wheel_indices: np.ndarray,
     section_states: np.ndarray,
-    names: Sequence[str],
+    measure_names: Sequence[str],
     compute_error_goal: Callable[[np.ndarray], np.ndarray],
-    always_compares: bool,
-    options: RefinementOptions = REFINEMENT_OPTIONS,
+    always_compares_tolerances: bool,
+    refinement_options: RefinementOptions = REFINEMENT_OPTIONS,
 ) -> RefinedGaits:
     """Return the gaits near section states, with their measures and bounds of the errors.
 
-    Corrections end if the remaining error is below the goal. `compute_error_goal` returns the
-    allowed errors of measures with about these values. If `always_compares` or if the error
-    of presumed short contacts matters, steps at other tolerances measure the numerical error.
+    Newton's corrections of a gait end when the remaining error is below the goal. The argument
+    `compute_error_goal` is a function from measures to their allowed errors. Steps at other
+    tolerances measure the numerical error in two cases: `always_compares_tolerances` is true, or
+    the error due to missed contacts is too large to be presumed.
     """
-    n_elements, m = section_states.shape
-    states, values = section_states.copy(), np.full((n_elements, len(names)), np.nan)
-    remaining_error, numerical_error = np.full((2, *values.shape), np.inf)
-    is_found, needs_comparison = np.zeros((2, n_elements), bool)
-    speed, n_steps = np.full(n_elements, np.nan), np.zeros(n_elements, int)
-    newton_matrix = np.zeros((n_elements, m, m))
-    quantity_jacobian = np.zeros((n_elements, N_STEP_QUANTITIES, m))
+    n_gaits, n_coordinates = section_states.shape
+    gait_states = section_states.copy()
+    measure_values = np.full((n_gaits, len(measure_names)), np.nan)
+    remaining_error_bounds, numerical_error_bounds = np.full((2, *measure_values.shape), np.inf)
+    is_found, needs_comparison = np.zeros((2, n_gaits), bool)
+    walking_speed, n_steps = np.full(n_gaits, np.nan), np.zeros(n_gaits, int)
+    newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
+    step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
 
-    def estimate(
-        step_ground: GroundBatch, positions: np.ndarray, step: StepQuantities
-    ) -> StepEstimate:
+    def estimate_gait_measures(
+        stepping_batch: ContactWheelBatch, gait_positions: np.ndarray, contact_step: StepQuantities
+    ) -> MeasureEstimates:
         return estimate_measures(
-            step_ground,
-            indices[positions],
-            states[positions],
-            step,
-            newton_matrix[positions],
-            quantity_jacobian[positions],
-            names,
+            stepping_batch,
+            wheel_indices[gait_positions],
+            gait_states[gait_positions],
+            contact_step,
+            newton_matrix[gait_positions],
+            step_quantity_jacobian[gait_positions],
+            measure_names,
         )
 
-    next_positions = np.arange(n_elements)
-    for _ in range(options.max_jacobians):
-        if not len(next_positions):
+    next_gait_positions = np.arange(n_gaits)
+    for _ in range(refinement_options.max_jacobians_per_gait):
+        if not len(next_gait_positions):
             break
-        positions, next_positions = next_positions, next_positions[:0]
-        step, return_jacobian, quantity_jacobian[positions] = ground.linearize_steps(
-            indices[positions], states[positions]
+        gait_positions, next_gait_positions = next_gait_positions, next_gait_positions[:0]
+        contact_step, return_map_jacobian, step_quantity_jacobian[gait_positions] = (
+            wheel_batch.linearize_steps(wheel_indices[gait_positions], gait_states[gait_positions])
         )
-        newton_matrix[positions] = solve_linear_systems(
-            np.eye(m) - return_jacobian, np.broadcast_to(np.eye(m), return_jacobian.shape)
+        newton_matrix[gait_positions] = solve_linear_systems(
+            np.eye(n_coordinates) - return_map_jacobian,
+            np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
         )
-        n_steps[positions] += options.jacobian_cost
-        previous_length = np.full(len(positions), np.inf)
-        for n_corrections in range(options.max_corrections):
-            gait = estimate(ground, positions, step)
-            length = np.linalg.norm(gait.correction, axis=1)
-            rate = length / np.maximum(previous_length, np.finfo(float).tiny)
-            is_slow = rate > options.max_contraction_rate
-            error = options.safety_factor * gait.correction_effect
-            error_goal = compute_error_goal(gait.values)
-            is_accurate = (n_corrections > 0) & np.all(
-                error <= np.maximum(error_goal - gait.numerical_error, gait.numerical_error), axis=1
+        n_steps[gait_positions] += refinement_options.jacobian_cost_in_steps
+        previous_correction_length = np.full(len(gait_positions), np.inf)
+        for n_corrections in range(refinement_options.max_corrections_per_jacobian):
+            measure_estimates = estimate_gait_measures(wheel_batch, gait_positions, contact_step)
+            correction_length = np.linalg.norm(measure_estimates.newton_correction, axis=1)
+            contraction_rate = correction_length / np.maximum(
+                previous_correction_length, np.finfo(float).tiny
             )
-            has_stalled = length <= options.stall_level * float(ground.options.rtol)
-            is_done = gait.same_codes & np.where(is_slow, has_stalled, is_accurate)
-            done = positions[is_done]
-            is_found[done], values[done] = True, gait.values[is_done]
-            remaining_error[done] = error[is_done]
-            numerical_error[done] = (gait.numerical_error + gait.missed_contact_error)[is_done]
-            speed[done] = evaluate_measures(("speed",), step.quantities[is_done])[:, 0]
-            needs_comparison[done] = (
-                always_compares
+            contracts_slowly = contraction_rate > refinement_options.max_contraction_rate
+            error_bound = (
+                refinement_options.error_safety_factor
+                * measure_estimates.correction_effect_on_measures
+            )
+            error_bound_goal = compute_error_goal(measure_estimates.measure_values)
+            is_within_goal = (n_corrections > 0) & np.all(
+                error_bound
+                <= np.maximum(
+                    error_bound_goal - measure_estimates.numerical_error_bound,
+                    measure_estimates.numerical_error_bound,
+                ),
+                axis=1,
+            )
+            is_at_stall_length = (
+                correction_length
+                <= refinement_options.stall_length_in_tolerances
+                * float(wheel_batch.step_options.rtol)
+            )
+            is_finished = measure_estimates.has_same_leg_codes & np.where(
+                contracts_slowly, is_at_stall_length, is_within_goal
+            )
+            finished_positions = gait_positions[is_finished]
+            is_found[finished_positions] = True
+            measure_values[finished_positions] = measure_estimates.measure_values[is_finished]
+            remaining_error_bounds[finished_positions] = error_bound[is_finished]
+            numerical_error_bounds[finished_positions] = (
+                measure_estimates.numerical_error_bound
+                + measure_estimates.missed_contact_error_bound
+            )[is_finished]
+            walking_speed[finished_positions] = evaluate_measures(
+                ("speed",), contact_step.step_quantities[is_finished]
+            )[:, 0]
+            needs_comparison[finished_positions] = (
+                always_compares_tolerances
                 | np.any(
-                    gait.missed_contact_error > options.max_presumed_error_fraction * error_goal,
+                    measure_estimates.missed_contact_error_bound
+                    > refinement_options.max_presumed_error_fraction * error_bound_goal,
                     axis=1,
-                )[is_done]
+                )[is_finished]
             )
             is_continued = (
-                ~is_done
-                & (step.outcome == Outcome.STEPPED)
-                & (length <= options.max_correction)
-                & (rate < 1.0)
+                ~is_finished
+                & (contact_step.step_outcomes == Outcome.STEPPED)
+                & (correction_length <= refinement_options.max_correction_length)
+                & (contraction_rate < 1.0)
             )
-            states[positions[is_continued]] = np.where(
-                gait.same_codes[:, None], states[positions] + gait.correction, step.section_states
+            gait_states[gait_positions[is_continued]] = np.where(
+                measure_estimates.has_same_leg_codes[:, None],
+                gait_states[gait_positions] + measure_estimates.newton_correction,
+                contact_step.section_states,
             )[is_continued]
-            needs_jacobian = is_continued & (is_slow | ~gait.same_codes)
-            next_positions = np.append(next_positions, positions[needs_jacobian])
+            needs_jacobian = is_continued & (
+                contracts_slowly | ~measure_estimates.has_same_leg_codes
+            )
+            next_gait_positions = np.append(next_gait_positions, gait_positions[needs_jacobian])
             is_continued &= ~needs_jacobian
-            positions, previous_length = positions[is_continued], length[is_continued]
-            if not len(positions):
+            gait_positions = gait_positions[is_continued]
+            previous_correction_length = correction_length[is_continued]
+            if not len(gait_positions):
                 break
-            step = ground.take_steps(indices[positions], states[positions])
-            n_steps[positions] += 1
-    compared = np.flatnonzero(needs_comparison)
-    errors_by_comparison = [np.zeros((len(compared), len(names)))]
-    for other_ground in ground.list_with_other_tolerances():
-        # At another tolerance the shortest resolved contact is shorter or longer.
-        step = other_ground.take_steps(indices[compared], states[compared])
-        gait = estimate(other_ground, compared, step)
-        error = options.safety_factor * np.abs(gait.values - values[compared])
-        error += np.minimum(gait.numerical_error, numerical_error[compared])
-        # A step with another motion gives no bound.
-        errors_by_comparison.append(np.where(gait.same_codes[:, None], error, np.inf))
-        n_steps[compared] += 1
-    numerical_error[compared] = np.max(errors_by_comparison, axis=0)
-    errors = remaining_error + numerical_error
-    is_found &= np.isfinite(errors).all(1)
+            contact_step = wheel_batch.take_steps(
+                wheel_indices[gait_positions], gait_states[gait_positions]
+            )
+            n_steps[gait_positions] += 1
+    compared_positions = np.flatnonzero(needs_comparison)
+    error_bounds_by_tolerance = [np.zeros((len(compared_positions), len(measure_names)))]
+    for comparison_batch in wheel_batch.make_comparison_batches():
+        # The duration of the shortest resolved contact depends on the tolerance.
+        contact_step = comparison_batch.take_steps(
+            wheel_indices[compared_positions], gait_states[compared_positions]
+        )
+        measure_estimates = estimate_gait_measures(
+            comparison_batch, compared_positions, contact_step
+        )
+        error_bound = refinement_options.error_safety_factor * np.abs(
+            measure_estimates.measure_values - measure_values[compared_positions]
+        )
+        error_bound += np.minimum(
+            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_positions]
+        )
+        # A step that changes the legs' codes gives no bound.
+        error_bounds_by_tolerance.append(
+            np.where(measure_estimates.has_same_leg_codes[:, None], error_bound, np.inf)
+        )
+        n_steps[compared_positions] += 1
+    numerical_error_bounds[compared_positions] = np.max(error_bounds_by_tolerance, axis=0)
+    total_error_bounds = remaining_error_bounds + numerical_error_bounds
+    is_found &= np.isfinite(total_error_bounds).all(1)
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
     # above a half.
     eigenvalues = np.linalg.eigvals(np.nan_to_num(newton_matrix, posinf=0.0, neginf=0.0))
     is_attracting = eigenvalues.real.min(-1) > 0.5
-    return RefinedGaits(is_found, is_attracting, values, errors, n_steps, states, speed)
+    return RefinedGaits(
+        is_found,
+        is_attracting,
+        measure_values,
+        total_error_bounds,
+        n_steps,
+        gait_states,
+        walking_speed,
+    )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vrw_jax.tolerance.contact_steps import GroundBatch, StepQuantities
+from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
 from vrw_jax.wheel import Outcome
 
 
@@ -24,124 +24,142 @@ class LeapOptions:
     - `max_leaps`: largest number of leaps;
     - `steps_per_leap`: number of steps after a leap. It is chosen because five steps miss three of
       118 gaits, among 451 wheels without a gait of the paper's model;
-    - `max_leap`: longest leap, chosen because longer ones pass over pairs of close gaits;
-    - `give_up_factor`, `give_up_leaps_left`: a walk ends if its drift would fade beyond this factor
-      times the remaining leaps, and at most so many leaps are left. They are chosen because a drift
-      may first grow for a while and then fade;
-    - `settled_drift`: drift per step, and distance to its predicted limit, below which a walk has
-      settled;
-    - `noise_drift`: drift at the level of the steps' own error.
+    - `max_leap_distance`: length of the longest leap, chosen because longer leaps pass over pairs
+      of close gaits;
+    - `max_fade_distance_ratio`: largest ratio of the fade distance to the distance of all remaining
+      leaps. A walk with a larger ratio ends. The fade distance is the distance to the predicted
+      limit of the drift;
+    - `max_leaps_left_to_give_up`: largest number of remaining leaps at which this ratio is tested,
+      chosen because a drift may first grow for a while and then fade;
+    - `max_settled_drift`: largest drift per step, and largest fade distance, of a settled walk;
+    - `drift_noise_level`: drift per step that is as small as the errors of the steps.
     """
 
     n_warmup_steps: int = 20
     max_leaps: int = 10
     steps_per_leap: int = 7
-    max_leap: float = 0.15
-    give_up_factor: float = 2.0
-    give_up_leaps_left: int = 3
-    settled_drift: float = 5e-4
-    noise_drift: float = 1e-5
+    max_leap_distance: float = 0.15
+    max_fade_distance_ratio: float = 2.0
+    max_leaps_left_to_give_up: int = 3
+    max_settled_drift: float = 5e-4
+    drift_noise_level: float = 1e-5
 
 
 LEAP_OPTIONS = LeapOptions()
 """Options of all walks with leaps."""
 
 
-class WalkEnd(NamedTuple):
-    """Ends of walks, for each element."""
+class WalkEnds(NamedTuple):
+    """End of each walk."""
 
-    is_settled: np.ndarray  # whether the walk has settled, probably near a gait
-    section_states: np.ndarray  # (elements, 4 + 3 n)
-    outcome: np.ndarray  # STEPPED, or the failure that ended the walk
-    n_steps: np.ndarray
+    has_settled: np.ndarray  # whether the walk has settled, probably near a gait
+    section_states: np.ndarray  # (walks, 4 + 3 n)
+    walk_outcomes: np.ndarray  # STEPPED, or the failure that ended the walk
+    n_steps: np.ndarray  # number of steps of the walk
 
 
 def walk_until_settled(
-    ground: GroundBatch,
-    indices: np.ndarray,
+    wheel_batch: ContactWheelBatch,
+    wheel_indices: np.ndarray,
     section_states: np.ndarray,
-    options: LeapOptions = LEAP_OPTIONS,
-) -> WalkEnd:
-    """Walk from section states until each walk settles or ends, and return the ends."""
-    n_elements, n_numbers = len(indices), section_states.shape[1] - ground.n_legs
-    loose_ground = ground.with_loose_steps()
-    walk_end = WalkEnd(
-        np.zeros(n_elements, bool),
+    leap_options: LeapOptions = LEAP_OPTIONS,
+) -> WalkEnds:
+    """Return the ends of walks from full section states, each of which settles or fails."""
+    n_walks, n_continuous = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
+    loose_step_batch = wheel_batch.make_batch_for_walks()
+    walk_ends = WalkEnds(
+        np.zeros(n_walks, bool),
         section_states.copy(),
-        np.full(n_elements, int(Outcome.STEPPED)),
-        np.zeros(n_elements, int),
+        np.full(n_walks, int(Outcome.STEPPED)),
+        np.zeros(n_walks, int),
     )
-    active_positions, start_states = np.arange(n_elements), section_states
-    steps_of_rounds = (options.n_warmup_steps, *options.max_leaps * (options.steps_per_leap,))
-    for round_index, n_steps in enumerate(steps_of_rounds):
-        if not len(active_positions):
+    active_walks, start_states = np.arange(n_walks), section_states
+    n_steps_by_round = (
+        leap_options.n_warmup_steps,
+        *leap_options.max_leaps * (leap_options.steps_per_leap,),
+    )
+    for round_index, n_round_steps in enumerate(n_steps_by_round):
+        if not len(active_walks):
             break
-        walk_end.n_steps[active_positions] += n_steps
-        active_indices = indices[active_positions]
-        earlier_step = loose_ground.take_steps(active_indices, start_states, n_steps - 2)
-        failed_positions = np.flatnonzero(earlier_step.outcome != Outcome.STEPPED)
-        if len(failed_positions):
+        walk_ends.n_steps[active_walks] += n_round_steps
+        active_wheel_indices = wheel_indices[active_walks]
+        earlier_step = loose_step_batch.take_steps(
+            active_wheel_indices, start_states, n_round_steps - 2
+        )
+        failed_walks = np.flatnonzero(earlier_step.step_outcomes != Outcome.STEPPED)
+        if len(failed_walks):
             # A leap failed, or the tolerance of the first steps is too loose.
-            retried_step = (loose_ground if round_index else ground).take_steps(
-                active_indices[failed_positions],
-                walk_end.section_states[active_positions[failed_positions]],
-                n_steps - 2,
+            retried_step = (loose_step_batch if round_index else wheel_batch).take_steps(
+                active_wheel_indices[failed_walks],
+                walk_ends.section_states[active_walks[failed_walks]],
+                n_round_steps - 2,
             )
             earlier_step = StepQuantities(*map(np.array, earlier_step))
-            for step_array, retried_part in zip(earlier_step, retried_step, strict=True):
-                step_array[failed_positions] = retried_part
-        previous_step = loose_ground.take_steps(active_indices, earlier_step.section_states)
-        current_step = loose_ground.take_steps(active_indices, previous_step.section_states)
+            for step_array, retried_array in zip(earlier_step, retried_step, strict=True):
+                step_array[failed_walks] = retried_array
+        previous_step = loose_step_batch.take_steps(
+            active_wheel_indices, earlier_step.section_states
+        )
+        current_step = loose_step_batch.take_steps(
+            active_wheel_indices, previous_step.section_states
+        )
         step_outcomes = np.stack(
-            [earlier_step.outcome, previous_step.outcome, current_step.outcome]
+            [earlier_step.step_outcomes, previous_step.step_outcomes, current_step.step_outcomes]
         )
-        is_stepping = np.all(step_outcomes == Outcome.STEPPED, axis=0)
-        first_failure = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
-        walk_end.outcome[active_positions] = step_outcomes[
-            first_failure, np.arange(len(active_positions))
+        has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
+        first_failed_step = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
+        walk_ends.walk_outcomes[active_walks] = step_outcomes[
+            first_failed_step, np.arange(len(active_walks))
         ]
-        active_positions = active_positions[is_stepping]
-        walk_end.section_states[active_positions] = current_step.section_states[is_stepping]
-        walk_end.is_settled[active_positions], leap_vectors, fade_distance = _analyze_drift(
-            earlier_step.section_states[is_stepping],
-            previous_step.section_states[is_stepping],
-            current_step.section_states[is_stepping],
-            n_numbers,
-            options,
+        active_walks = active_walks[has_stepped]
+        walk_ends.section_states[active_walks] = current_step.section_states[has_stepped]
+        walk_ends.has_settled[active_walks], leap_vectors, fade_distance = _extrapolate_drift(
+            earlier_step.section_states[has_stepped],
+            previous_step.section_states[has_stepped],
+            current_step.section_states[has_stepped],
+            n_continuous,
+            leap_options,
         )
-        n_leaps_left = options.max_leaps - round_index
-        is_continued = ~walk_end.is_settled[active_positions] & (
-            (n_leaps_left > options.give_up_leaps_left)
-            | (fade_distance <= options.give_up_factor * options.max_leap * n_leaps_left)
+        n_leaps_left = leap_options.max_leaps - round_index
+        is_continued = ~walk_ends.has_settled[active_walks] & (
+            (n_leaps_left > leap_options.max_leaps_left_to_give_up)
+            | (
+                fade_distance
+                <= leap_options.max_fade_distance_ratio
+                * leap_options.max_leap_distance
+                * n_leaps_left
+            )
         )
-        active_positions, leap_vectors = (
-            step_array[is_continued] for step_array in (active_positions, leap_vectors)
+        active_walks, leap_vectors = (
+            step_array[is_continued] for step_array in (active_walks, leap_vectors)
         )
-        start_states = walk_end.section_states[active_positions]
+        start_states = walk_ends.section_states[active_walks]
         # A step places loaded feet on the slope, so that the end of a leap is a valid start.
-        start_states[:, :n_numbers] += leap_vectors
-    return walk_end
+        start_states[:, :n_continuous] += leap_vectors
+    return walk_ends
 
 
-def _analyze_drift(
+def _extrapolate_drift(
     earlier_states: np.ndarray,
     previous_states: np.ndarray,
     current_states: np.ndarray,
-    n_numbers: int,
-    options: LeapOptions,
+    n_continuous: int,
+    leap_options: LeapOptions,
 ) -> tuple[np.ndarray, ...]:
-    """Return whether walks have settled, the leap, and the distance at which the drift fades.
+    """Return whether each walk has settled, the leap of each walk, and the fade distance.
 
-    The arguments are three successive section states of each walk. The leap starts from the last
-    one. Leap and distance are zero if the legs' codes change.
+    The arguments are three successive section states of each walk, of which the first
+    `n_continuous` entries are continuous. A leap starts at the last of these states. The fade
+    distance is the distance to the predicted limit of the drift. Leap and fade distance are zero if
+    the legs' codes change.
     """
-    same_codes = np.all(
-        (earlier_states[:, n_numbers:] == current_states[:, n_numbers:])
-        & (previous_states[:, n_numbers:] == current_states[:, n_numbers:]),
+    has_same_leg_codes = np.all(
+        (earlier_states[:, n_continuous:] == current_states[:, n_continuous:])
+        & (previous_states[:, n_continuous:] == current_states[:, n_continuous:]),
         axis=1,
     )
-    earlier_change = (previous_states - earlier_states)[:, :n_numbers]
-    last_change = (current_states - previous_states)[:, :n_numbers]
+    earlier_change = (previous_states - earlier_states)[:, :n_continuous]
+    last_change = (current_states - previous_states)[:, :n_continuous]
     drift_per_step = np.abs(last_change).max(1)
     with np.errstate(all="ignore"):
         decay_rate = np.nan_to_num(
@@ -150,22 +168,24 @@ def _analyze_drift(
         )
         n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
         fade_distance = np.where(
-            drift_per_step < options.noise_drift, 0.0, np.abs(n_steps_to_fade) * drift_per_step
+            drift_per_step < leap_options.drift_noise_level,
+            0.0,
+            np.abs(n_steps_to_fade) * drift_per_step,
         )
         n_leap_steps = np.where(
             drift_per_step > 0.0,
-            np.minimum(n_steps_to_fade, options.max_leap / drift_per_step),
+            np.minimum(n_steps_to_fade, leap_options.max_leap_distance / drift_per_step),
             0.0,
         )
     # A drift that changes sign at each step leads to a gait of two steps.
-    is_settled = (
-        same_codes
-        & (fade_distance < options.settled_drift)
-        & (drift_per_step < options.settled_drift)
+    has_settled = (
+        has_same_leg_codes
+        & (fade_distance < leap_options.max_settled_drift)
+        & (drift_per_step < leap_options.max_settled_drift)
     )
-    has_leap = same_codes & ~is_settled & (decay_rate > 0.0)
+    has_leap = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
     return (
-        is_settled,
+        has_settled,
         np.where(has_leap, n_leap_steps, 0.0)[:, None] * last_change,
-        np.where(same_codes, fade_distance, 0.0),
+        np.where(has_same_leg_codes, fade_distance, 0.0),
     )

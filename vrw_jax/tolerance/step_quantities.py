@@ -13,26 +13,27 @@ QUANTITY_NAMES = (
     "dtheta_touchdown",
     "dL1_touchdown",
 )
-"""Names of the quantities: durations with two feet, one foot and no foot on the ground, s; step
-length, m; and the paper's section state.
-"""
+"""Names of the step quantities.
+
+These are durations with two feet, one foot and no foot on the ground (s), the step length (m) and
+the paper's section state after the step."""
 
 N_STEP_QUANTITIES = len(QUANTITY_NAMES)
 """Number of quantities of a step."""
 
 N_DURATIONS = 3
-"""Number of durations, which are the first quantities."""
+"""Number of durations, which are the first of the step quantities."""
 
 
-def _period_of_quantities(quantities: np.ndarray) -> np.ndarray:
-    """Return the duration of a step, the sum of its durations in each support, s."""
-    return quantities[..., 0] + quantities[..., 1] + quantities[..., 2]
+def _compute_step_period(step_quantities: np.ndarray) -> np.ndarray:
+    """Return the duration of a step, which is the sum of its first three quantities, s."""
+    return step_quantities[..., 0] + step_quantities[..., 1] + step_quantities[..., 2]
 
 
 MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "speed": lambda t: t[..., 3] / _period_of_quantities(t),
-    "period": _period_of_quantities,
-    "dls_fraction": lambda t: t[..., 0] / _period_of_quantities(t),
+    "speed": lambda t: t[..., 3] / _compute_step_period(t),
+    "period": _compute_step_period,
+    "dls_fraction": lambda t: t[..., 0] / _compute_step_period(t),
     "step_length": lambda t: t[..., 3],
     "duration_dls": lambda t: t[..., 0],
     "duration_single": lambda t: t[..., 1],
@@ -41,23 +42,36 @@ MEASURE_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "dtheta_touchdown": lambda t: t[..., 5],
     "dL1_touchdown": lambda t: t[..., 6],
 }
-"""Functions that compute the measures every model has, by their names in `measures.MEASURES`."""
+"""Functions from step quantities to the measures of every model, by names of
+`measures.MEASURES`."""
 
 COMPLEX_STEP = 1e-30
 """Imaginary step of complex-step derivatives, chosen so small that its square has no effect."""
 
 
-def evaluate_measures(names: Sequence[str], quantities: np.ndarray) -> np.ndarray:
-    """Return measures (elements, measures) from quantities (elements, 7); NaN if a step failed."""
-    with np.errstate(invalid="ignore"):
-        return np.stack([MEASURE_FUNCTIONS[name](quantities) for name in names], -1)
+def evaluate_measures(measure_names: Sequence[str], step_quantities: np.ndarray) -> np.ndarray:
+    """Return the measures (wheels, measures) that follow from step quantities (wheels, 7).
 
-
-def compute_measure_derivatives(names: Sequence[str], quantities: np.ndarray) -> np.ndarray:
-    """Return derivatives of measures with respect to quantities, (elements, measures, 7), by
-    complex steps.
+    The measures of a failed step are NaN.
     """
-    complex_quantities = quantities[:, None, :] + 1j * COMPLEX_STEP * np.eye(N_STEP_QUANTITIES)
+    with np.errstate(invalid="ignore"):
+        return np.stack(
+            [MEASURE_FUNCTIONS[measure_name](step_quantities) for measure_name in measure_names], -1
+        )
+
+
+def compute_measure_derivatives(
+    measure_names: Sequence[str], step_quantities: np.ndarray
+) -> np.ndarray:
+    """Return the derivatives of measures with respect to step quantities, (wheels, measures, 7).
+
+    The derivatives are computed by complex steps.
+    """
+    complex_quantities = step_quantities[:, None, :] + 1j * COMPLEX_STEP * np.eye(N_STEP_QUANTITIES)
     return np.stack(
-        [MEASURE_FUNCTIONS[name](complex_quantities).imag / COMPLEX_STEP for name in names], 1
+        [
+            MEASURE_FUNCTIONS[measure_name](complex_quantities).imag / COMPLEX_STEP
+            for measure_name in measure_names
+        ],
+        1,
     )

@@ -5,7 +5,7 @@ by the lower model's derivatives, is that model's error to second order. This is
 residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001) with the next model in place of the
 finer mesh. If the error is within the tolerance, the lower model's value is returned. Otherwise
 Newton's method leads from the end of that step to the gait with unilateral contact. If that gait is
-far from the lower model's, a walk leads to another one.
+far from the lower model's, a walk leads to another gait.
 """
 
 import time
@@ -19,14 +19,14 @@ import numpy as np
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, take_rows
 from vrw_jax.runtime import with_default_jax_settings
-from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, GroundBatch
+from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch
 from vrw_jax.tolerance.lower_fidelity import (
-    LowerFidelityGait,
+    LowerFidelityGaits,
     ModelIndex,
-    compute_static_contraction,
-    empty_gaits,
+    compute_static_leg_contraction,
     find_paper_gaits,
     find_rigid_gaits,
+    make_empty_gaits,
     replace_gaits,
 )
 from vrw_jax.tolerance.measure_result import MeasureResult, MeasureStatus
@@ -46,27 +46,28 @@ from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
 
 @dataclass(frozen=True)
-class RequestOptions:
+class MeasureRequestOptions:
     """Options of the search for a model and a gait that give measures to a tolerance.
 
-    - `error_safety_factor`: factor from the error estimate of one step to its bound, chosen because
-      the bound holds as long as corrections contract by 3/4;
-    - `very_tight_below`: tolerance of a measure below which steps have the very tight tolerance;
-    - `n_cold_starts`: number of starts, slow ones first, for wheels without a lower gait. It is
+    - `error_safety_factor`: bound of the error over its estimate from one step, chosen because the
+      bound holds as long as each correction is at most 3/4 as long as the previous correction;
+    - `min_tol_for_tight_steps`: smallest tolerance of a measure for which steps have the tight
+      tolerance. Below this value, they have the very tight tolerance;
+    - `n_cold_starts`: number of starts, slow starts first, for wheels without a lower gait. It is
       chosen because the first two starts lead 100 of 232 wheels to a gait, and the other starts
-      none of the rest;
-    - `max_distance_ratio`: largest distance of the gait with unilateral contact from the lower gait
-      that it continues, in first corrections. It is chosen because a contraction by a half moves at
-      most so far.
+      lead no other wheel to a gait;
+    - `max_gait_distance_ratio`: largest distance from the lower gait to the gait that continues it,
+      in lengths of the first correction. It is chosen because corrections that are halved each time
+      have a sum of twice the first correction.
     """
 
     error_safety_factor: float = 4.0
-    very_tight_below: float = 1e-7
+    min_tol_for_tight_steps: float = 1e-7
     n_cold_starts: int = 2
-    max_distance_ratio: float = 2.0
+    max_gait_distance_ratio: float = 2.0
 
 
-REQUEST_OPTIONS = RequestOptions()
+REQUEST_OPTIONS = MeasureRequestOptions()
 """Options of `vrw.measure_to_tolerance`."""
 
 
@@ -83,12 +84,13 @@ def measure_to_tolerance(
 ) -> MeasureResult:
     """Return measures of the wheel's gait on ground of this friction, each to within `tol`.
 
-    The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the one that
-    continues the paper's gait, or else the one that a walk from the paper's gait reaches;
-    `MeasureResult.why` names which. Fields of `params` and `friction` may have one batch
-    axis; each element is computed independently.
+    The reference is `UnilateralWheel(friction, stoppers=stoppers)`. Its gait is the gait that
+    continues the paper's gait. If there is none, it is the gait that a walk from the paper's gait
+    reaches. `MeasureResult.why` names the case. Fields of `params` and `friction` may have one
+    batch axis; the elements of a batch are independent.
 
-    This function cannot be used inside `jax.jit`, because it depends on values.
+    This function cannot be used inside `jax.jit`, because the models that it runs depend on the
+    numbers.
 
     Args:
         measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
@@ -99,7 +101,8 @@ def measure_to_tolerance(
         relative: whether `tol` is relative to the value itself.
         stoppers: stoppers of the reference wheel, "bilateral" or "one-sided".
         which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
-            contact that walks from a stated set of starts reach. It replaces the gait above.
+            contact that walks from a stated set of starts reach. By default, the gait is the one
+            described above.
 
     Returns:
         A `MeasureResult`.
@@ -117,338 +120,403 @@ def measure_to_tolerance(
     check_not_traced(
         "vrw.measure_to_tolerance", "it on numbers, and give a batch as arrays", params, friction
     )
-    names = check_names("measures", measures)
-    for name in names:
-        check_known_name(name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
-    if not names:
+    measure_names = check_names("measures", measures)
+    for measure_name in measure_names:
+        check_known_name(measure_name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    if not measure_names:
         raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
     tol, relative = check_positive("tol", tol), check_bool("relative", relative)
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    params, friction_by_wheel, shape = check_batch(params, convert_friction(friction))
-    rank = None if which is None else parse_gait_choice(which)
-    tolerance = (
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(
+        params, convert_friction(friction)
+    )
+    gait_rank = None if which is None else parse_gait_choice(which)
+    solver_tolerance = (
         STEP_TOLERANCES.tight_tolerance
-        if tol >= REQUEST_OPTIONS.very_tight_below
+        if tol >= REQUEST_OPTIONS.min_tol_for_tight_steps
         else STEP_TOLERANCES.very_tight_tolerance
     )
-    options = StepOptions(rtol=tolerance, atol=tolerance)
-    request = _MeasureRequest(
-        names,
+    step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
+    measure_request = _MeasureRequest(
+        measure_names,
         tol,
         relative,
-        GroundBatch.from_params(params, friction_by_wheel, stoppers, options),
+        ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options),
         params,
     )
-    if rank is None:
-        request.try_rigid_model()
-        request.try_paper_model()
-        request.walk_to_gaits()
+    if gait_rank is None:
+        measure_request.try_rigid_model()
+        measure_request.try_paper_model()
+        measure_request.walk_to_gaits()
     else:
-        request.select_by_rank(rank)
-    results = jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), request.results)
+        measure_request.select_gait_by_rank(gait_rank)
+    result_arrays = jax.tree.map(
+        lambda x: x.reshape(batch_shape + x.shape[1:]), measure_request.result_arrays
+    )
     return MeasureResult(
-        **results,
-        names=names,
+        **result_arrays,
+        names=measure_names,
         is_single=isinstance(measures, str),
         seconds=time.perf_counter() - start_seconds,
     )
 
 
-def check_batch(
+def broadcast_params_and_friction(
     params: WheelParams, friction: Any
 ) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
-    """Return wheels and friction broadcast to one batch axis, and their original batch shape."""
+    """Return wheels and friction with one batch axis, and the batch shape of the arguments.
+
+    Raise ValueError if the arguments have several batch axes or different lengths.
+    """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    shapes = {np.shape(argument_array) for argument_array in (*jax.tree.leaves(params), friction)}
-    shape = max(shapes, key=len)
-    if len(shape) > 1 or shapes - {(), shape}:
-        shapes_text = ", ".join(map(str, sorted(shapes - {()})))
+    argument_shapes = {
+        np.shape(argument_array) for argument_array in (*jax.tree.leaves(params), friction)
+    }
+    batch_shape = max(argument_shapes, key=len)
+    if len(batch_shape) > 1 or argument_shapes - {(), batch_shape}:
+        shapes_text = ", ".join(map(str, sorted(argument_shapes - {()})))
         raise ValueError(
             f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but a batch has one "
             "axis, the same for all: give one value for all, or one for each element."
         )
-    n_elements = shape[0] if shape else 1
-    broadcast_parameters = lambda argument_array: np.broadcast_to(
-        np.asarray(argument_array, float), (n_elements,)
+    n_wheels = batch_shape[0] if batch_shape else 1
+    broadcast_to_batch = lambda argument_array: np.broadcast_to(
+        np.asarray(argument_array, float), (n_wheels,)
     )
     return (
-        jax.tree.map(broadcast_parameters, params),
-        broadcast_parameters(friction),
-        shape,
+        jax.tree.map(broadcast_to_batch, params),
+        broadcast_to_batch(friction),
+        batch_shape,
     )
 
 
-RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "states")
-"""Names of the results that a gait determines."""
+GAIT_RESULT_NAMES = ("values", "errors", "model_errors", "numerical_errors", "states")
+"""Names of those results of a request that a gait determines."""
 
 
 class _MeasureRequest:
-    """Request for measures of a batch of wheels, with the results so far."""
+    """Request for measures of a batch of wheels, with the results that are known so far."""
 
     def __init__(
         self,
-        names: tuple[str, ...],
+        measure_names: tuple[str, ...],
         tol: float,
         relative: bool,
-        ground: GroundBatch,
+        wheel_batch: ContactWheelBatch,
         params: WheelParams,
-        options: RequestOptions = REQUEST_OPTIONS,
+        request_options: MeasureRequestOptions = REQUEST_OPTIONS,
     ) -> None:
-        n_elements, n_measures = len(ground.parameter_columns.T), len(names)
-        self.names, self.tol, self.relative, self.options = names, tol, relative, options
-        self.ground, self.params, self.lower_gaits = ground, params, empty_gaits(n_elements)
-        make_full_array = lambda fill_value: np.full((n_elements, n_measures), fill_value)
-        self.results = {
-            "values": make_full_array(np.nan),
-            "errors": make_full_array(np.inf),
-            "model_errors": make_full_array(np.nan),
-            "numerical_errors": make_full_array(np.inf),
-            "models": np.full(n_elements, ModelIndex.NONE),
-            "statuses": np.full(n_elements, int(MeasureStatus.NO_GAIT)),
-            "n_steps": np.zeros(n_elements, int),
-            "outcomes": np.full(n_elements, int(Outcome.NO_CYCLE_FOUND)),
-            "n_gaits": np.zeros(n_elements, int),
-            "states": ground.embed_states(np.arange(n_elements), np.zeros((n_elements, 3))),
+        n_wheels, n_measures = len(wheel_batch.parameter_columns.T), len(measure_names)
+        self.measure_names = measure_names
+        self.tol = tol
+        self.relative = relative
+        self.request_options = request_options
+        self.wheel_batch = wheel_batch
+        self.params = params
+        self.lower_gaits = make_empty_gaits(n_wheels)
+        fill_measure_array = lambda fill_value: np.full((n_wheels, n_measures), fill_value)
+        self.result_arrays = {
+            "values": fill_measure_array(np.nan),
+            "errors": fill_measure_array(np.inf),
+            "model_errors": fill_measure_array(np.nan),
+            "numerical_errors": fill_measure_array(np.inf),
+            "models": np.full(n_wheels, ModelIndex.NONE),
+            "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
+            "n_steps": np.zeros(n_wheels, int),
+            "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
+            "n_gaits": np.zeros(n_wheels, int),
+            "states": wheel_batch.embed_paper_states(np.arange(n_wheels), np.zeros((n_wheels, 3))),
         }
 
-    def compute_error_goal(self, values: np.ndarray) -> np.ndarray:
-        """Return the absolute tolerance of measures with about these values."""
-        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
+    def compute_error_goal(self, measure_values: np.ndarray) -> np.ndarray:
+        """Return the allowed absolute errors of measures of about this size."""
+        return self.tol * (
+            np.abs(measure_values) if self.relative else np.ones_like(measure_values)
+        )
 
-    @property
-    def find_indices_without_result(self) -> np.ndarray:
-        """Return the indices of the elements without a result."""
-        return np.flatnonzero(self.results["models"] == ModelIndex.NONE)
+    def find_unfinished_indices(self) -> np.ndarray:
+        """Return the indices of the wheels without a result."""
+        return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
 
     def try_rigid_model(self) -> None:
-        """Try the rigid gait for wheels whose legs are stiff enough, and record accepted
-        results.
-        """
+        """Check the rigid gaits of wheels with stiff legs, and record the accepted measures."""
         with np.errstate(all="ignore"):
-            indices = np.flatnonzero(
-                self.options.error_safety_factor * compute_static_contraction(self.params)
+            wheel_indices = np.flatnonzero(
+                self.request_options.error_safety_factor
+                * compute_static_leg_contraction(self.params)
                 <= self.tol
             )
-        if not len(indices):
+        if not len(wheel_indices):
             return
-        replace_gaits(self.lower_gaits, indices, find_rigid_gaits(self._take_wheels(indices)))
-        indices = indices[np.isfinite(self.lower_gaits.quantities[indices]).all(1)]
-        self._correct_from_gaits(indices, continues_iteration=False)
+        replace_gaits(
+            self.lower_gaits, wheel_indices, find_rigid_gaits(self._take_wheels(wheel_indices))
+        )
+        wheel_indices = wheel_indices[
+            np.isfinite(self.lower_gaits.step_quantities[wheel_indices]).all(1)
+        ]
+        self._correct_lower_gaits(wheel_indices, continues_iteration=False)
 
     def try_paper_model(self) -> None:
-        """Try the paper's gaits, or else the gaits with unilateral contact near them, and record
-        accepted results.
-        """
-        indices = self.find_indices_without_result
-        if not len(indices):
+        """Check the paper's gaits, refine the rejected gaits, and record the accepted measures."""
+        wheel_indices = self.find_unfinished_indices()
+        if not len(wheel_indices):
             return
         replace_gaits(
             self.lower_gaits,
-            indices,
-            find_paper_gaits(self._take_wheels(indices), self.ground.options),
+            wheel_indices,
+            find_paper_gaits(self._take_wheels(wheel_indices), self.wheel_batch.step_options),
         )
-        self._correct_from_gaits(
-            indices[self.lower_gaits.model_index[indices] != ModelIndex.NONE],
+        self._correct_lower_gaits(
+            wheel_indices[self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE],
             continues_iteration=True,
         )
 
     def walk_to_gaits(self) -> None:
-        """Walk to the gaits with unilateral contact of wheels without a result, and record them."""
-        indices = self.find_indices_without_result
-        has_lower_gait = self.lower_gaits.model_index[indices] != ModelIndex.NONE
-        lower_states = self.lower_gaits.section_state[indices[has_lower_gait]]
-        self._walk_and_record(
-            indices[has_lower_gait], lower_states, MeasureStatus.REACHED_FROM_LOWER_GAIT
+        """Walk with the wheels without a result, and record the measures of the gaits reached."""
+        wheel_indices = self.find_unfinished_indices()
+        has_lower_gait = self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE
+        lower_section_states = self.lower_gaits.section_states[wheel_indices[has_lower_gait]]
+        self._walk_and_record_gaits(
+            wheel_indices[has_lower_gait],
+            lower_section_states,
+            MeasureStatus.REACHED_FROM_LOWER_GAIT,
         )
-        indices = indices[~has_lower_gait]
-        for start in compute_walk_starts(self._take_wheels(indices))[: self.options.n_cold_starts]:
-            has_no_result = self.results["models"][indices] == ModelIndex.NONE
-            self._walk_and_record(
-                indices[has_no_result], start[has_no_result], MeasureStatus.REACHED_FROM_START
+        wheel_indices = wheel_indices[~has_lower_gait]
+        for walk_start in compute_walk_starts(self._take_wheels(wheel_indices))[
+            : self.request_options.n_cold_starts
+        ]:
+            has_no_result = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
+            self._walk_and_record_gaits(
+                wheel_indices[has_no_result],
+                walk_start[has_no_result],
+                MeasureStatus.REACHED_FROM_START,
             )
 
-    def select_by_rank(self, rank: int) -> None:
-        """Record the gait of this rank, slowest first, among the ends of walks from all starts."""
-        indices, starts = self.find_indices_without_result, compute_walk_starts(self.params)
-        gait_indices, gaits = self._walk_and_refine(
-            np.tile(indices, len(starts)), np.concatenate(starts)
-        )
-        selected_positions: list[int] = []
-        for index in indices:
-            distinct_gaits = _find_distinct_gaits(gaits, np.flatnonzero(gait_indices == index))
-            self.results["n_gaits"][index] = len(distinct_gaits)
-            if -len(distinct_gaits) <= rank < len(distinct_gaits):
-                selected_positions.append(distinct_gaits[rank])
-        self._record_gaits(
-            gait_indices, gaits, np.array(selected_positions, int), MeasureStatus.SELECTED_BY_RANK
-        )
-
-    def _take_wheels(self, indices: np.ndarray) -> WheelParams:
-        """Return the wheels at these indices."""
-        return jax.device_put(take_rows(self.params, indices))
-
-    def _correct_from_gaits(self, indices: np.ndarray, continues_iteration: bool) -> None:
-        """Take one step with unilateral contact from the lower gaits, and correct further if
-        `continues_iteration`.
+    def select_gait_by_rank(self, gait_rank: int) -> None:
+        """Record the measures of the gait of this rank, slowest first, among the gaits that walks
+        from all starts reach.
         """
-        lower_gaits = LowerFidelityGait(*(gait_array[indices] for gait_array in self.lower_gaits))
-        section_states = self.ground.embed_states(
-            indices, lower_gaits.section_state, lower_gaits.model_index == ModelIndex.RIGID
+        wheel_indices = self.find_unfinished_indices()
+        walk_starts = compute_walk_starts(self.params)
+        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
+            np.tile(wheel_indices, len(walk_starts)), np.concatenate(walk_starts)
         )
-        first_step = self.ground.take_steps(indices, section_states)
-        estimate = estimate_measures(
-            self.ground,
-            indices,
-            section_states,
-            first_step,
-            lower_gaits.newton_matrix,
-            lower_gaits.quantity_jacobian,
-            self.names,
-            self.ground.plane_indices(),
-        )
-        values = evaluate_measures(self.names, lower_gaits.quantities)
-        with np.errstate(all="ignore"):
-            correction_effect = (
-                np.abs(evaluate_measures(self.names, first_step.quantities) - values)
-                + estimate.correction_effect
+        selected_gait_positions: list[int] = []
+        for wheel_index in wheel_indices:
+            distinct_gait_positions = _find_distinct_gaits(
+                refined_gaits, np.flatnonzero(wheel_indices_of_gaits == wheel_index)
             )
-            error = values - estimate.values
-            sensitivity = np.abs(estimate.measure_jacobian @ lower_gaits.quantity_jacobian)
-            lower_defect_effect = np.einsum("ijk,ik->ij", sensitivity, np.abs(lower_gaits.defect))
+            self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_positions)
+            if -len(distinct_gait_positions) <= gait_rank < len(distinct_gait_positions):
+                selected_gait_positions.append(distinct_gait_positions[gait_rank])
+        self._record_gaits(
+            wheel_indices_of_gaits,
+            refined_gaits,
+            np.array(selected_gait_positions, int),
+            MeasureStatus.SELECTED_BY_RANK,
+        )
+
+    def _take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
+        """Return the wheels at these indices."""
+        return jax.device_put(take_rows(self.params, wheel_indices))
+
+    def _correct_lower_gaits(self, wheel_indices: np.ndarray, continues_iteration: bool) -> None:
+        """Take one step with unilateral contact from each lower gait, and record the accepted
+        measures.
+
+        If `continues_iteration`, the gaits near the rejected lower gaits are refined and recorded.
+        """
+        lower_gaits = LowerFidelityGaits(
+            *(gait_array[wheel_indices] for gait_array in self.lower_gaits)
+        )
+        section_states = self.wheel_batch.embed_paper_states(
+            wheel_indices, lower_gaits.section_states, lower_gaits.model_index == ModelIndex.RIGID
+        )
+        contact_step = self.wheel_batch.take_steps(wheel_indices, section_states)
+        measure_estimates = estimate_measures(
+            self.wheel_batch,
+            wheel_indices,
+            section_states,
+            contact_step,
+            lower_gaits.newton_matrix,
+            lower_gaits.step_quantity_jacobian,
+            self.measure_names,
+            self.wheel_batch.list_paper_state_indices(),
+        )
+        lower_measure_values = evaluate_measures(self.measure_names, lower_gaits.step_quantities)
+        with np.errstate(all="ignore"):
+            step_and_correction_effect = (
+                np.abs(
+                    evaluate_measures(self.measure_names, contact_step.step_quantities)
+                    - lower_measure_values
+                )
+                + measure_estimates.correction_effect_on_measures
+            )
+            model_error = lower_measure_values - measure_estimates.measure_values
+            section_state_sensitivity = np.abs(
+                measure_estimates.measure_jacobian @ lower_gaits.step_quantity_jacobian
+            )
+            lower_gait_error_effect = np.einsum(
+                "ijk,ik->ij", section_state_sensitivity, np.abs(lower_gaits.section_state_error)
+            )
             numerical_error = (
-                lower_defect_effect + estimate.numerical_error + estimate.missed_contact_error
+                lower_gait_error_effect
+                + measure_estimates.numerical_error_bound
+                + measure_estimates.missed_contact_error_bound
             )
             error_bound = (
-                np.abs(error)
-                + (self.options.error_safety_factor - 1.0) * correction_effect
+                np.abs(model_error)
+                + (self.request_options.error_safety_factor - 1.0) * step_and_correction_effect
                 + numerical_error
             )
-            is_accepted = estimate.same_codes & np.all(
-                error_bound <= self.compute_error_goal(values), axis=1
+            is_accepted = measure_estimates.has_same_leg_codes & np.all(
+                error_bound <= self.compute_error_goal(lower_measure_values), axis=1
             )
-        self.results["n_steps"][indices] += 1
-        self._record(
-            indices[is_accepted],
+        self.result_arrays["n_steps"][wheel_indices] += 1
+        self._record_results(
+            wheel_indices[is_accepted],
             lower_gaits.model_index[is_accepted],
             MeasureStatus.CHECKED_BY_ONE_STEP,
-            values[is_accepted],
+            lower_measure_values[is_accepted],
             error_bound[is_accepted],
-            error[is_accepted],
+            model_error[is_accepted],
             numerical_error[is_accepted],
             section_states[is_accepted],
         )
         rejected_positions = np.flatnonzero(
-            continues_iteration & ~is_accepted & estimate.same_codes
+            continues_iteration & ~is_accepted & measure_estimates.has_same_leg_codes
         )
-        gaits = refine_gaits(
-            self.ground,
-            indices[rejected_positions],
-            first_step.section_states[rejected_positions],
-            self.names,
+        refined_gaits = refine_gaits(
+            self.wheel_batch,
+            wheel_indices[rejected_positions],
+            contact_step.section_states[rejected_positions],
+            self.measure_names,
             self.compute_error_goal,
-            always_compares=False,
+            always_compares_tolerances=False,
         )
-        self.results["n_steps"][indices[rejected_positions]] += gaits.n_steps
-        distance = np.linalg.norm(
-            (gaits.section_states - section_states[rejected_positions])[
-                :, self.ground.plane_indices()
+        self.result_arrays["n_steps"][wheel_indices[rejected_positions]] += refined_gaits.n_steps
+        gait_distance = np.linalg.norm(
+            (refined_gaits.section_states - section_states[rejected_positions])[
+                :, self.wheel_batch.list_paper_state_indices()
             ],
             axis=1,
         )
-        max_distance = self.options.max_distance_ratio * np.linalg.norm(
-            estimate.correction[rejected_positions], axis=1
+        max_gait_distance = self.request_options.max_gait_distance_ratio * np.linalg.norm(
+            measure_estimates.newton_correction[rejected_positions], axis=1
         )
         self._record_gaits(
-            indices[rejected_positions],
-            gaits,
-            gaits.is_found & (distance <= max_distance),
+            wheel_indices[rejected_positions],
+            refined_gaits,
+            refined_gaits.is_found & (gait_distance <= max_gait_distance),
             MeasureStatus.CONTINUES_LOWER_GAIT,
         )
 
-    def _walk_and_record(
-        self, indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
+    def _walk_and_record_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
     ) -> None:
-        """Walk from the paper's section states, and record the gaits that the walks reach."""
-        gait_indices, gaits = self._walk_and_refine(indices, section_states)
-        self._record_gaits(gait_indices, gaits, gaits.is_found & gaits.is_attracting, status)
-
-    def _walk_and_refine(
-        self, indices: np.ndarray, section_states: np.ndarray
-    ) -> tuple[np.ndarray, RefinedGaits]:
-        """Walk from the paper's section states, and refine the gaits at the ends of the walks.
-
-        Return the index of the element of each gait, and the gaits.
+        """Walk from the paper's section states, and record the measures of the gaits that are
+        reached.
         """
-        walk_end = walk_until_settled(
-            self.ground, indices, self.ground.embed_states(indices, section_states)
+        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
+            wheel_indices, section_states
         )
-        np.add.at(self.results["n_steps"], indices, walk_end.n_steps)
+        self._record_gaits(
+            wheel_indices_of_gaits,
+            refined_gaits,
+            refined_gaits.is_found & refined_gaits.is_attracting,
+            status,
+        )
+
+    def _walk_and_refine_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray
+    ) -> tuple[np.ndarray, RefinedGaits]:
+        """Return the refined gaits at the ends of walks from the paper's section states.
+
+        The result is (wheel index of each gait, gaits).
+        """
+        walk_ends = walk_until_settled(
+            self.wheel_batch,
+            wheel_indices,
+            self.wheel_batch.embed_paper_states(wheel_indices, section_states),
+        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
         # A step cannot begin if a wheel has turned more than once in flight.
-        self.results["outcomes"][indices] = np.where(
-            np.isin(walk_end.outcome, (Outcome.STEPPED, Outcome.BAD_INPUT)),
+        self.result_arrays["outcomes"][wheel_indices] = np.where(
+            np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT)),
             Outcome.NO_CYCLE_FOUND,
-            walk_end.outcome,
+            walk_ends.walk_outcomes,
         )
-        gait_indices = indices[walk_end.is_settled]
-        gaits = refine_gaits(
-            self.ground,
-            gait_indices,
-            walk_end.section_states[walk_end.is_settled],
-            self.names,
+        wheel_indices_of_gaits = wheel_indices[walk_ends.has_settled]
+        refined_gaits = refine_gaits(
+            self.wheel_batch,
+            wheel_indices_of_gaits,
+            walk_ends.section_states[walk_ends.has_settled],
+            self.measure_names,
             self.compute_error_goal,
-            always_compares=True,
+            always_compares_tolerances=True,
         )
-        np.add.at(self.results["n_steps"], gait_indices, gaits.n_steps)
-        return gait_indices, gaits
+        np.add.at(self.result_arrays["n_steps"], wheel_indices_of_gaits, refined_gaits.n_steps)
+        return wheel_indices_of_gaits, refined_gaits
 
     def _record_gaits(
         self,
-        gait_indices: np.ndarray,
-        gaits: RefinedGaits,
-        selected_positions: np.ndarray,
+        wheel_indices_of_gaits: np.ndarray,
+        refined_gaits: RefinedGaits,
+        selected_gait_positions: np.ndarray,
         status: MeasureStatus,
     ) -> None:
-        """Record the selected gaits with unilateral contact. `gait_indices` are the indices of
-        their elements.
-        """
-        indices = gait_indices[selected_positions]
-        gaits = RefinedGaits(*(gait_array[selected_positions] for gait_array in gaits))
-        self._record(
-            indices,
-            np.full(len(indices), ModelIndex.UNILATERAL),
+        """Record the measures of the selected gaits with unilateral contact."""
+        wheel_indices = wheel_indices_of_gaits[selected_gait_positions]
+        refined_gaits = RefinedGaits(
+            *(gait_array[selected_gait_positions] for gait_array in refined_gaits)
+        )
+        self._record_results(
+            wheel_indices,
+            np.full(len(wheel_indices), ModelIndex.UNILATERAL),
             status,
-            gaits.values,
-            gaits.errors,
-            evaluate_measures(self.names, self.lower_gaits.quantities[indices]) - gaits.values,
-            gaits.errors,
-            gaits.section_states,
+            refined_gaits.measure_values,
+            refined_gaits.error_bounds,
+            evaluate_measures(self.measure_names, self.lower_gaits.step_quantities[wheel_indices])
+            - refined_gaits.measure_values,
+            refined_gaits.error_bounds,
+            refined_gaits.section_states,
         )
 
-    def _record(
+    def _record_results(
         self,
-        indices: np.ndarray,
+        wheel_indices: np.ndarray,
         model_index: np.ndarray,
         status: MeasureStatus,
-        *results: np.ndarray,
+        *gait_results: np.ndarray,
     ) -> None:
-        """Record results of some elements, in the order of RESULT_NAMES, with the model and the
-        method.
+        """Record the results of some wheels, in the order of `GAIT_RESULT_NAMES`, with their model
+        and method.
         """
-        for name, values in zip(RESULT_NAMES, results, strict=True):
-            self.results[name][indices] = values
-        self.results["models"][indices], self.results["statuses"][indices] = model_index, status
-        self.results["outcomes"][indices] = Outcome.STEPPED
+        for result_name, result_values in zip(GAIT_RESULT_NAMES, gait_results, strict=True):
+            self.result_arrays[result_name][wheel_indices] = result_values
+        self.result_arrays["models"][wheel_indices] = model_index
+        self.result_arrays["statuses"][wheel_indices] = status
+        self.result_arrays["outcomes"][wheel_indices] = Outcome.STEPPED
 
 
-def _find_distinct_gaits(gaits: RefinedGaits, candidate_positions: np.ndarray) -> list[int]:
-    """Return the positions of attracting gaits that differ by more than their errors, slowest
-    first.
+def _find_distinct_gaits(refined_gaits: RefinedGaits, candidate_positions: np.ndarray) -> list[int]:
+    """Return the positions of the different attracting gaits, slowest first.
+
+    Two gaits are different if a measure differs by more than the sum of both error bounds.
     """
     distinct_positions: list[int] = []
-    is_candidate = (gaits.is_found & gaits.is_attracting)[candidate_positions]
-    for candidate in candidate_positions[is_candidate].tolist():
-        differences = np.abs(gaits.values[candidate] - gaits.values[distinct_positions])
-        errors = gaits.errors[candidate] + gaits.errors[distinct_positions]
-        if np.all(np.any(differences > errors, axis=1)):
-            distinct_positions.append(candidate)
-    return sorted(distinct_positions, key=lambda position: gaits.speed[position])
+    is_attracting_gait = (refined_gaits.is_found & refined_gaits.is_attracting)[candidate_positions]
+    for candidate_position in candidate_positions[is_attracting_gait].tolist():
+        measure_differences = np.abs(
+            refined_gaits.measure_values[candidate_position]
+            - refined_gaits.measure_values[distinct_positions]
+        )
+        error_bound_sums = (
+            refined_gaits.error_bounds[candidate_position]
+            + refined_gaits.error_bounds[distinct_positions]
+        )
+        if np.all(np.any(measure_differences > error_bound_sums, axis=1)):
+            distinct_positions.append(candidate_position)
+    return sorted(
+        distinct_positions, key=lambda gait_position: refined_gaits.walking_speed[gait_position]
+    )
