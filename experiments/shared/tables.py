@@ -65,7 +65,7 @@ def describe_run(module: str) -> str:
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     return (
         f"{SOURCE_LINE_START} `python -m {module}`; commit: `{commit or 'unknown'}`; machine: "
-        f"{describe_processor()}; date: `{time.strftime('%Y-%m-%d', time.gmtime())}`."
+        f"`{describe_processor()}`; date: `{time.strftime('%Y-%m-%d', time.gmtime())}`."
     )
 
 

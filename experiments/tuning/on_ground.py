@@ -20,8 +20,8 @@ from experiments.shared.wheels import WIDE_BOX
 FRICTION = 0.7
 PAPER_MODEL_BOX = WIDE_BOX  # Above c = 215 the rear foot lifts off at the landing.
 BOX = WIDE_BOX | {"damping": (20.0, 400.0)}
-DAMPING = 300.0  # of the second start on real ground, else Table 1; the first: the paper's optimum
-TOLERANCE, MAX_EVALUATIONS = 1e-4, 30  # gaits of one climb
+DAMPING = 300.0  # of the second start with unilateral contact; the other parameters are Table 1's
+TOLERANCE, MAX_EVALUATIONS = 1e-4, 30  # gaits of one call of tune
 OPTIONS = {"rtol": 1e-9, "atol": 1e-9}  # of steps
 FIELDS = ("scene", *BOX, "ending", "held_by", "dls_fraction", "period", "speed", "slip", "radius")
 
@@ -70,21 +70,21 @@ def main() -> None:
     paper = vrw.tune(vrw.WheelParams(), "dls_fraction", list(BOX), PAPER_MODEL_BOX)
     held_values = "; ".join(f"{a.name} at {a.limit:.4g}" for a in paper.active)
     row(
-        "paper's optimum, paper's rung",
+        "paper's optimum, paper's model",
         paper.params,
         measure_with_paper_model(paper.params),
         paper.status.name,
         held_values,
     )
     row(
-        "paper's optimum, real ground",
+        "paper's optimum, unilateral contact",
         paper.params,
         measure_with_contact(paper.params, paper.cycle.section_state),
     )
-    climbed = []
+    tuned_results = []
     starts = {
-        "climbed from the paper's optimum": paper.params,
-        f"climbed from c = {DAMPING:g}": vrw.WheelParams(damping=DAMPING),
+        "tuned from the paper's optimum": paper.params,
+        f"tuned from c = {DAMPING:g}": vrw.WheelParams(damping=DAMPING),
     }
     for scene, start in starts.items():
         tuned = vrw.tune(
@@ -95,9 +95,13 @@ def main() -> None:
         result = measure_with_contact(tuned.params, tuned.cycle.section_state)
         print(tuned, flush=True)
         row(scene, tuned.params, result, tuned.status.name, held_values)
-        climbed.append(tuned)
-    best = max(climbed, key=lambda tuned: tuned.value)
-    row("optimum on real ground, paper's rung", best.params, measure_with_paper_model(best.params))
+        tuned_results.append(tuned)
+    best = max(tuned_results, key=lambda tuned: tuned.value)
+    row(
+        "optimum with unilateral contact, paper's model",
+        best.params,
+        measure_with_paper_model(best.params),
+    )
     write_table(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
     show_table(
         "studies/double_support.md",
