@@ -168,7 +168,7 @@ def test_a_mean_that_few_walks_dominate_has_no_error_estimate():
     params = vrw.WheelParams(damping=109.66, stiffness=524.94, slope=0.31148)
     passage = vrw.first_passage(params, 0.008915, n_walkers=1024, max_steps=10_000)
     assert float(passage.error) == np.inf
-    assert passage.ending == "A few sampled walks dominate the mean: its error is unknown."
+    assert "The error is unknown" in passage.ending
 
 
 @pytest.mark.slow
@@ -181,6 +181,20 @@ def test_failures_are_counted_if_few_sampled_walks_dominate():
     error = float(passage.error)
     assert error < 0.2 * float(passage.mean_steps)
     assert abs(float(passage.mean_steps) - counted_mean) < error + counted_error
+
+
+def test_failures_that_no_large_slope_causes_are_counted():
+    """A landing that releases the rear foot precedes one failure in ten of this wheel.
+
+    Importance sampling alone gives 321.0 steps with a stated error of 1.8 %.
+    """
+    params = vrw.WheelParams(damping=214.656184, stiffness=481.549933, slope=0.286840858)
+    # Counts: 50,741 failures after the start's effect has decayed.
+    passage = vrw.first_passage(params, 0.0101333984, seed=2, tol=0.05)
+    assert set(passage.end_names) == {"TOUCHDOWN_BEFORE_STOPPER", "FELL_BACK"}
+    counted_mean, counted_error = 287.53, 0.0114 * 287.53
+    assert float(passage.error) < 0.06 * counted_mean
+    assert abs(float(passage.mean_steps) - counted_mean) < float(passage.error) + counted_error
 
 
 def test_no_failure_is_an_ending_and_not_an_error():

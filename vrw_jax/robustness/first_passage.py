@@ -41,7 +41,10 @@ class PassageStatus(StatusCode):
     CONVERGED = 0, "The error estimate is within the tolerance."
     TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."
     NO_FAILURE = 2, "No walk failed, however uneven its slopes were made: the mean has no estimate."
-    UNKNOWN_ERROR = 3, "A few sampled walks dominate the mean: its error is unknown."
+    UNKNOWN_ERROR = (
+        3,
+        "The error is unknown: sampled walks miss failures, or a few of them dominate the mean.",
+    )
 
 
 class FirstPassage(AbstractPrintable):
@@ -58,7 +61,7 @@ class FirstPassage(AbstractPrintable):
     - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays.
       With samples, its error is some hundredths;
     - `error`: error estimate of `mean_steps`. With samples, it is half a confidence interval of 99
-      %, and infinite if a few walks dominate the mean;
+      %. It is infinite if sampled walks miss failures, or if a few of them dominate the mean;
     - `states`: states of the quasi-stationary distribution. With quadrature, they are squared rates
       with the stance leg vertical, 1/s^2, shape (n, 1). With samples, they are section states with
       the slope as last component;
