@@ -254,6 +254,14 @@ def test_a_gradient_of_the_papers_wheel_is_a_central_difference():
     assert abs(gradient - (ends[0] - ends[1]) / (2.0 * h)) < error
 
 
+def test_a_derivative_without_failing_walks_raises_one_sentence():
+    mean_steps = lambda slope_sd: (
+        vrw.first_passage(vrw.WheelParams(), slope_sd, n_walkers=64).mean_steps
+    )
+    with pytest.raises(ValueError, match="no sampled walk failed with slope_sd 1e-05 rad"):
+        jax.grad(mean_steps)(1e-5)
+
+
 def test_sampled_means_inside_jit_are_one_sentence():
     mean_steps = lambda damping: (
         vrw.first_passage(vrw.WheelParams(damping=damping), 0.01).mean_steps

@@ -125,13 +125,21 @@ def _draw_failing_walks(
     walk_density: GaussianMixture,
     gradient_options: PassageGradientOptions,
 ) -> FailingWalks:
-    """Return failing walks with equal weights, resampled from rounds of biased walks."""
+    """Return failing walks with equal weights, resampled from rounds of biased walks.
+
+    Raise ValueError if no walk fails in its last step.
+    """
     n_walks, effective_size = gradient_options.n_failing_walks, 0.0
     rounds: list[tuple[np.ndarray, np.ndarray]] = []
     while effective_size < n_walks and len(rounds) < gradient_options.max_sampling_rounds:
         rounds.append(run_biased_walks(walker_groups, walk_density))
         slope_deviations, weights = map(np.concatenate, zip(*rounds, strict=True))
         effective_size = np.sum(weights) ** 2 / np.sum(weights**2) if np.any(weights) else 0.0
+    if effective_size == 0.0:
+        raise ValueError(
+            f"no sampled walk failed with slope_sd {walker_groups.slope_sd:g} rad, so that the "
+            "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
+        )
     walk_indices = walker_groups.random.choice(len(weights), n_walks, p=weights / np.sum(weights))
     walker_indices = walk_indices % len(walker_groups.states)
     radii = np.linalg.norm(slope_deviations[walk_indices], axis=1)
