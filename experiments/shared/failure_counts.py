@@ -1,0 +1,65 @@
+"""Plain counts of failures on random slopes, with which first passages are compared."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+import vrw_jax as vrw
+from vrw_jax.simulation import ModelLike
+
+NORMAL_QUANTILE = 2.576
+"""Half width of a 99 % confidence interval, in standard deviations of a normal distribution."""
+
+
+class FailureCount(NamedTuple):
+    """Number of failures among the counted steps."""
+
+    n_failures: int
+    n_counted: int  # steps after the effect of the start has decayed
+    n_steps: int  # all steps
+
+    @property
+    def mean_steps(self) -> float:
+        """Return the mean number of steps until a failure."""
+        return self.n_counted / self.n_failures
+
+    @property
+    def relative_error(self) -> float:
+        """Return half the relative width of a 99 % confidence interval of `mean_steps`."""
+        return float(NORMAL_QUANTILE / np.sqrt(self.n_failures))
+
+
+def count_failures(
+    params: vrw.WheelParams,
+    slope_sd: float,
+    n_failures: int,
+    *,
+    seed: int,
+    n_forgetting_steps: int = 12,
+    n_walkers: int = 16384,
+    model: ModelLike | None = None,
+) -> FailureCount:
+    """Return the count of walks side by side, until at least `n_failures` failures are counted.
+
+    All walks begin at the gait. A failed walk continues as a copy of another one, so that the walks
+    have the quasi-stationary distribution after `n_forgetting_steps` steps. The count begins then.
+    """
+    random, mean_slope = np.random.default_rng(seed), float(params.slope)
+    cycle: Any = vrw.limit_cycle(params, model=model)
+    states = np.tile(np.asarray(cycle.section_state), (n_walkers, 1))
+    slopes = np.full(n_walkers, mean_slope)
+    options = vrw.StepOptions(rtol=1e-6, atol=1e-6)
+    n_failed, n_rounds = 0, 0
+    while n_failed < n_failures:
+        next_slopes = mean_slope + slope_sd * random.standard_normal(n_walkers)
+        wheels = eqx.tree_at(lambda p: p.slope, params, np.stack([slopes, next_slopes], 1))
+        result = vrw.step_batch(wheels, states, model=model, options=options)
+        is_alive = result.outcome == vrw.Outcome.STEPPED
+        n_failed += int(np.sum(~is_alive)) if n_rounds >= n_forgetting_steps else 0
+        n_rounds += 1
+        sources = np.arange(n_walkers)
+        sources[~is_alive] = random.choice(sources[is_alive], np.sum(~is_alive))
+        states, slopes = result.section_state[sources], next_slopes[sources]
+    n_counted = (n_rounds - n_forgetting_steps) * n_walkers
+    return FailureCount(n_failed, n_counted, n_rounds * n_walkers)
