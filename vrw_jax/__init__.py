@@ -79,7 +79,11 @@ from vrw_jax.tolerance import (
     multifidelity_mean,
 )
 from vrw_jax.tuning import TuneResult, tune
-from vrw_jax.validation import RENAMED_PACKAGE_NAMES, describe_renamed_attribute, suggest_name
+from vrw_jax.validation import (
+    PRESENT_PACKAGE_NAME_BY_OLD_NAME,
+    describe_renamed_attribute,
+    format_name_suggestion,
+)
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, ParameterSet, WheelParams, parameter_sets
 
@@ -172,10 +176,11 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
-    if sentence := describe_renamed_attribute("vrw_jax", name, RENAMED_PACKAGE_NAMES):
+    if sentence := describe_renamed_attribute("vrw_jax", name, PRESENT_PACKAGE_NAME_BY_OLD_NAME):
         raise AttributeError(sentence)
     raise AttributeError(
-        f"vrw_jax has no {name!r}{suggest_name(name, __all__)}: dir(vrw_jax) lists what it has."
+        f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists what "
+        "it has."
     )
 
 

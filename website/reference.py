@@ -184,5 +184,5 @@ _GROUPS = (
 
 
 def _meaning(measure: Measure) -> str:
-    breaks = f" Below zero: {measure.violation}." if measure.violation else ""
+    breaks = f" Below zero: {measure.violation_text}." if measure.violation_text else ""
     return f"{measure.long_name[0].upper()}{measure.long_name[1:]}. {measure.description}{breaks}"

@@ -252,8 +252,8 @@ def growth() -> Rows:
             by_x = np.asarray(by_x)
             by_damping = by_x @ by_damping + np.asarray(by_params.damping)
             by_start = by_x @ by_start
-            _, rear = transitions.landing_forces(
-                params.symbols(), transitions.land(params.symbols(), *values_array)
+            _, rear = transitions.compute_landing_forces(
+                params.symbols(), transitions.resolve_landing(params.symbols(), *values_array)
             )
             lowest.append(float(rear.normal))
             values_array = np.asarray(vrw.return_map(params, values_array))

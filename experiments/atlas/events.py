@@ -16,7 +16,7 @@ import vrw_jax as vrw
 from experiments.speed import peers
 from experiments.speed.peers import hy
 from vrw_jax import Outcome
-from vrw_jax.numerics import take_rows
+from vrw_jax.numerics import select_tree_rows
 from vrw_jax.wheel import Motion, Symbols, dynamics, geometry, transitions
 
 Rows = Iterator[dict[str, object]]
@@ -96,13 +96,13 @@ def phases() -> tuple[Phase, Phase, Phase]:
     sin, cos = hy.sin(th), hy.cos(th)
 
     x1, rear_normal, *_ = peers.double_support(sin, cos, w, hy.par[10], P)
-    circle = geometry.double_support_circle(s, hy.par[10], sin, cos)
-    m = Motion(sin, cos, circle.L1, circle.L2, w, circle.G1 * w, circle.G2 * w)
+    circle = geometry.compute_double_support_circle(s, hy.par[10], sin, cos)
+    m = Motion(sin, cos, circle.L1, circle.L2, w, circle.dL1_dtheta * w, circle.dL2_dtheta * w)
     a = dynamics.Acceleration(
-        x1, circle.G1 * x1 - circle.L1 * w * w, circle.G2 * x1 - circle.L2 * w * w
+        x1, circle.dL1_dtheta * x1 - circle.L1 * w * w, circle.dL2_dtheta * x1 - circle.L2 * w * w
     )
-    rear = dynamics.rear_foot_force(s, m, a)
-    height = geometry.landing_foot_height
+    rear = dynamics.compute_rear_foot_force(s, m, a)
+    height = geometry.compute_landing_foot_height
     falls = lambda m, fore: [m.dtheta, m.L1 - s.a, m.L2 - s.a, fore.normal]
     dls = Phase(
         [(th, w), (w, x1)],
@@ -110,7 +110,7 @@ def phases() -> tuple[Phase, Phase, Phase]:
             rear_normal,
             s.L0 - m.L2,
             height(s, m),
-            *falls(m, dynamics.fore_foot_force(s, m, a, rear)),
+            *falls(m, dynamics.compute_fore_foot_force(s, m, a, rear)),
         ],
         (
             Outcome.STEPPED,
@@ -123,13 +123,13 @@ def phases() -> tuple[Phase, Phase, Phase]:
     m, a = Motion(sin, cos, L1, L2, w, v1, v2), dynamics.Acceleration(*x)
     sls1 = Phase(
         [(th, w), (L1, v1), (L2, v2), (w, x[0]), (v1, x[1]), (v2, x[2])],
-        [s.L0 - L2, height(s, m), *falls(m, dynamics.fore_foot_force(s, m, a))],
+        [s.L0 - L2, height(s, m), *falls(m, dynamics.compute_fore_foot_force(s, m, a))],
         (Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER, *FALLS),
     )
     z = peers.single_support_2(sin, cos, L1, w, v1, P)
     m = Motion(sin, cos, L1, s.L0, w, v1, 0.0 * v1)
     a = dynamics.Acceleration(*z, 0.0 * z[0])
-    fore = dynamics.fore_foot_force(s, m, a)
+    fore = dynamics.compute_fore_foot_force(s, m, a)
     sls2 = Phase(
         [(th, w), (L1, v1), (w, z[0]), (v1, z[1])],
         [height(s, m), w, L1 - s.a, fore.normal],
@@ -142,9 +142,11 @@ def step_by_isolated_roots(created: tuple, params: vrw.WheelParams, starts: np.n
     """Outcome, durations and section state (zeros where it failed) of one step of each lane."""
     dls, sls1, sls2 = created
     packed = peers.pack(params)
-    landing = transitions.land(params.symbols(), *starts.T)
-    stays = np.asarray(landing.keeps_rear_foot)
-    posture = np.stack([landing.theta, *landing.motion[2:]], 1)  # theta, L1, L2 and rates
+    landing = transitions.resolve_landing(params.symbols(), *starts.T)
+    stays = np.asarray(landing.is_rear_foot_planted)
+    posture = np.stack(
+        [landing.theta_after, *landing.motion_after[2:]], 1
+    )  # theta, L1, L2 and rates
     outcomes, durations, ends = np.zeros(len(starts), int), *np.zeros((2, len(starts), 3))
     for lane, values in enumerate(packed):
         P = tuple(values)
@@ -221,7 +223,7 @@ def compare_dips(cases: int, done: int) -> Rows:
         )
         gave_up = (mine == Outcome.SOLVER_FAILED) | (tight == Outcome.SOLVER_FAILED)
         requested = np.flatnonzero((mine != tight) & ~gave_up)
-        few_items = take_rows(
+        few_items = select_tree_rows(
             jax.tree.map(lambda x: np.broadcast_to(x, N_STARTS), params), requested
         )
         codes = (

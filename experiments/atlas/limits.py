@@ -19,7 +19,14 @@ from experiments.speed import peers
 from vrw_jax import Outcome
 from vrw_jax.hybrid import MonitoredFunctions, integrate_phase
 from vrw_jax.models.viscoelastic import make_diffrax_phase
-from vrw_jax.wheel import Motion, Symbols, dynamics, landing_foot_height, make_phases, transitions
+from vrw_jax.wheel import (
+    Motion,
+    Symbols,
+    compute_landing_foot_height,
+    dynamics,
+    make_phases,
+    transitions,
+)
 
 # --- A leg of first order: SLS-I without the airborne leg's own inertia.
 
@@ -45,7 +52,7 @@ def first_order_rates(s: Symbols, y: jax.Array, ddL2: jax.Array | float = 0.0) -
     Forces are linear in L2': with L2'' known the three rows of M q'' = f give theta'', L1'', L2'.
     """
     theta, L1, L2, dtheta, dL1 = y
-    value_at = lambda dL2: dynamics.equation_terms(
+    value_at = lambda dL2: dynamics.compute_equation_terms(
         s, Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
     )
     zero = 0.0 * theta
@@ -72,7 +79,7 @@ def after_the_layer(s: Symbols, state: jax.Array, rates: Callable) -> jax.Array:
     The difference of L2' from its slow value decays at the rate c (M^-1)_33. It changes rates and
     positions along M^-1 e_3, as an impact does.
     """
-    M = dynamics.mass_matrix(s, state[1], state[2])
+    M = dynamics.compute_mass_matrix(s, state[1], state[2])
     zero = 0.0 * state[0]
     matrix = [[M.M11, M.M12, M.M13], [M.M12, M.M22, M.M23], [M.M13, M.M23, M.M33]]
     matrix = jnp.array([[zero + entry for entry in row] for row in matrix])
@@ -91,14 +98,14 @@ def step_with_leg(
 ) -> tuple:
     """Section state and durations, and solver steps and outcome of SLS-I, of a step."""
     s = params.symbols()
-    landing = transitions.land(s, *x)
+    landing = transitions.resolve_landing(s, *x)
     values_array = jnp.asarray(True)
-    phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+    phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
     run = lambda phase, y: integrate_phase(
         phase.vector_field, phase.guards, y, values_array, options
     )
-    first = run(dls, jnp.stack([landing.theta, landing.motion.dtheta]))
+    first = run(dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]))
     m = dls.unpack_motion(first.state)
     state = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
     if leg == "full":
@@ -110,11 +117,11 @@ def step_with_leg(
         start = after_the_layer(s, state, rates) if leg == "corrected" else state[:5]
 
         def guards(y: jax.Array) -> jax.Array:
-            return jnp.stack([s.L0 - y[2], landing_foot_height(s, full(y)), y[3]])
+            return jnp.stack([s.L0 - y[2], compute_landing_foot_height(s, full(y)), y[3]])
 
         second = integrate_phase(rates, MonitoredFunctions(guards, 3), start, values_array, options)
         motion = full(second.state)
-    hit = transitions.hit_stopper(s, motion).motion
+    hit = transitions.resolve_stopper_collision(s, motion).motion_after
     third = run(sls2, jnp.stack([second.state[0], hit.L1, hit.dtheta, hit.dL1]))
     theta, _, dtheta, dL1 = third.state
     durations = jnp.stack([first.duration, second.duration, third.duration])
@@ -132,8 +139,11 @@ def first_order() -> Rows:
     for rate, wheel in LIGHT.items():
         params = vrw.WheelParams(**wheel)
         params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LANES,)), params)
-        landing = transitions.land(params.symbols(), *START)
-        y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)[:1]
+        landing = transitions.resolve_landing(params.symbols(), *START)
+        y = np.stack(
+            [landing.theta_after + 0.0 * landing.motion_after.dtheta, landing.motion_after.dtheta],
+            1,
+        )[:1]
         reference = peers.Heyoka(1e-15)(y, peers.pack(params)[:1])[0, :6]
         for leg, run in runs.items():
             call = lambda run=run, params=params: jax.block_until_ready(
@@ -235,11 +245,11 @@ def settle_walk(
 def upright_rate(slope: float, start: np.ndarray) -> float:
     """Rate at which double support leaves its upright equilibrium, 1/s; NaN without one."""
     s = vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope).symbols()
-    landing = transitions.land(s, *start)
-    double_support = make_phases(s, landing.distance, stop_at_lift_off=True)[0]
+    landing = transitions.resolve_landing(s, *start)
+    double_support = make_phases(s, landing.foot_distance, stop_at_lift_off=True)[0]
     field = make_diffrax_phase(double_support, records_margins=False).vector_field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
-    places = float(landing.theta) + np.linspace(0.0, 1.0, 2001)
+    places = float(landing.theta_after) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0
     if not np.any(rises):
         return np.nan

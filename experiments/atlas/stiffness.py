@@ -53,8 +53,11 @@ def measure_over_rates() -> Rows:
     for axis, value in places:
         wheel = stiff_wheel(axis, value)
         params = vrw.WheelParams(**{name: np.full(1, x) for name, x in wheel.items()})
-        landing = transitions.land(params.symbols(), *START)
-        y = np.stack([landing.theta + 0.0 * landing.motion.dtheta, landing.motion.dtheta], 1)
+        landing = transitions.resolve_landing(params.symbols(), *START)
+        y = np.stack(
+            [landing.theta_after + 0.0 * landing.motion_after.dtheta, landing.motion_after.dtheta],
+            1,
+        )
         packed = peers.pack(params)
         reference = peers.Heyoka(1e-15)(y, packed)[0, :6]
         peer = lambda steps, *more, y=y, packed=packed: (

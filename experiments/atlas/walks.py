@@ -32,7 +32,7 @@ def with_damping(
     The energy is a component of the state, so the solver controls its error.
     """
     s = params.symbols()
-    power = lambda y: dynamics.damping_power(s, phase.unpack_motion(y))
+    power = lambda y: dynamics.compute_damping_power(s, phase.unpack_motion(y))
     field = lambda y: jnp.append(phase.vector_field(y[:-1]), power(y[:-1]))
     watched = MonitoredFunctions(lambda y: phase.guards.evaluate(y[:-1]), phase.guards.n_guards)
     zero = 0.0 * start[:1]
@@ -49,24 +49,31 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     dampers take - energy at the next touchdown.
     """
     s = params.symbols()
-    before = transitions.motion_before_landing(s, *x)
-    landing = transitions.land(s, *x)
-    phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+    before = transitions.compute_motion_before_landing(s, *x)
+    landing = transitions.resolve_landing(s, *x)
+    phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
     dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
-    start = jnp.stack([landing.theta, landing.motion.dtheta])
+    start = jnp.stack([landing.theta_after, landing.motion_after.dtheta])
     first, lost_1, m = with_damping(dls, start, params, options)
     start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
     second, lost_2, m = with_damping(sls1, start, params, options)
-    hit = transitions.hit_stopper(s, m)
-    start = jnp.stack([second.state[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
+    hit = transitions.resolve_stopper_collision(s, m)
+    start = jnp.stack(
+        [second.state[0], hit.motion_after.L1, hit.motion_after.dtheta, hit.motion_after.dL1]
+    )
     third, lost_3, m = with_damping(sls2, start, params, options)
     ends = first, second, third
-    outcomes = [p.outcome_of_guard(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)]
+    outcomes = [
+        p.select_guard_outcome(e.guard, e.timed_out) for p, e in zip(phases, ends, strict=True)
+    ]
     step_result = jnp.all(jnp.stack(outcomes) == Outcome.STEPPED)
     theta, _, dtheta, dL1, _ = third.state
-    work = (s.Mt) * s.g * landing.distance * s.sin_phi
-    lost_values = landing.energy_lost + hit.energy_lost + lost_1 + lost_2 + lost_3
-    change = dynamics.mechanical_energy(s, m).total - dynamics.mechanical_energy(s, before).total
+    work = (s.Mt) * s.g * landing.foot_distance * s.sin_phi
+    lost_values = landing.energy_loss + hit.energy_loss + lost_1 + lost_2 + lost_3
+    change = (
+        dynamics.compute_mechanical_energy(s, m).total_energy
+        - dynamics.compute_mechanical_energy(s, before).total_energy
+    )
     duration = first.duration + second.duration + third.duration
     return jnp.stack([theta, dtheta, dL1]), step_result, duration, work, work - lost_values - change
 

@@ -18,8 +18,8 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax.cycles import collocation_search as search
 from vrw_jax.cycles import gait_surface as surface
-from vrw_jax.numerics import make_blockwise
-from vrw_jax.wheel import PARAMETER_NAMES, stack_parameters, wheel_from_parameters
+from vrw_jax.numerics import apply_in_blocks
+from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters, stack_parameters
 
 PARAMETER_BOX = {
     "damping": (15.0, 219.0),
@@ -52,7 +52,7 @@ def find_gaits_by_continuation(
             problem, parameters, start, table_1_parameters, stages, limit, pending
         )
 
-    return jax.jit(make_blockwise(search_from_table_1, 64))(parameters)
+    return jax.jit(apply_in_blocks(search_from_table_1, 64))(parameters)
 
 
 def main() -> None:
@@ -80,7 +80,7 @@ def main() -> None:
         rows.extend(np.asarray(block).reshape(-1, N_WHEELS) * time_unit**2)
     unknowns = np.stack([np.asarray(row) for row in rows])[:, is_found]
 
-    wheels = wheel_from_parameters(jnp.asarray(parameters[:, is_found]), 8)
+    wheels = make_wheel_from_parameters(jnp.asarray(parameters[:, is_found]), 8)
     coordinates = np.stack([np.asarray(x) for x in surface.compute_surface_coordinates(wheels)])
     centre, spread = coordinates.mean(1), coordinates.std(1)
     features = np.stack(

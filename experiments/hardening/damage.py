@@ -173,7 +173,7 @@ def compute() -> list[list[float]]:
     from vrw_jax.runtime import (
         compile_cached_lane_function,
         compile_cached_lane_program,
-        compile_exported_trace,
+        compile_exported_function,
     )
 
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -188,7 +188,9 @@ def compute() -> list[list[float]]:
         )
         call = lambda y, g=inner: jnp.sin(g(y))
         results.append(
-            compile_exported_trace(call, (jnp.asarray(x),), ("call", factor), jax.devices()[0])(x)
+            compile_exported_function(call, (jnp.asarray(x),), ("call", factor), jax.devices()[0])(
+                x
+            )
         )
     return [np.asarray(values).tolist() for values in results]
 

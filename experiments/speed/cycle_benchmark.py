@@ -23,7 +23,7 @@ from experiments.shared.timing import measure_cpu_seconds, use_one_core
 from experiments.shared.wheels import WIDE_BOX, draw_parameter_rows
 from experiments.shared.wheels import make_wheels as wheels_of_rows
 from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS
-from vrw_jax.wheel import stack_parameters, wheel_from_parameters
+from vrw_jax.wheel import make_wheel_from_parameters, stack_parameters
 
 N_SETS, N_STAGES, LANES = 2048, 48, 1024
 ON_STABILITY = ("spectral_radius", "spectral_margin", "stability_margin")
@@ -85,9 +85,9 @@ def find_reachable_wheels(params: vrw.WheelParams) -> np.ndarray:
     ends = stack_parameters(params)
     starts = jnp.broadcast_to(stack_parameters(vrw.WheelParams())[:, None], ends.shape)
     find = jax.jit(
-        jax.vmap(lambda p, guess: vrw.limit_cycle(wheel_from_parameters(p, 8), guess=guess))
+        jax.vmap(lambda p, guess: vrw.limit_cycle(make_wheel_from_parameters(p, 8), guess=guess))
     )
-    values_here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(wheel_from_parameters(p, 8))))(
+    values_here = jax.jit(jax.vmap(lambda p: vrw.limit_cycle(make_wheel_from_parameters(p, 8))))(
         starts.T
     )
     reached = np.ones(ends.shape[1], bool)
@@ -143,13 +143,15 @@ def measure_batch_time() -> dict[str, float]:
 
     def differentiated(v: jax.Array) -> tuple:
         def evaluate(v: jax.Array) -> tuple:
-            cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
+            cycle = vrw.limit_cycle(make_wheel_from_parameters(v, 8))
             values = jnp.concatenate([cycle.post_impact, cycle.durations, cycle.dls_fraction[None]])
             return values, cycle.residual
 
         return jax.jacfwd(evaluate, has_aux=True)(v)
 
-    measured = lambda name: lambda v: vrw.limit_cycle(wheel_from_parameters(v, 8)).measure(name)
+    measured = lambda name: (
+        lambda v: vrw.limit_cycle(make_wheel_from_parameters(v, 8)).measure(name)
+    )
     derived = {
         "gradient of `dls_fraction`": jax.grad(measured("dls_fraction")),
         "gradient of `spectral_radius`": jax.grad(measured("spectral_radius")),
@@ -173,7 +175,7 @@ def measure_single_time() -> dict[str, float]:
     names = [name for name in CYCLE_MEASURE_FUNCTIONS if name not in ON_STABILITY]
 
     def evaluate(v: jax.Array) -> jax.Array:
-        cycle = vrw.limit_cycle(wheel_from_parameters(v, 8))
+        cycle = vrw.limit_cycle(make_wheel_from_parameters(v, 8))
         return jnp.stack([cycle.measure(name) for name in names])
 
     v = stack_parameters(params)

@@ -25,8 +25,8 @@ COLUMNS = 7
 
 def compute_landing(rows: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return theta, its rate and the distance of the feet after the landing, for each lane."""
-    landing = transitions.land(make_wheels(rows).symbols(), *np.asarray(states).T)
-    return np.stack([landing.theta, landing.motion.dtheta, landing.distance], 1)
+    landing = transitions.resolve_landing(make_wheels(rows).symbols(), *np.asarray(states).T)
+    return np.stack([landing.theta_after, landing.motion_after.dtheta, landing.foot_distance], 1)
 
 
 def compute_landing_with_tangents(
@@ -35,8 +35,10 @@ def compute_landing_with_tangents(
     """Return the result of `compute_landing` and its derivatives, shape (lanes, 3, COLUMNS)."""
 
     def one(given: jax.Array) -> jax.Array:
-        landing = transitions.land(make_wheels(given[3:]).symbols(), *given[:3])
-        return jax.numpy.stack([landing.theta, landing.motion.dtheta, landing.distance])
+        landing = transitions.resolve_landing(make_wheels(given[3:]).symbols(), *given[:3])
+        return jax.numpy.stack(
+            [landing.theta_after, landing.motion_after.dtheta, landing.foot_distance]
+        )
 
     columns = jax.jit(jax.vmap(jax.jacfwd(one)))(np.concatenate([states, rows], 1))
     return compute_landing(rows, states), np.asarray(columns)

@@ -103,8 +103,8 @@ def by_peer(function, side_by_side=False):
             columns = [np.asarray(getattr(params, name)) for name in PARAMETER_NAMES]
             order = sort_wheels_by_work(columns, states)
             params, states, back = make_wheels(rows[order]), states[order], np.argsort(order)
-        landing = transitions.land(params.symbols(), *np.asarray(states).T)
-        starts = np.asarray(np.stack([landing.theta, landing.motion.dtheta], 1))
+        landing = transitions.resolve_landing(params.symbols(), *np.asarray(states).T)
+        starts = np.asarray(np.stack([landing.theta_after, landing.motion_after.dtheta], 1))
         packed = peers.pack(params)
         return lambda: function(starts, packed)[back, :6]
 

@@ -17,7 +17,7 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
 BOX = {
     "damping": (5.0, 400.0),
@@ -55,7 +55,7 @@ def compute_steps(
     rows: np.ndarray, states: np.ndarray, engine: str, options: vrw.StepOptions
 ) -> tuple[StepValues, np.ndarray]:
     """Return one step of each wheel, and the number of tried solver steps."""
-    params = wheel_from_parameters(jnp.asarray(rows.T), 8)
+    params = make_wheel_from_parameters(jnp.asarray(rows.T), 8)
     batch_result = vrw.step_batch(params, states, options=options, engine=engine)  # type: ignore[arg-type]
     values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
     return (np.asarray(batch_result.outcome), values), np.asarray(batch_result.solver_steps)

@@ -23,7 +23,7 @@ from experiments.speed.engines_agree import draw_wheels
 from vrw_jax.batches.batch_steps import sort_wheels_by_work
 from vrw_jax.integrator import load_explicit_tableau
 from vrw_jax.models.batch_step import run_batch_phases
-from vrw_jax.wheel import PARAMETER_NAMES, wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 GROUP, N_LEGS = 8, 8
 
@@ -36,7 +36,7 @@ def count_tried_steps(
     tableau = load_explicit_tableau(solver)
     assert tableau is not None
     walk_result = run_batch_phases(
-        wheel_from_parameters(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False
+        make_wheel_from_parameters(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False
     )
     return jnp.stack([end.n_solver_steps for end in walk_result.phase_ends])
 

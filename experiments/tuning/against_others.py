@@ -41,7 +41,7 @@ from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.tuning import tune
 from vrw_jax.tuning.objective import compute_slack_scales
 from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem
-from vrw_jax.wheel import wheel_from_parameters
+from vrw_jax.wheel import make_wheel_from_parameters
 
 cma = require_extra("cma")
 
@@ -112,7 +112,7 @@ def values_of(problem: TuneProblem) -> Callable:
     target_values, finder = problem.objective_and_constraints, problem.gait_finder
 
     def values(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-        wheel = wheel_from_parameters(parameters, problem.params.n_legs)
+        wheel = make_wheel_from_parameters(parameters, problem.params.n_legs)
         cycle = finder.find_cycle(wheel)
         step = finder.model.take_step(wheel, cycle.section_state, finder.step_options)
         agrees = (

@@ -114,7 +114,7 @@ def list_output_rows(n_legs: int) -> list[str]:
     """Return the names of the outputs of a step, one per row."""
     legs = range(3, n_legs + 1)
     margins = [
-        [f"{name}[{leg}]" for leg in legs] if measure.dimension else [name]
+        [f"{name}[{leg}]" for leg in legs] if measure.leg_dimension else [name]
         for name, measure in PAGE_MARGINS.items()
     ]
     return [
@@ -164,7 +164,7 @@ def facts() -> dict[str, Any]:
                 "value": float(getattr(default, name)),
                 "from": span[0],
                 "to": span[1],
-                "least": PARAMETER_DOMAINS[name].lower,
+                "least": PARAMETER_DOMAINS[name].lower_bound,
             }
             for name, span in SLIDERS.items()
         },
@@ -186,7 +186,7 @@ def facts() -> dict[str, Any]:
                 | LIMIT_CYCLE_MEASURES
             ).items()
         },
-        "margins": {name: bool(m.dimension) for name, m in PAGE_MARGINS.items()},
+        "margins": {name: bool(m.leg_dimension) for name, m in PAGE_MARGINS.items()},
         "outcomes": {int(o): {"name": o.name, "meaning": o.meaning} for o in vrw.Outcome},
     }
 

@@ -32,8 +32,8 @@ from vrw_jax.models import (
 from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
-from vrw_jax.numerics import StepOptions, sine_cosine
-from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, wheel_from_parameters
+from vrw_jax.numerics import StepOptions, compute_sine_cosine
+from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, make_wheel_from_parameters
 
 LEGS = (6, 8, 10)
 """Numbers of legs that the page offers: each is code of its own."""
@@ -77,7 +77,7 @@ class _OfAnyLegs(WheelParams):
     def symbols(self) -> Symbols:
         """Those of a step's motion, in which legs in the air are not told one by one."""
         alpha = self.leg_angle
-        sin, cos = sine_cosine(alpha)
+        sin, cos = compute_sine_cosine(alpha)
         return (
             super()
             .symbols()
@@ -111,7 +111,7 @@ def programs(n_legs: int) -> dict[str, Program]:
     """Return by name the programs of a step for a number of legs."""
 
     def wheel(parameters: Array) -> WheelParams:
-        return wheel_from_parameters(tuple(parameters), n_legs)
+        return make_wheel_from_parameters(tuple(parameters), n_legs)
 
     def told(tolerance: Array, friction: Array, parameters: Array, x: Array) -> tuple:
         """Return all outputs of the step in the order of `result_of`, and its motion by phase."""
@@ -245,7 +245,9 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
 
 def ground_rows(n_legs: int) -> dict[str, int]:
     """Return the numbers of rows of a section state and of the state of a walk."""
-    onward = _on_ground(lambda p: wheel_from_parameters(tuple(p), n_legs), n_legs)["ground_onward"]
+    onward = _on_ground(lambda p: make_wheel_from_parameters(tuple(p), n_legs), n_legs)[
+        "ground_onward"
+    ]
     return {"section": full_section_size(n_legs), "lane": onward.section}
 
 

@@ -148,14 +148,16 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
 
     def one(row: jax.Array, x: jax.Array, setting: jax.Array) -> jax.Array:
         s = make_wheels(row).symbols()
-        landing = transitions.land(s, *x)
-        phases = make_phases(s, landing.distance, stop_at_lift_off=True)
+        landing = transitions.resolve_landing(s, *x)
+        phases = make_phases(s, landing.foot_distance, stop_at_lift_off=True)
         dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
-        y, first_time, n1 = until(dls, jnp.stack([landing.theta, landing.motion.dtheta]), setting)
+        y, first_time, n1 = until(
+            dls, jnp.stack([landing.theta_after, landing.motion_after.dtheta]), setting
+        )
         m = dls.unpack_motion(y)
         start = jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
         y, second, n2 = until(sls1, start, setting)
-        hit = transitions.hit_stopper(s, sls1.unpack_motion(y)).motion
+        hit = transitions.resolve_stopper_collision(s, sls1.unpack_motion(y)).motion_after
         start = jnp.stack([y[0], hit.L1, hit.dtheta, hit.dL1])
         y, third, n3 = until(sls2, start, setting)
         times = first_time, second, third
@@ -181,8 +183,8 @@ def compute_landing(params: vrw.WheelParams, states: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _compute_landing_columns(params: vrw.WheelParams, states: jax.Array) -> jax.Array:
-    landing = transitions.land(params.symbols(), *states.T)
-    return jnp.stack([landing.theta, landing.motion.dtheta], 1)
+    landing = transitions.resolve_landing(params.symbols(), *states.T)
+    return jnp.stack([landing.theta_after, landing.motion_after.dtheta], 1)
 
 
 def peer_steps(name: str, tolerance: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
@@ -253,8 +255,8 @@ def cycle_of_map(row: jax.Array, start: jax.Array, options: vrw.StepOptions) -> 
     s = params.symbols()
 
     def section(y: jax.Array) -> jax.Array:
-        landing = transitions.land(s, *y)
-        return jnp.stack([landing.theta, landing.motion.dtheta])
+        landing = transitions.resolve_landing(s, *y)
+        return jnp.stack([landing.theta_after, landing.motion_after.dtheta])
 
     fixed_point = vrw.solve_fixed_point(
         lambda x: model.advance(params, x, options).section_state,

@@ -27,7 +27,7 @@ from vrw_jax.integrator.tableaus import (
     rk_step,
 )
 from vrw_jax.numerics import batch_sizes
-from vrw_jax.numerics.trigonometry import sine_cosine
+from vrw_jax.numerics.trigonometry import compute_sine_cosine
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
@@ -249,7 +249,7 @@ def test_invalid_arguments_of_a_batch_are_refused_in_one_sentence():
 
 def test_sine_and_cosine_are_accurate_to_round_off_at_every_leg_angle():
     x = jnp.linspace(-0.5 * np.pi, 0.5 * np.pi, 10_001)
-    sine, cosine = sine_cosine(x)
+    sine, cosine = compute_sine_cosine(x)
     np.testing.assert_allclose(sine, np.sin(x), atol=4e-16)
     np.testing.assert_allclose(cosine, np.cos(x), atol=4e-16)
 

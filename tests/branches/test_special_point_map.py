@@ -22,7 +22,7 @@ def make_scan(signs, outcome=None):
     """Return a scan of which all quantities are 1, except the given ones."""
     ones = {name: np.ones((len(C), len(K))) for name in ("lambda_4_plus", *MARGIN_MEASURES)}
     data = {name: (MAP_PARAMETERS, signs.get(name, values)) for name, values in ones.items()}
-    for name in (name for name in MARGIN_MEASURES if MARGIN_MEASURES[name].dimension):
+    for name in (name for name in MARGIN_MEASURES if MARGIN_MEASURES[name].leg_dimension):
         data[name] = ((*MAP_PARAMETERS, "leg"), np.ones((len(C), len(K), len(LEG_NUMBERS))))
     data["spectral_radius"] = (MAP_PARAMETERS, np.full((len(C), len(K)), 0.5))
     steps = np.full((len(C), len(K)), vrw.Outcome.STEPPED)

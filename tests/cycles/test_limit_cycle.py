@@ -15,7 +15,7 @@ import vrw_jax as vrw
 from vrw_jax import simd
 from vrw_jax.continuation import floquet, solve_fixed_point_implicit
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import PARAMETER_NAMES, wheel_from_parameters
+from vrw_jax.wheel.params import PARAMETER_NAMES, make_wheel_from_parameters
 
 TIGHT_OPTIONS = vrw.CycleOptions.tight()
 MASS_NAMES = [PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass")]
@@ -584,7 +584,7 @@ def test_unknown_measure_is_refused_in_one_sentence():
 
 
 def test_wheels_and_parameter_vectors_convert_into_each_other():
-    wheel = wheel_from_parameters(jnp.asarray(reference_values.REFERENCE_PARAMETERS[1]), 8)
+    wheel = make_wheel_from_parameters(jnp.asarray(reference_values.REFERENCE_PARAMETERS[1]), 8)
     assert float(wheel.damping) == 100.0
 
 

@@ -10,7 +10,7 @@ from support import reference_values
 from support.batched import NAMES, compute_full_steps, compute_states_and_work
 
 import vrw_jax as vrw
-from vrw_jax.wheel import Motion, dynamics, make_phases, rear_foot_height, transitions
+from vrw_jax.wheel import Motion, compute_rear_foot_height, dynamics, make_phases, transitions
 
 STARTS = reference_values.stack_quantity("step", "start")
 
@@ -64,12 +64,14 @@ def compute_descent_energy(params, step):
 def test_no_landing_and_no_stopper_gains_energy(theta, dtheta, dL1, leg_mass, leg_com, hub_mass):
     s = vrw.WheelParams(leg_mass=leg_mass, leg_com=leg_com, hub_mass=hub_mass).symbols()
     state = (jnp.asarray(theta), jnp.asarray(dtheta), jnp.asarray(dL1))
-    landing = transitions.land(s, *state)
-    scale = float(dynamics.kinetic_energy(s, transitions.motion_before_landing(s, *state)))
-    assert float(landing.energy_lost) >= -1e-12 * scale
-    hit = transitions.hit_stopper(s, landing.motion)
-    at_stopper = float(dynamics.kinetic_energy(s, landing.motion._replace(L2=s.L0)))
-    assert float(hit.energy_lost) >= -1e-12 * at_stopper
+    landing = transitions.resolve_landing(s, *state)
+    scale = float(
+        dynamics.compute_kinetic_energy(s, transitions.compute_motion_before_landing(s, *state))
+    )
+    assert float(landing.energy_loss) >= -1e-12 * scale
+    hit = transitions.resolve_stopper_collision(s, landing.motion_after)
+    at_stopper = float(dynamics.compute_kinetic_energy(s, landing.motion_after._replace(L2=s.L0)))
+    assert float(hit.energy_loss) >= -1e-12 * at_stopper
 
 
 @settings(max_examples=40, deadline=None)
@@ -79,9 +81,9 @@ def test_planted_feet_do_not_move_in_double_support(theta, dtheta, distance):
 
     def rear_foot(angle):
         phase = make_phases(s, jnp.asarray(distance), True)[0]
-        m = phase.motion_at((angle,), (jnp.asarray(dtheta),))
+        m = phase.compute_motion((angle,), (jnp.asarray(dtheta),))
         rear = jnp.stack([jnp.sin(angle + s.alpha), jnp.cos(angle + s.alpha)])
-        return m.L1 * jnp.stack([m.sin, m.cos]) - m.L2 * rear
+        return m.L1 * jnp.stack([m.sin_theta, m.cos_theta]) - m.L2 * rear
 
     place, drift = jax.jvp(rear_foot, (jnp.asarray(theta),), (jnp.ones(()),))
     np.testing.assert_allclose(place, [-distance, 0.0], atol=1e-14)
@@ -90,15 +92,15 @@ def test_planted_feet_do_not_move_in_double_support(theta, dtheta, distance):
 
 def test_both_feet_are_at_rest_after_a_landing_that_holds_them():
     s = vrw.WheelParams().symbols()
-    landing = transitions.land(s, *map(jnp.asarray, (0.1027, 1.61, -0.109)))
-    m = landing.motion
+    landing = transitions.resolve_landing(s, *map(jnp.asarray, (0.1027, 1.61, -0.109)))
+    m = landing.motion_after
 
     def height(t):
-        theta = landing.theta + t * m.dtheta
+        theta = landing.theta_after + t * m.dtheta
         shifted = Motion.from_angle(
             theta, m.L1 + t * m.dL1, m.L2 + t * m.dL2, m.dtheta, m.dL1, m.dL2
         )
-        return rear_foot_height(s, shifted)
+        return compute_rear_foot_height(s, shifted)
 
     assert abs(float(height(0.0))) < 1e-15
     assert abs(float(jax.grad(height)(0.0))) < 1e-14
@@ -147,7 +149,7 @@ def test_forces_equal_the_rate_of_momentum_of_the_point_masses():
     s = p.symbols()
     theta, L1, L2, dtheta, dL1, dL2 = -0.3, 0.93, 0.96, 1.2, -0.1, 0.2
     m = Motion.from_angle(*map(jnp.asarray, (theta, L1, L2, dtheta, dL1, dL2)))
-    a = dynamics.single_support_1_acceleration(s, m)
+    a = dynamics.solve_single_support_1(s, m)
 
     def masses(t):
         angle = theta + dtheta * t + 0.5 * a.ddtheta * t * t
@@ -163,5 +165,5 @@ def test_forces_equal_the_rate_of_momentum_of_the_point_masses():
 
     rate = jax.jacfwd(jax.jacfwd(masses))(0.0)
     gravity = 9.81 * 18.0 * np.array([np.sin(0.3), -np.cos(0.3)])
-    fore = dynamics.fore_foot_force(s, m, a)
+    fore = dynamics.compute_fore_foot_force(s, m, a)
     np.testing.assert_allclose(jnp.stack([*fore]), rate - gravity, rtol=1e-12)

@@ -3,7 +3,12 @@
 import pytest
 
 from vrw_jax.measures import MARGIN_MEASURES, STEP_MEASURES, describe_violation
-from vrw_jax.printing import format_html_table, format_markdown_table, format_mathtext, format_text
+from vrw_jax.printing import (
+    format_heading_and_rows,
+    format_html_table,
+    format_markdown_table,
+    format_mathtext,
+)
 from vrw_jax.selection.ladder import MODEL_SELECTION_MARGINS, describe_selection_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
@@ -11,18 +16,22 @@ INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 
 @pytest.mark.parametrize("name", [*MARGIN_MEASURES, *INDICATORS])
 def test_a_margin_or_an_indicator_describes_its_violation(name):
-    breaks = (MARGIN_MEASURES | STEP_MEASURES)[name].violation
+    breaks = (MARGIN_MEASURES | STEP_MEASURES)[name].violation_text
     assert breaks
     assert not breaks.endswith(".")
     assert breaks in describe_violation(name)
 
 
 def test_no_two_margins_describe_the_same_violation():
-    assert len({measure.violation for measure in MARGIN_MEASURES.values()}) == len(MARGIN_MEASURES)
+    assert len({measure.violation_text for measure in MARGIN_MEASURES.values()}) == len(
+        MARGIN_MEASURES
+    )
 
 
 def test_other_measures_describe_no_violation():
-    assert {name for name, measure in STEP_MEASURES.items() if measure.violation} == set(INDICATORS)
+    assert {name for name, measure in STEP_MEASURES.items() if measure.violation_text} == set(
+        INDICATORS
+    )
     assert describe_violation("period_doubling") == "period doubling"
     assert describe_violation("locked_stopper_force[5]").endswith(", leg 5")
     assert describe_violation("lambda_4_plus") == "λ4⁺ = 0: rear foot lifts at once"
@@ -30,7 +39,7 @@ def test_other_measures_describe_no_violation():
 
 def test_reasons_of_the_ladder_come_from_the_table():
     for reason, name in enumerate(MODEL_SELECTION_MARGINS, start=1):
-        assert MARGIN_MEASURES[name].violation in describe_selection_reason(reason)
+        assert MARGIN_MEASURES[name].violation_text in describe_selection_reason(reason)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +63,7 @@ def test_a_symbol_becomes_mathtext(symbol, tex):
 
 def test_rows_are_formatted_as_text_markdown_and_html():
     rows = [("a", "1 < 2"), ("b", "|x|")]
-    assert format_text("Title", rows) == "Title\n  a: 1 < 2\n  b: |x|"
+    assert format_heading_and_rows("Title", rows) == "Title\n  a: 1 < 2\n  b: |x|"
     assert format_markdown_table(("name", "value"), rows) == [
         "| name | value |", "|---|---|", "| a | 1 < 2 |", r"| b | \|x\| |",
     ]  # fmt: skip

@@ -17,7 +17,7 @@ import vrw_jax as vrw
 from vrw_jax.runtime import (
     compile_cached_lane_function,
     compile_cached_lane_program,
-    compile_exported_trace,
+    compile_exported_function,
 )
 from vrw_jax.runtime import (
     disk_cache as store,
@@ -57,7 +57,9 @@ def multiples():
         )
         call = lambda x, g=within: g(x) + 0.0
         results.append(
-            compile_exported_trace(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(X)
+            compile_exported_function(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(
+                X
+            )
         )
     return results
 
@@ -174,7 +176,7 @@ def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
         traces.append(1)
         return 2.0 * x
 
-    run = lambda: compile_exported_trace(double, (X,), "versions", jax.devices()[0])(X)
+    run = lambda: compile_exported_function(double, (X,), "versions", jax.devices()[0])(X)
     run(), run()
     assert len(traces) == 1
     monkeypatch.setattr(store, "_list_library_versions", lambda: ("diffrax 0.0",))

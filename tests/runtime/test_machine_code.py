@@ -11,7 +11,7 @@ from vrw_jax import simd
 from vrw_jax.runtime import (
     compile_cached_lane_function,
     compile_cached_lane_program,
-    compile_exported_trace,
+    compile_exported_function,
 )
 from vrw_jax.runtime import (
     disk_cache as store,
@@ -45,7 +45,7 @@ def make_function(traced):
         traced.append(1)
         return double(x) + 1.0
 
-    return compile_exported_trace(run, (X,), "kept", jax.devices()[0])(X)
+    return compile_exported_function(run, (X,), "kept", jax.devices()[0])(X)
 
 
 def test_a_cached_program_finds_the_machine_code_that_it_calls(cache_folder, fresh_process):
@@ -90,7 +90,7 @@ def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, mon
         traced.append(1)
         return 2.0 * x
 
-    run = lambda: compile_exported_trace(double, (jnp.ones(2),), "kept", jax.devices()[0])(
+    run = lambda: compile_exported_function(double, (jnp.ones(2),), "kept", jax.devices()[0])(
         jnp.ones(2)
     )
     run(), run()

@@ -21,7 +21,7 @@ def evaluate_arithmetically(columns: SampleColumns) -> Mapping[str, np.ndarray]:
     total = np.sum([np.sin(column) for column in columns.values()], axis=0)
     results = {name: total * (i + 1) for i, name in enumerate(MARGIN_MEASURES)}
     for name, margin in MARGIN_MEASURES.items():
-        if margin.dimension:
+        if margin.leg_dimension:
             results[name] = results[name][:, None] + np.arange(6)
     outcome = np.where(total > 0.9, Outcome.NO_CYCLE_FOUND, Outcome.STEPPED).astype(np.int8)
     names = ("dls_fraction", "speed", "d_dls_fraction_d_damping", "spectral_radius")

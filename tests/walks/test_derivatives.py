@@ -78,8 +78,8 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         return end, matrix - jnp.outer(f, gradient @ matrix) / (gradient @ f)
 
     def landed(x):
-        landing = transitions.land(s, *x)
-        return jnp.stack([landing.theta, landing.motion.dtheta, landing.distance])
+        landing = transitions.resolve_landing(s, *x)
+        return jnp.stack([landing.theta_after, landing.motion_after.dtheta, landing.foot_distance])
 
     @jax.jit
     def by_saltation(durations):
@@ -100,8 +100,10 @@ def test_the_saltation_formula_agrees(forward_jacobian):
             return jnp.stack([y[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])
 
         def locked(y):
-            hit = transitions.hit_stopper(s, second.unpack_motion(y))
-            return jnp.stack([y[0], hit.motion.L1, hit.motion.dtheta, hit.motion.dL1])
+            hit = transitions.resolve_stopper_collision(s, second.unpack_motion(y))
+            return jnp.stack(
+                [y[0], hit.motion_after.L1, hit.motion_after.dtheta, hit.motion_after.dL1]
+            )
 
         end, dls = through(with_distance, at_landing, durations[0])
         end2, sls1 = through(second, lifted(end), durations[1])

@@ -8,7 +8,7 @@ import pytest
 import vrw_jax as vrw
 from vrw_jax import simd
 from vrw_jax.numerics import batch_sizes
-from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, make_wheel_from_parameters
 
 N = 96
 ALL_INPUT_NAMES = ("section_state", *PARAMETER_NAMES)
@@ -98,7 +98,7 @@ def test_derivatives_of_a_batch_element_do_not_depend_on_the_other_elements(
     params, states = draw_box(N, 0)
     rows = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
     selection = np.random.default_rng(2).permutation(N)[:11]
-    wheels = wheel_from_parameters(jnp.asarray(rows[:, selection]), 8)
+    wheels = make_wheel_from_parameters(jnp.asarray(rows[:, selection]), 8)
     part = vrw.step_batch(
         wheels, states[selection], options=TIGHT_OPTIONS, derivatives=ALL_INPUT_NAMES
     )

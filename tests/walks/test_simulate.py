@@ -11,7 +11,7 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.measures.table import MEASURES, TRAJECTORY_MEASURES
-from vrw_jax.wheel.dynamics import momentum
+from vrw_jax.wheel.dynamics import compute_momentum
 from vrw_jax.wheel.geometry import Motion
 
 N_SAMPLES = 1001
@@ -42,7 +42,7 @@ def _momentum(params: vrw.WheelParams, part: xr.Dataset) -> np.ndarray:
     motion = Motion.from_angle(
         *(jnp.asarray(part[name].values) for name in ("theta", "L1", "L2", "dtheta", "dL1", "dL2"))
     )
-    return np.stack([np.asarray(p) for p in momentum(params.symbols(), motion)])
+    return np.stack([np.asarray(p) for p in compute_momentum(params.symbols(), motion)])
 
 
 def test_every_variable_has_unit_long_name_and_symbol(sampled_walk: xr.Dataset) -> None:
@@ -51,7 +51,7 @@ def test_every_variable_has_unit_long_name_and_symbol(sampled_walk: xr.Dataset) 
         assert variable.attrs["units"] == MEASURES[str(name)].unit
         assert variable.attrs["long_name"]
         assert variable.attrs["symbol"]
-    assert sampled_walk.phase.attrs["flag_meanings"] == "DLS SLS-I SLS-II"
+    assert sampled_walk.phase.variable_attributes["flag_meanings"] == "DLS SLS-I SLS-II"
 
 
 def test_a_trajectory_records_its_provenance(sampled_walk: xr.Dataset, tmp_path: Path) -> None:

@@ -18,19 +18,19 @@ from vrw_jax.wheel import (
     Outcome,
     PhaseInstant,
     PhaseMargins,
+    compute_landing_foot_height,
+    compute_rear_foot_height,
     dynamics,
-    landing_foot_height,
     make_phases,
-    rear_foot_height,
     stack_parameters,
     transitions,
 )
-from vrw_jax.wheel.geometry import double_support_circle
+from vrw_jax.wheel.geometry import compute_double_support_circle
 
 PARAMS = vrw.WheelParams()
 SYMBOLS = PARAMS.symbols()
 GAIT = jnp.asarray([0.1027, 1.611, -0.1093])
-STATE_DISTANCE = transitions.land(SYMBOLS, *GAIT).distance
+STATE_DISTANCE = transitions.resolve_landing(SYMBOLS, *GAIT).foot_distance
 PHASE_STATES = (
     ((-0.6,), (1.2,)),
     ((-0.3, 0.97, 0.93), (1.1, -0.2, 0.4)),
@@ -50,11 +50,12 @@ def make_state_at(index, distance=STATE_DISTANCE, stop_at_lift_off=True):
 @each
 def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
     phase, q, v = make_state_at(index)
-    motion = phase.motion_at(q, v)
-    own_values = phase.acceleration(motion)[: phase.n_dof]
-    np.testing.assert_allclose(phase.dynamics_residual(motion, own_values), 0.0, atol=1e-12)
+    motion = phase.compute_motion(q, v)
+    own_values = phase.solve_acceleration(motion)[: phase.n_dof]
+    np.testing.assert_allclose(phase.compute_dynamics_residual(motion, own_values), 0.0, atol=1e-12)
     shifted_rows = [
-        phase.dynamics_residual(motion, tuple(a + k for a in own_values)) for k in (1.0, 2.0)
+        phase.compute_dynamics_residual(motion, tuple(a + k for a in own_values))
+        for k in (1.0, 2.0)
     ]
     assert np.min(np.abs(shifted_rows[0])) > 0.1
     np.testing.assert_allclose(shifted_rows[1], 2.0 * np.asarray(shifted_rows[0]), rtol=1e-12)
@@ -63,45 +64,47 @@ def test_the_residual_vanishes_at_the_acceleration_and_is_linear_in_it(index):
 @each
 def test_dependent_coordinates_follow_those_of_the_phase(index):
     phase, q, v = make_state_at(index)
-    own_values = phase.acceleration(phase.motion_at(q, v))[: phase.n_dof]
-    evaluate_along = lambda q, v: jnp.stack(phase.motion_at(q, v))
+    own_values = phase.solve_acceleration(phase.compute_motion(q, v))[: phase.n_dof]
+    evaluate_along = lambda q, v: jnp.stack(phase.compute_motion(q, v))
     motion, rates = jax.jvp(evaluate_along, (q, v), (v, own_values))
-    m = phase.motion_at(q, v)
-    np.testing.assert_allclose(rates[:2], [m.cos * m.dtheta, -m.sin * m.dtheta], rtol=1e-14)
+    m = phase.compute_motion(q, v)
+    np.testing.assert_allclose(
+        rates[:2], [m.cos_theta * m.dtheta, -m.sin_theta * m.dtheta], rtol=1e-14
+    )
     np.testing.assert_allclose(rates[2:4], motion[5:], rtol=1e-12, atol=1e-15)
-    for complete in (phase.complete_acceleration(m, own_values), phase.acceleration(m)):
+    for complete in (phase.complete_acceleration(m, own_values), phase.solve_acceleration(m)):
         np.testing.assert_allclose(rates[4:], jnp.stack(complete), rtol=1e-12, atol=1e-14)
 
 
 @each
 def test_phase_coordinates_reproduce_the_motion(index):
     phase, q, v = make_state_at(index)
-    assert phase.select_coordinates(q[0], phase.motion_at(q, v)) == (q, v)
+    assert phase.select_coordinates(q[0], phase.compute_motion(q, v)) == (q, v)
 
 
 def test_forces_agree_with_the_equations_of_motion():
     phase, q, v = make_state_at(0)
-    current_value = PhaseInstant(phase, phase.motion_at(q, v), None)
-    M, _, f2, f3 = dynamics.equation_terms(SYMBOLS, current_value.motion)
-    needed = M.multiply(current_value.acceleration)
-    rear = dynamics.foot_force_from_residual(
+    current_value = PhaseInstant(phase, phase.compute_motion(q, v), None)
+    M, _, f2, f3 = dynamics.compute_equation_terms(SYMBOLS, current_value.motion)
+    needed = M.multiply_vector(current_value.acceleration)
+    rear = dynamics.compute_rear_force_from_residual(
         SYMBOLS, current_value.motion, needed[1] - f2, needed[2] - f3
     )
     np.testing.assert_allclose(current_value.rear_force, rear)
     for index in (1, 2):
         phase, q, v = make_state_at(index)
-        assert PhaseInstant(phase, phase.motion_at(q, v), None).rear_force is None
+        assert PhaseInstant(phase, phase.compute_motion(q, v), None).rear_force is None
 
 
 @pytest.mark.parametrize("stop_at_lift_off", [True, False])
 @each
 def test_guards_have_meanings_and_margins_have_names(index, stop_at_lift_off):
     phase, q, v = make_state_at(index, stop_at_lift_off=stop_at_lift_off)
-    current_value = PhaseInstant(phase, phase.motion_at(q, v), None)
-    guards, margins = phase.guards(current_value), phase.evaluate_margins(current_value)
+    current_value = PhaseInstant(phase, phase.compute_motion(q, v), None)
+    guards, margins = phase.compute_guards(current_value), phase.compute_margins(current_value)
     assert len(guards) == len(phase.all_guard_outcomes)
     assert phase.all_guard_outcomes[0] == Outcome.STEPPED
-    assert guards[0] == phase.end_guard(current_value)
+    assert guards[0] == phase.compute_end_guard(current_value)
     assert (Outcome.LEG_1_LIFTED_OFF in phase.all_guard_outcomes) == stop_at_lift_off
     assert len(margins) == len(phase.margins_counted_at_start)
     named = PhaseMargins.from_values(margins, SYMBOLS.n)
@@ -110,7 +113,7 @@ def test_guards_have_meanings_and_margins_have_names(index, stop_at_lift_off):
     assert (named.rear_clearance is None) == (index == 0)
     assert (named.rear_stopper_force is None) == (index < 2)
     if index > 0:
-        assert named.rear_clearance == rear_foot_height(SYMBOLS, current_value.motion)
+        assert named.rear_clearance == compute_rear_foot_height(SYMBOLS, current_value.motion)
 
 
 @pytest.mark.parametrize("n_legs", [5, 8])
@@ -125,18 +128,18 @@ def test_double_support_is_the_three_equations_restricted_to_its_circle(n_legs):
         leg_mass=select(0.3, 2), leg_com=select(0.1, 0.9), hub_mass=select(1, 20), n_legs=n_legs,
     ).symbols()  # fmt: skip
     distance, theta, dtheta = select(0.3, 1.2), select(-1, 0.5), select(-2, 3)
-    motion = PAPER_PHASES[0](s, (distance,), True).motion_at((theta,), (dtheta,))
-    circle = double_support_circle(s, distance, motion.sin, motion.cos)
-    mass, *force = dynamics.equation_terms(s, motion)
-    w = np.stack([np.ones(1000), circle.G1, circle.G2])
-    restricted = np.stack(mass.multiply(tuple(w)))
+    motion = PAPER_PHASES[0](s, (distance,), True).compute_motion((theta,), (dtheta,))
+    circle = compute_double_support_circle(s, distance, motion.sin_theta, motion.cos_theta)
+    mass, *force = dynamics.compute_equation_terms(s, motion)
+    w = np.stack([np.ones(1000), circle.dL1_dtheta, circle.dL2_dtheta])
+    restricted = np.stack(mass.multiply_vector(tuple(w)))
     inertia = np.sum(w * restricted, 0)
     turning = np.sum(w * np.stack(force), 0)
     turning += dtheta**2 * (circle.L1 * restricted[1] + circle.L2 * restricted[2])
-    result = dynamics.double_support_equation(s, distance, motion)
-    np.testing.assert_allclose(result.inertia, inertia, rtol=1e-14)
+    result = dynamics.compute_double_support_equation(s, distance, motion)
+    np.testing.assert_allclose(result.inertia_factor, inertia, rtol=1e-14)
     size = np.sum(np.abs(w * np.stack(force)), 0)  # of what cancels in the sum
-    assert np.max(np.abs(result.force - turning) / size) < 1e-13
+    assert np.max(np.abs(result.generalized_force - turning) / size) < 1e-13
 
 
 @each
@@ -144,8 +147,8 @@ def test_the_outcome_of_a_phase_end_matches_its_guard(index):
     phase, _, _ = make_state_at(index)
     guards = jnp.arange(-1, len(phase.all_guard_outcomes), dtype=jnp.int32)
     expected = [Outcome.SOLVER_FAILED, *phase.all_guard_outcomes]
-    np.testing.assert_array_equal(phase.outcome_of_guard(guards, guards > 99), expected)
-    late_values = phase.outcome_of_guard(guards, guards == -1)
+    np.testing.assert_array_equal(phase.select_guard_outcome(guards, guards > 99), expected)
+    late_values = phase.select_guard_outcome(guards, guards == -1)
     np.testing.assert_array_equal(
         late_values, [Outcome.NO_TOUCHDOWN_IN_TIME, *phase.all_guard_outcomes]
     )
@@ -157,19 +160,21 @@ def test_guards_are_positive_along_a_gait_until_the_end():
     states = jnp.stack([np.asarray(trajectory[name]) for name in names]).reshape(6, 3, -1)
     for index, phase in enumerate(make_phases(SYMBOLS, STATE_DISTANCE, True)):
         q, v = (tuple(part[: phase.n_dof, index]) for part in (states[:3], states[3:]))
-        guards = jnp.stack(phase.guards(PhaseInstant(phase, phase.motion_at(q, v), None)))
+        guards = jnp.stack(
+            phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
+        )
         assert jnp.all(guards[:, 1:-1] > 0.0)
         assert abs(guards[0, -1]) < 1e-7 * jnp.max(guards[0])
 
 
 def test_resets_agree_with_the_collisions():
     dls, sls1, _ = make_phases(SYMBOLS, STATE_DISTANCE, True)
-    m = dls.motion_at(*(tuple(map(jnp.asarray, x)) for x in PHASE_STATES[0]))
-    assert dls.reset_map(m) == m
+    m = dls.compute_motion(*(tuple(map(jnp.asarray, x)) for x in PHASE_STATES[0]))
+    assert dls.reset_motion(m) == m
     _, q, v = make_state_at(1)
-    before = sls1.motion_at(q, v)
-    hit = transitions.hit_stopper(SYMBOLS, before).motion
-    np.testing.assert_array_equal(jnp.stack(sls1.reset_map(before)), jnp.stack(hit))
+    before = sls1.compute_motion(q, v)
+    hit = transitions.resolve_stopper_collision(SYMBOLS, before).motion_after
+    np.testing.assert_array_equal(jnp.stack(sls1.reset_motion(before)), jnp.stack(hit))
     constants = sequence.compute_phase_constants(PARAMS.n_legs, *stack_parameters(PARAMS))
     following = (
         sequence.make_held_landing_sequence(PARAMS.n_legs)
@@ -241,10 +246,12 @@ def test_every_engine_ends_the_phase_at_its_guard(engine, monkeypatch):
     def height():
         q, v = engine()
         return float(
-            landing_foot_height(SYMBOLS, PAPER_PHASES[2](SYMBOLS, (), True).motion_at(q, v))
+            compute_landing_foot_height(
+                SYMBOLS, PAPER_PHASES[2](SYMBOLS, (), True).compute_motion(q, v)
+            )
         )
 
     assert abs(height()) < 1e-8
-    sooner = lambda self, now: landing_foot_height(self.s, now.motion) - 0.01
-    monkeypatch.setattr(PAPER_PHASES[2], "end_guard", sooner)
+    sooner = lambda self, now: compute_landing_foot_height(self.s, now.motion) - 0.01
+    monkeypatch.setattr(PAPER_PHASES[2], "compute_end_guard", sooner)
     assert abs(height() - 0.01) < 1e-8

@@ -52,16 +52,16 @@ from vrw_jax.validation import (
     check_choice,
     check_int,
     check_names,
-    check_not_traced,
     check_numpy_reals,
     check_type,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     Outcome,
     WheelParams,
-    wheel_from_parameters,
+    make_wheel_from_parameters,
 )
 
 BatchEngine = Literal["auto", "lanes", "diffrax", "collocation"]
@@ -137,7 +137,7 @@ def step_batch(
         >>> result.durations.shape, result.n_stepped.tolist(), result.engine
         ((3, 3), [10, 10, 10], 'lanes')
     """
-    check_not_traced(
+    require_untraced_arguments(
         "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
     )
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
@@ -421,7 +421,8 @@ def sort_wheels_by_work(
 
 class _BatchEngine(NamedTuple):
     """Engine that takes one gait step of any number of lanes. Its arrays are NumPy arrays with
-    lanes on the last axis."""
+    lanes on the last axis.
+    """
 
     engine_name: str
     take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
@@ -477,7 +478,7 @@ def _step_lanes_by_kernel(
             current_options = current_options.with_derivative_tolerances()
 
         def compute_step_outputs(*lane_inputs: Array) -> tuple:
-            params = wheel_from_parameters(
+            params = make_wheel_from_parameters(
                 lane_inputs[:n_parameters], n_legs, *lane_inputs[NEXT_SLOPE_INPUT_INDEX:]
             )
             x = lane_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
@@ -543,7 +544,7 @@ def _step_lanes_by_collocation(
     def step_lanes(
         scalar_arguments: Any, lane_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
-        params = wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
+        params = make_wheel_from_parameters(lane_inputs[:n_parameters], n_legs)
         x, expected_durations = tuple(lane_inputs[n_parameters:-3]), tuple(lane_inputs[-3:])
         collocation_step = take_collocation_step(params, x, expected_durations, stop_at_lift_off)
         is_unfinished = jnp.zeros_like(collocation_step.is_trusted)
@@ -578,7 +579,8 @@ def _step_lanes_by_diffrax(
     *next_slopes: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return one step of all lanes by `model.advance` under `jax.vmap`; see
-    `_BatchEngine.take_lane_steps`."""
+    `_BatchEngine.take_lane_steps`.
+    """
     convert_option_leaves = functools.partial(
         jax.tree.map, lambda leaf: np.asarray(leaf, parameter_rows.dtype)
     )
@@ -653,7 +655,7 @@ def _step_rows_by_vmap(
                 varied_inputs
             )
             next_slope = step_inputs_with_varied[NEXT_SLOPE_INPUT_INDEX:]
-            params = wheel_from_parameters(
+            params = make_wheel_from_parameters(
                 step_inputs_with_varied[:n_parameters], n_legs, *next_slope
             )
             x = step_inputs_with_varied[n_parameters:NEXT_SLOPE_INPUT_INDEX]

@@ -38,7 +38,7 @@ from vrw_jax.collocation import (
     lagrange_weights,
 )
 from vrw_jax.models import PAPER_START_STATE, is_valid_start_state, replace_invalid_inputs
-from vrw_jax.numerics import Vector, value_and_partials
+from vrw_jax.numerics import Vector, evaluate_with_partials
 from vrw_jax.wheel import (
     AbstractPhase,
     PhaseInstant,
@@ -165,7 +165,8 @@ def solve_phase_by_collocation(
     options: CollocationStepOptions = COLLOCATION_STEP_OPTIONS,
 ) -> CollocatedPhase:
     """Return the end of a phase that starts from (q, v), at the first guard near the expected
-    duration."""
+    duration.
+    """
     interval_fractions, zero_scalars = (
         phase_mesh.interval_fractions,
         jnp.zeros_like(expected_duration),
@@ -205,7 +206,7 @@ def solve_phase_by_collocation(
         )
         return interval_carry, None
 
-    start_guards = phase.guards(PhaseInstant(phase, phase.motion_at(q, v), None))
+    start_guards = phase.compute_guards(PhaseInstant(phase, phase.compute_motion(q, v), None))
     interval_carry = (
         q,
         v,
@@ -324,7 +325,7 @@ def _solve_mesh_interval(
     interval. If the length changes, the nodes move along the polynomial through their values.
     """
     n_dof = len(q)
-    start_acceleration = phase.acceleration(phase.motion_at(q, v))[:n_dof]
+    start_acceleration = phase.solve_acceleration(phase.compute_motion(q, v))[:n_dof]
     coordinate_indices = range(n_dof)
     interval_middle_state = (
         tuple(
@@ -370,8 +371,8 @@ def _solve_mesh_interval(
                 node_index, q, v, newton_sweep_state.h, newton_sweep_state.node_accelerations
             )
             node_residuals.append(
-                phase.dynamics_residual(
-                    phase.motion_at(Q, V), newton_sweep_state.node_accelerations[node_index]
+                phase.compute_dynamics_residual(
+                    phase.compute_motion(Q, V), newton_sweep_state.node_accelerations[node_index]
                 )
             )
         # The sign of the projections is that of a correction.
@@ -400,8 +401,8 @@ def _solve_mesh_interval(
         ), None
 
     def evaluate_event_guard(q: Vector, v: Vector) -> tuple[Array, Vector]:
-        phase_instant = PhaseInstant(phase, phase.motion_at(q, v), None)
-        return phase.end_guard(phase_instant), phase_instant.acceleration[: phase.n_dof]
+        phase_instant = PhaseInstant(phase, phase.compute_motion(q, v), None)
+        return phase.compute_end_guard(phase_instant), phase_instant.acceleration[: phase.n_dof]
 
     def compute_time_to_event(newton_sweep_state: _NewtonSweepState) -> Array:
         """Return the time from the interval's end to the event, by Newton's method, s."""
@@ -498,7 +499,8 @@ def _add_node_accelerations(
     acceleration_factor: float,
 ) -> NodeAccelerations:
     """Return the first accelerations plus `acceleration_factor` times the second ones, node by
-    node."""
+    node.
+    """
     node_pairs = zip(node_accelerations, other_accelerations, strict=True)
     return tuple(
         tuple(x + acceleration_factor * y for x, y in zip(*node_pair, strict=True))
@@ -538,9 +540,9 @@ def _linearize_dynamics_residual(phase: AbstractPhase, q: Vector, v: Vector, a: 
 
     def evaluate_dynamics_residual(*arguments: Array) -> Vector:
         q, v, a = (arguments[i * n : (i + 1) * n] for i in range(3))
-        return phase.dynamics_residual(phase.motion_at(q, v), a)
+        return phase.compute_dynamics_residual(phase.compute_motion(q, v), a)
 
-    dynamics_residual, partial_derivative_rows = value_and_partials(
+    dynamics_residual, partial_derivative_rows = evaluate_with_partials(
         evaluate_dynamics_residual, (*q, *v, *a)
     )
     derivative_columns = list(zip(*partial_derivative_rows, strict=True))
@@ -694,7 +696,8 @@ def _correct_node_accelerations(
     h: Array,
 ) -> tuple[NodeAccelerations, Array]:
     """Return the corrected node accelerations, and the largest change of a rate that the correction
-    causes."""
+    causes.
+    """
     corrected_accelerations, largest_acceleration_change = [], jnp.zeros_like(h)
     for node_index in range(N_GAUSS_NODES):
         corrected_node_acceleration = []
@@ -759,8 +762,8 @@ def _find_lowest_guard(
         ),
         tuple(v[i] + newton_sweep_state.h * velocity_integral[i] for i in coordinate_indices),
     )
-    evaluate_phase_guards = lambda q, v, a: phase.guards(
-        PhaseInstant(phase, phase.motion_at(q, v), a)
+    evaluate_phase_guards = lambda q, v, a: phase.compute_guards(
+        PhaseInstant(phase, phase.compute_motion(q, v), a)
     )
     middle_guards = evaluate_phase_guards(*interval_middle_state, middle_acceleration)
     end_guards = evaluate_phase_guards(*solved_interval.end_state, end_acceleration)
@@ -804,11 +807,11 @@ def take_collocation_step(
     is_valid_lane = is_valid_start_state(params, x)
     params, x = replace_invalid_inputs(is_valid_lane, params, x, PAPER_START_STATE)
     wheel_units = compute_wheel_units(params.symbols())
-    state_units: tuple[Any, ...] = (1.0, wheel_units.rate, wheel_units.velocity)
+    state_units: tuple[Any, ...] = (1.0, wheel_units.rate_unit, wheel_units.velocity_unit)
     params = convert_to_wheel_units(params)
     x = tuple(state_component / unit for state_component, unit in zip(x, state_units, strict=True))
     expected_durations = tuple(
-        expected_duration / wheel_units.time for expected_duration in expected_durations
+        expected_duration / wheel_units.time_unit for expected_duration in expected_durations
     )
     has_valid_duration = [
         (expected_duration > 0.0) & (expected_duration < options.max_expected_duration)
@@ -819,10 +822,10 @@ def take_collocation_step(
         jnp.where(is_valid_lane, expected_duration, 0.1) for expected_duration in expected_durations
     )
     s = params.symbols()
-    landing_result = transitions.land(s, *x)
-    is_trusted = is_valid_lane & landing_result.keeps_rear_foot
-    wheel_angle, wheel_motion = landing_result.theta, landing_result.motion
-    phases = make_phases(s, landing_result.distance, stop_at_lift_off)
+    landing_result = transitions.resolve_landing(s, *x)
+    is_trusted = is_valid_lane & landing_result.is_rear_foot_planted
+    wheel_angle, wheel_motion = landing_result.theta_after, landing_result.motion_after
+    phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off)
     phase_durations = []
     for phase, expected_duration, phase_mesh, max_start_rate_error in zip(
         phases, expected_durations, options.phase_meshes, options.max_start_rate_errors, strict=True
@@ -840,7 +843,7 @@ def take_collocation_step(
         )
         wheel_angle, wheel_motion = (
             phase_end.q[0],
-            phase.reset_map(phase.motion_at(phase_end.q, phase_end.v)),
+            phase.reset_motion(phase.compute_motion(phase_end.q, phase_end.v)),
         )
         phase_durations.append(phase_end.duration)
 
@@ -853,6 +856,6 @@ def take_collocation_step(
 
     return CollocationStep(
         convert_trusted_to_si((wheel_angle, wheel_motion.dtheta, wheel_motion.dL1), state_units),
-        convert_trusted_to_si(phase_durations, [wheel_units.time] * len(phase_durations)),
+        convert_trusted_to_si(phase_durations, [wheel_units.time_unit] * len(phase_durations)),
         is_trusted,
     )

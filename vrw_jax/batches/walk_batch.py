@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_ending,
+    describe_step_ending,
     format_outcome_counts,
     format_quantity,
 )
@@ -66,7 +66,7 @@ class StepBatchResult(AbstractPrintable):
     @property
     def ending(self) -> Any:
         """Return how each walk ended, as an array of sentences."""
-        return describe_ending(self.outcome, Outcome)
+        return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return the rows of the printed result as pairs of label and text."""
@@ -200,7 +200,8 @@ class WalkBatch:
 
     def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
         """Return the derivatives of the walk by the name of the input. The derivatives of failed
-        walks are zero."""
+        walks are zero.
+        """
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
@@ -239,7 +240,8 @@ class WalkBatch:
         is_collocated: np.ndarray,
     ) -> None:
         """Record one step of the lanes at `lane_indices`. The step values are state, durations,
-        outcome, solver steps and Jacobian."""
+        outcome, solver steps and Jacobian.
+        """
         section_state, durations, outcome, n_solver_steps, *step_jacobian = step_values
         lane_selection = select_lanes(lane_indices, self)
         if step_jacobian:
@@ -320,7 +322,8 @@ class WalkBatch:
 
 def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
     """Return an index of the lanes: a slice, which copies nothing, if `lane_indices` contain all
-    lanes."""
+    lanes.
+    """
     return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
 
 
@@ -328,7 +331,8 @@ def _replace_lane_values(
     lane_values: np.ndarray, lane_selection: Any, new_values: np.ndarray
 ) -> np.ndarray:
     """Return the array with new values of the selected lanes; the array is changed in place unless
-    all lanes are selected."""
+    all lanes are selected.
+    """
     if isinstance(lane_selection, slice):
         return new_values
     lane_values[..., lane_selection] = new_values

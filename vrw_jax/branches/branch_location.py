@@ -54,10 +54,10 @@ from vrw_jax.continuation import (
 )
 from vrw_jax.numerics import (
     batch_sizes,
-    concat_rows,
+    concatenate_tree_rows,
     map_in_batches,
     map_in_numpy_batches,
-    take_rows,
+    select_tree_rows,
 )
 
 
@@ -169,7 +169,7 @@ class AbstractContinuation(abc.ABC):
 
         They include the bifurcation functions and ADMISSIBILITY_COLUMN.
         """
-        point_wheels = take_rows(self.wheels, wheel_indices)
+        point_wheels = select_tree_rows(self.wheels, wheel_indices)
         table = self.evaluate_point_quantities(point_wheels, points)
         test_functions = map_in_numpy_batches(
             evaluate_bifurcation_functions, (batch_sizes.POINT_BATCH_SIZE,), points.jacobian
@@ -221,7 +221,7 @@ def _continue_in_both_directions(
     the parameter.
     """
     repeat_for_both_directions = lambda tree: jax.device_put(
-        take_rows(tree, np.repeat(np.arange(len(parameter_values)), 2))
+        select_tree_rows(tree, np.repeat(np.arange(len(parameter_values)), 2))
     )
     parameter_bounds = jnp.asarray(continuation.parameter_bounds)
     direction_signs = jnp.tile(
@@ -361,15 +361,17 @@ class _BranchPointTable(NamedTuple):
                 int(n) for n in direction_results.n_points[wheel_index]
             )
             if n_toward_lower:
-                direction_points = take_rows(direction_results.points, (wheel_index, 0))
-                direction_points = take_rows(direction_points, np.arange(n_toward_lower)[::-1])
+                direction_points = select_tree_rows(direction_results.points, (wheel_index, 0))
+                direction_points = select_tree_rows(
+                    direction_points, np.arange(n_toward_lower)[::-1]
+                )
                 points_by_direction.append(
                     direction_points._replace(fraction_rate=-direction_points.fraction_rate)
                 )
             if n_toward_upper:
-                direction_points = take_rows(direction_results.points, (wheel_index, 1))
+                direction_points = select_tree_rows(direction_results.points, (wheel_index, 1))
                 points_by_direction.append(
-                    take_rows(
+                    select_tree_rows(
                         direction_points, np.arange(1 if n_toward_lower else 0, n_toward_upper)
                     )
                 )
@@ -378,9 +380,11 @@ class _BranchPointTable(NamedTuple):
             )
         if not wheel_indices:
             return cls(
-                take_rows(direction_results.points, (0, 0, slice(0, 0))), np.zeros(0, int), {}
+                select_tree_rows(direction_results.points, (0, 0, slice(0, 0))),
+                np.zeros(0, int),
+                {},
             )
-        direction_points = concat_rows(*points_by_direction)
+        direction_points = concatenate_tree_rows(*points_by_direction)
         return cls(
             direction_points,
             np.array(wheel_indices),
@@ -459,18 +463,18 @@ class _BranchPointTable(NamedTuple):
                     | {BRANCH_POINT_KIND: -lower_end.quantities_beside[BRANCH_POINT_KIND]},
                 )
             append_points(
-                take_rows(self.points, valid_range.point_indices),
+                select_tree_rows(self.points, valid_range.point_indices),
                 valid_range.wheel_index,
-                take_rows(self.quantity_table, valid_range.point_indices),
+                select_tree_rows(self.quantity_table, valid_range.point_indices),
             )
             if upper_end is not None and upper_end.quantities_beside[ADMISSIBILITY_COLUMN][0] > 0.0:
                 append_points(
                     upper_end.point_beside, valid_range.wheel_index, upper_end.quantities_beside
                 )
         return _BranchPointTable(
-            concat_rows(*point_groups),
+            concatenate_tree_rows(*point_groups),
             np.concatenate(wheel_index_groups),
-            concat_rows(*quantity_tables),
+            concatenate_tree_rows(*quantity_tables),
         )
 
 
@@ -497,7 +501,7 @@ class _LocatedZero(NamedTuple):
         is_jump_at_left = abs(p[i] - p[max(i - 1, 0)]) <= abs(p[min(j + 1, last_index)] - p[j])
         chord_fraction = 0.0 if is_jump_at_left else 1.0
         point_index = i if is_jump_at_left else j
-        point_beside, quantities_beside = take_rows(
+        point_beside, quantities_beside = select_tree_rows(
             (point_table.points, point_table.quantity_table), slice(point_index, point_index + 1)
         )
         return cls(
@@ -526,11 +530,11 @@ def _locate_zeros(
     )
     quantity_names = [request[2] for request in zero_requests]
     left_points, right_points = (
-        take_rows(point_table.points, left_indices),
-        take_rows(point_table.points, right_indices),
+        select_tree_rows(point_table.points, left_indices),
+        select_tree_rows(point_table.points, right_indices),
     )
     wheel_indices = point_table.wheel_indices[left_indices]
-    bracket_wheels = take_rows(continuation.wheels, wheel_indices)
+    bracket_wheels = select_tree_rows(continuation.wheels, wheel_indices)
     solve_on_chords = (
         _solve_on_chords if continuation.problem.is_traceable else _solve_on_chords_untraced
     )
@@ -550,7 +554,9 @@ def _locate_zeros(
     def solve_at_fractions(
         chord_fractions: np.ndarray, bracket_indices: np.ndarray
     ) -> tuple[ContinuationPoint, PointQuantities]:
-        bracket_rows = take_rows((bracket_wheels, left_points, right_points), bracket_indices)
+        bracket_rows = select_tree_rows(
+            (bracket_wheels, left_points, right_points), bracket_indices
+        )
         solved_points, is_found = continuation.map_over_rows(
             solve_chord_points, batch_sizes.LOCATION_BATCH_SIZES[-1], *bracket_rows, chord_fractions
         )
@@ -612,8 +618,10 @@ def _locate_zeros(
             row_indices[inadmissible_requests] = len(row_indices) + np.arange(
                 len(inadmissible_requests)
             )
-            points_beside, quantities_beside = take_rows(
-                concat_rows((points_beside, quantities_beside), retried_points_and_quantities),
+            points_beside, quantities_beside = select_tree_rows(
+                concatenate_tree_rows(
+                    (points_beside, quantities_beside), retried_points_and_quantities
+                ),
                 row_indices,
             )
     return [
@@ -621,8 +629,8 @@ def _locate_zeros(
             zero_requests[i],
             float(parameter_by_location[i, zero_location.best_locations[i]]),
             float(zero_location.best_locations[i]),
-            take_rows(points_beside, slice(i, i + 1)),
-            take_rows(quantities_beside, slice(i, i + 1)),
+            select_tree_rows(points_beside, slice(i, i + 1)),
+            select_tree_rows(quantities_beside, slice(i, i + 1)),
         )
         for i in range(len(zero_requests))
     ]
@@ -643,7 +651,7 @@ def _is_mesh_limited(
         continuation.name_branch_end(point_table.quantity_table, i) for i in unexplained_ends
     )
     return continuation.is_mesh_limited(
-        take_rows(point_table.quantity_table, valid_range.point_indices), end_names
+        select_tree_rows(point_table.quantity_table, valid_range.point_indices), end_names
     )
 
 
@@ -889,7 +897,7 @@ def continue_and_locate_points(
     if not is_finest_mesh:
         for valid_range in valid_ranges:
             if _is_mesh_limited(continuation, point_table, valid_range):
-                points, branch_quantities = take_rows(
+                points, branch_quantities = select_tree_rows(
                     (point_table.points, point_table.quantity_table), valid_range.point_indices
                 )
                 branch_data_by_wheel[valid_range.wheel_index] = BranchData(
@@ -914,7 +922,7 @@ def continue_and_locate_points(
         n_multipliers: int = 0,
     ) -> SpecialPoint:
         """Return the special point at a located zero."""
-        point_beside = take_rows(located_zero.point_beside, 0)
+        point_beside = select_tree_rows(located_zero.point_beside, 0)
         section_state = np.asarray(
             continuation.problem.section_state(jax.device_put(point_beside.z))
         )
@@ -967,12 +975,12 @@ def continue_and_locate_points(
             end_reasons.append(continuation.describe_branch_end(end_point.name, end_point.value))
         points_with_position.sort(key=lambda pair: pair[0])
         special_points = tuple(special_point for _, special_point in points_with_position)
-        branch_quantities = take_rows(joined_points.quantity_table, point_indices)
+        branch_quantities = select_tree_rows(joined_points.quantity_table, point_indices)
         end_names = tuple(
             special_point.name for special_point in special_points if special_point.ends_branch
         )
         branch_data_by_wheel[valid_range.wheel_index] = BranchData(
-            take_rows(joined_points.points, point_indices),
+            select_tree_rows(joined_points.points, point_indices),
             branch_quantities,
             special_points,
             (end_reasons[0], end_reasons[1]),

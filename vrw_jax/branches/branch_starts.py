@@ -27,7 +27,7 @@ from vrw_jax.cycles import (
     transfer_solution_to_mesh,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.numerics import StepOptions, select_tree_rows
 from vrw_jax.simulation import walk_toward_gait
 from vrw_jax.wheel import WheelParams
 
@@ -121,7 +121,7 @@ def start_branches_from_collocation(branch_request: BranchRequest, given_cycle: 
     collocation_system = gait_finder.system
 
     def make_cycle_finder(wheel_index: int, branch_point: ContinuationPoint) -> LimitCycleFinder:
-        start_cycle_of_wheel, start_params = take_rows((start_cycle, params), wheel_index)
+        start_cycle_of_wheel, start_params = select_tree_rows((start_cycle, params), wheel_index)
         return LimitCycleFinder(
             gait_finder,
             branch_request.model,

@@ -49,13 +49,13 @@ from vrw_jax.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
     UNILATERAL_STEP_MEASURES,
-    locked_leg_coordinate,
-    make_variables,
-    measure_attrs,
-    provenance,
+    collect_provenance_attributes,
+    make_labeled_variables,
+    make_locked_leg_coordinate,
+    make_measure_attributes,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_numpy_batches, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.selection import raise_if_ladder
@@ -64,11 +64,11 @@ from vrw_jax.validation import (
     check_bool,
     check_callable,
     check_int,
-    check_not_traced,
     check_range,
     check_real,
     check_reals,
     check_type,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_name
 
@@ -150,7 +150,7 @@ class GaitContinuation(AbstractContinuation):
             measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
         )
         for name, margin_measure in MARGIN_MEASURES.items():
-            if margin_measure.dimension and name in quantity_table:
+            if margin_measure.leg_dimension and name in quantity_table:
                 leg_positions = enumerate(range(3, self.n_legs + 1))
                 quantity_table |= {
                     f"{name}[{leg}]": quantity_table[name][:, leg_position]
@@ -260,8 +260,8 @@ def continue_branch(
     check_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
-    check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
-    params_batch, cycle = jax.device_put(take_rows((params, cycle), None))
+    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    params_batch, cycle = jax.device_put(select_tree_rows((params, cycle), None))
     (branch,) = continue_branches(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=check_model(resolve_model(params, model)),
@@ -314,7 +314,7 @@ def continue_branches(
         >>> [round(branch.special_points[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
-    check_not_traced("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
+    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_HINT, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = (
         check_model(model),
@@ -356,7 +356,7 @@ def continue_branches(
         (jax.tree.map(pad_batch, params), np.clip(start_values, lower_bound, upper_bound))
     )
     if isinstance(cycle, AbstractCycle) and padded_size > n_wheels:
-        cycle = jax.device_put(take_rows(cycle, wheel_indices))
+        cycle = jax.device_put(select_tree_rows(cycle, wheel_indices))
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
     branch_request = BranchRequest(
@@ -368,7 +368,7 @@ def continue_branches(
     return tuple(
         _label_gait_branch(
             branch_data[wheel_index],
-            jax.device_put(take_rows(params, wheel_index)),
+            jax.device_put(select_tree_rows(params, wheel_index)),
             name,
             model,
             step_options,
@@ -453,7 +453,7 @@ def _label_gait_branch(
     start_outcome: int,
 ) -> Branch:
     """Return the labeled branch of one wheel; `start_outcome` is the outcome of its start."""
-    start_provenance = provenance(params, model, step_options)
+    start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
     branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
     if branch_data is None:
@@ -473,7 +473,7 @@ def _label_gait_branch(
         | FORCE_PEAK_MEASURES
         if parameter_name not in MEASURES_OUTSIDE_BRANCHES
     )
-    branch_variables = make_variables(
+    branch_variables = make_labeled_variables(
         {
             variable_name: branch_data.quantity_table[variable_name]
             for variable_name in measure_names
@@ -501,9 +501,11 @@ def _label_gait_branch(
         ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
     branch_coordinates = {
-        parameter_name: xr.Variable("point", branch_data.points.p, measure_attrs(parameter_name)),
+        parameter_name: xr.Variable(
+            "point", branch_data.points.p, make_measure_attributes(parameter_name)
+        ),
         "component": component_names,
-        "leg": locked_leg_coordinate(params.n_legs),
+        "leg": make_locked_leg_coordinate(params.n_legs),
     }
     dataset = xr.Dataset(
         branch_variables | _make_stability_variables(np.asarray(branch_data.points.jacobian)),
@@ -541,10 +543,12 @@ def _make_stability_variables(jacobians: np.ndarray) -> dict[str, xr.Variable]:
             )
         },
         "spectral_radius": xr.Variable(
-            "point", spectral_radius, LIMIT_CYCLE_MEASURES["spectral_radius"].attrs
+            "point", spectral_radius, LIMIT_CYCLE_MEASURES["spectral_radius"].variable_attributes
         ),
         "spectral_margin": xr.Variable(
-            "point", 1.0 - spectral_radius, LIMIT_CYCLE_MEASURES["spectral_margin"].attrs
+            "point",
+            1.0 - spectral_radius,
+            LIMIT_CYCLE_MEASURES["spectral_margin"].variable_attributes,
         ),
     }
 
@@ -601,7 +605,7 @@ def continue_map(
         [('period_doubling', 3.0)]
     """
     check_callable("function", function, "of constants, x and p")
-    check_not_traced("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
+    require_untraced_arguments("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
     lower_bound, upper_bound = check_range("bounds", bounds)
     if not lower_bound <= check_real("p", p) <= upper_bound:
         raise ValueError(

@@ -47,8 +47,8 @@ from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
     WheelParams,
+    make_wheel_from_parameters,
     stack_parameters,
-    wheel_from_parameters,
 )
 
 FRICTION_SURPLUS_COLUMN_NAME = "friction_above_slope"
@@ -163,7 +163,7 @@ class CollocationProblem(AbstractGaitProblem):
         over the steps.
         """
         parameters = self._stack_parameters_at(wheel, p)
-        wheel_symbols = wheel_from_parameters(parameters, self.system.n_legs).symbols()
+        wheel_symbols = make_wheel_from_parameters(parameters, self.system.n_legs).symbols()
         _, phase_points_by_step = self.system.evaluate_phase_points(parameters, z)
         takeoff_accelerations = [
             compute_takeoff_acceleration(wheel_symbols, sls1) for _, sls1, _ in phase_points_by_step

@@ -50,11 +50,11 @@ from vrw_jax.continuation import (
     TestFunctionPoint,
 )
 from vrw_jax.cycles import CollocationSystem, LimitCycle, transfer_solution_to_mesh
-from vrw_jax.measures import MARGIN_MEASURES, measure_attrs, provenance
+from vrw_jax.measures import MARGIN_MEASURES, collect_provenance_attributes, make_measure_attributes
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import xarray as xr
-from vrw_jax.wheel import Outcome, WheelParams, wheel_from_parameters
+from vrw_jax.wheel import Outcome, WheelParams, make_wheel_from_parameters
 
 RANGE_EDGE_COLUMN = "edge of the box"
 """Name of the quantity that is zero if the second parameter is at an end of its range."""
@@ -260,7 +260,7 @@ class CurveTracer(NamedTuple):
     def _make_seed(self, special_point: SpecialPoint) -> CurveSeed:
         """Return the seed at a special point of a branch."""
         cycle = special_point.cycle
-        params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
+        params = make_wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
         first_value, second_value = (
             float(getattr(params, special_point_name))
             for special_point_name in self.parameter_names
@@ -597,17 +597,23 @@ class CurveTracer(NamedTuple):
         quantity_table = branch_data.quantity_table | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
         curve_variables: dict[str, Any] = {
-            column_name: ("point", quantity_table[column_name], measure_attrs(column_name))
+            column_name: (
+                "point",
+                quantity_table[column_name],
+                make_measure_attributes(column_name),
+            )
             for column_name in column_names
         }
         curve_variables["mesh_error"] = ("point", quantity_table["mesh_error"])
         curve_variables["section_state"] = (("point", "component"), quantity_table["section_state"])
         parameter_values = np.asarray(branch_data.points.p), quantity_table["second"]
         curve_coordinates = {
-            parameter: ("point", value, measure_attrs(parameter))
+            parameter: ("point", value, make_measure_attributes(parameter))
             for parameter, value in zip(self.parameter_names, parameter_values, strict=True)
         }
-        start_wheel = provenance(seed.branch_wheel.params, self.model, self.step_options)
+        start_wheel = collect_provenance_attributes(
+            seed.branch_wheel.params, self.model, self.step_options
+        )
         title = {
             "title": f"Curve of {seed.special_point_name} over {' and '.join(self.parameter_names)}"
         }

@@ -49,9 +49,9 @@ from vrw_jax.wheel import (
     PhaseInstant,
     Symbols,
     make_phases,
+    make_wheel_from_parameters,
     stack_parameters,
     transitions,
-    wheel_from_parameters,
 )
 
 LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
@@ -123,7 +123,7 @@ def find_test_quantity_group(name: str, n_legs: int) -> tuple[str, ...]:
     step_quantities = [
         name + leg
         for name, margin_name in MARGIN_MEASURES.items()
-        for leg in (leg_suffixes if margin_name.dimension else [""])
+        for leg in (leg_suffixes if margin_name.leg_dimension else [""])
     ]
     quantity_groups = (
         BIFURCATION_NAMES,
@@ -360,7 +360,7 @@ def _stack_continued_quantities(
     system: CollocationSystem, parameters: Array, is_phase_active: Array, z: CollocationSolution
 ) -> Array:
     """Return the `CONTINUED_QUANTITIES` of a collocated gait, in their order."""
-    wheel_symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
+    wheel_symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
     (phase_points,) = system.evaluate_phase_points(parameters, z)[1]
     return jnp.stack(list(_compute_continued_quantities(wheel_symbols, phase_points, z).values()))
 
@@ -370,8 +370,8 @@ def _compute_continued_quantities(
 ) -> dict[str, Array]:
     """Return the `CONTINUED_QUANTITIES` of a step by name, from the points of its phases."""
     dls, sls1, sls2 = phase_points
-    landing = transitions.land(wheel_symbols, sls2.end.q[0], *sls2.end.v)
-    fore_force, rear_force = transitions.landing_forces(wheel_symbols, landing)
+    landing = transitions.resolve_landing(wheel_symbols, sls2.end.q[0], *sls2.end.v)
+    fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing)
     dls_duration, *other_durations = z.durations[0]
     landing_forces = landing.rear_impulse.normal, fore_force.normal, rear_force.normal
     quantity_values = (
@@ -390,9 +390,9 @@ def _compute_force_decrease_rates(
     dls_phase = make_phases(s, dls.start.held_constants[0], stop_at_lift_off=False)[0]
 
     def make_instant(theta: Array, dtheta: Array) -> PhaseInstant:
-        return PhaseInstant(dls_phase, dls_phase.motion_at((theta,), (dtheta,)), None)
+        return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)), None)
 
-    compute_rear_force = lambda *state: dls_phase.end_guard(make_instant(*state))
+    compute_rear_force = lambda *state: dls_phase.compute_end_guard(make_instant(*state))
     start_state, end_state = (*dls.start.q, *dls.start.v), (*dls.end.q, *dls.end.v)
     state_rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
     first_force, force_rate = jax.jvp(compute_rear_force, start_state, state_rates)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from vrw_jax.continuation import ContinuationResult, ContinuationStatus
-from vrw_jax.numerics import take_rows
+from vrw_jax.numerics import select_tree_rows
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def continue_beyond_jumps(
         is_stalled = is_stalled & (n_points > 1) & ~has_search_failed
         if not is_stalled.any():
             break
-        end_points = take_rows(
+        end_points = select_tree_rows(
             direction_results.points, (branch_indices, np.maximum(n_points - 1, 0))
         )
         direction_signs = np.sign(end_points.fraction_rate)
@@ -94,7 +94,7 @@ def continue_beyond_jumps(
                 )
             )
             new_results = jax.tree.map(np.asarray, continue_branches(*continuation_arguments))
-            first_points = take_rows(new_results.points, (branch_indices, 0))
+            first_points = select_tree_rows(new_results.points, (branch_indices, 0))
             is_gait_found = is_requested & (np.asarray(new_results.n_points) > 1)
             first_quantities = continuation.make_table(first_points, wheel_indices)
             is_gait_found = is_gait_found & continuation.is_same_gait(

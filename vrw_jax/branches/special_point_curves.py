@@ -10,10 +10,10 @@ from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, Cur
 from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
-from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.numerics import StepOptions, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_names, check_range, check_type
-from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 
@@ -129,12 +129,12 @@ def continue_special_points(
         step_options,
         measures_force_peaks=not set(names).isdisjoint(FORCE_QUANTITY_NAMES),
     )
-    params = wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
+    params = make_wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
     seeds_by_name: dict[str, CurveSeed] = {}
     for parameter_index, parameter in enumerate(parameters):
         if set(names) - set(seeds_by_name):
             curve_seeds = curve_tracer.find_seeds(
-                parameter_index, *take_rows((params, cycle), None)
+                parameter_index, *select_tree_rows((params, cycle), None)
             )
             start_value = float(getattr(params, parameter))
             distance_order = np.argsort(

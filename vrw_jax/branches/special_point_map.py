@@ -229,11 +229,11 @@ def _collect_signed_quantities(
     )
     for name in (name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES):
         measure_values = scan_dataset[name].transpose(*parameter_names, ...).values
-        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[name].dimension else []
+        leg_numbers = scan_dataset.leg.values if MARGIN_MEASURES[name].leg_dimension else []
         signed_quantities |= {
             f"{name}[{leg}]": measure_values[..., i] for i, leg in enumerate(leg_numbers)
         }
-        if not MARGIN_MEASURES[name].dimension:
+        if not MARGIN_MEASURES[name].leg_dimension:
             signed_quantities[name] = measure_values
     return signed_quantities
 

@@ -25,7 +25,7 @@ from vrw_jax.scans import (
 )
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import find_model_class, list_model_config_names
-from vrw_jax.validation import check_known_name, check_range, format_value, suggest_name
+from vrw_jax.validation import check_range, format_name_suggestion, format_value, require_known_name
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_DOMAINS,
@@ -33,7 +33,7 @@ from vrw_jax.wheel import (
     WheelParams,
     check_parameter_name,
     parameter_sets,
-    refuse_symbol,
+    raise_for_parameter_symbol,
 )
 
 RANDOM_DESIGN_FUNCTIONS = {
@@ -98,7 +98,8 @@ class ScanConfig:
         cls, config_table: Mapping[str, object], model_class: type[AbstractWheel]
     ) -> "ScanConfig":
         """Return the settings of `[scan]`. Raise a ValueError if the model does not have a
-        requested measure."""
+        requested measure.
+        """
         _require_known_keys(config_table, cls.__dataclass_fields__, "[scan]", "settings")
         measure_names = config_table.get("measures")
         slope_sd = config_table.get("slope_sd")
@@ -301,7 +302,8 @@ class Config:
 
     def make_wheel(self, changed_values: Mapping[str, float | int] | None = None) -> WheelParams:
         """Return the wheel: Table 1, changed by the values of the config and then by
-        `changed_values`."""
+        `changed_values`.
+        """
         parameter_values: dict[str, Any] = {**self.wheel_values, **(changed_values or {})}
         return WheelParams(**parameter_values)
 
@@ -319,7 +321,7 @@ def load_config(config_path: str | Path) -> Config:
     """Return the checked config of a file. Raise a ValueError if the file is invalid."""
     config_path = Path(config_path)
     if not config_path.exists():
-        name_suggestion = suggest_name(
+        name_suggestion = format_name_suggestion(
             config_path.name,
             (neighbor_path.name for neighbor_path in config_path.parent.glob("*.toml")),
         )
@@ -467,7 +469,7 @@ def _parse_wheel_table(config_table: Mapping[str, object]) -> dict[str, float | 
     _require_known_keys(config_table, known_keys, "[wheel]", "parameters")
     parameter_values: dict[str, float | int] = {}
     if (parameter_set_name := config_table.get(PARAMETER_SET_KEY)) is not None:
-        check_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
+        require_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
         parameter_values |= parameter_sets[str(parameter_set_name)].values
     for parameter_name, given_value in config_table.items():
         if parameter_name == PARAMETER_SET_KEY:
@@ -487,7 +489,7 @@ def _parse_model_table(
     """Return the name and the settings of the model of `[model]`."""
     _raise_for_renamed_keys(config_table, "[model]")
     model_name = config_table.get("name", Config.model_name)
-    check_known_name(model_name, list_model_config_names(), "model")
+    require_known_name(model_name, list_model_config_names(), "model")
     assert isinstance(model_name, str)
     default_settings = {
         model_field.name: model_field.default
@@ -621,7 +623,8 @@ def _parse_parameter_range(
     range_name: str, given_range: object, parameter_name: str = ""
 ) -> tuple[float, float]:
     """Return lower and upper bound in the domain of a parameter, by default the parameter
-    `range_name`."""
+    `range_name`.
+    """
     if not (isinstance(given_range, list) and len(given_range) == 2):
         raise _make_value_error(
             range_name, given_range, f"a range of two numbers: write {range_name} = [lower, upper]"
@@ -635,12 +638,13 @@ def _parse_parameter_range(
 
 def _parse_parameter_value(parameter_name: str, given_value: object) -> float:
     """Return a value as a number. Raise a ValueError if the value is not in the domain of the
-    parameter."""
+    parameter.
+    """
     parameter_value = _parse_finite_number(
         given_value, parameter_name, must_be_positive=parameter_name == FRICTION_NAME
     )
     if parameter_name != FRICTION_NAME:
-        PARAMETER_DOMAINS[parameter_name].require_inside(parameter_name, parameter_value)
+        PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
     return parameter_value
 
 
@@ -680,10 +684,11 @@ def _require_known_keys(
     """Raise a ValueError if a table has a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for key in config_table:
-        refuse_symbol(key, allowed_keys)
+        raise_for_parameter_symbol(key, allowed_keys)
         if key not in allowed_keys:
             raise ValueError(
-                f"{table_location} has the unknown key '{key}'{suggest_name(key, allowed_keys)}: "
+                f"{table_location} has the unknown key "
+                f"'{key}'{format_name_suggestion(key, allowed_keys)}: "
                 f"its {key_kind} are {', '.join(allowed_keys)}."
             )
 
@@ -699,7 +704,8 @@ def _raise_for_renamed_keys(config_table: Mapping[str, object], table_location: 
 
 def _make_value_error(setting_name: str, given_value: object, requirement_text: str) -> ValueError:
     """Return the error about a value that does not satisfy a requirement. The message writes the
-    value as in TOML."""
+    value as in TOML.
+    """
     value_text = format_value(given_value)
     if isinstance(given_value, bool):
         value_text = value_text.lower()

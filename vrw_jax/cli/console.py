@@ -45,7 +45,8 @@ def report_command_errors(
     interruption_message: str = "stopped; nothing was written.",
 ) -> Iterator[None]:
     """Return a context that reports an error in one sentence with exit code 2, and a Ctrl-C with
-    exit code 130."""
+    exit code 130.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -397,7 +398,7 @@ def _print_step_margins(step_result: "StepResult") -> None:
         margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))
         lowest_margin, margin_label = float(margin_values.min()), margin_description.long_name
         violation_mark = "[green]holds[/]" if lowest_margin >= 0.0 else "[bold red]broken[/]"
-        if margin_description.dimension and lowest_margin < 0.0:
+        if margin_description.leg_dimension and lowest_margin < 0.0:
             leg_texts = [str(leg_index + 3) for leg_index in np.flatnonzero(margin_values < 0.0)]
             margin_label += f" (broken at legs {', '.join(leg_texts)})"
         margin_rows.append(

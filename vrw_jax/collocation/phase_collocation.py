@@ -39,13 +39,13 @@ from vrw_jax.numerics import (
     LaneArray,
     Vector,
     apply_matrix,
-    contract_axes,
-    fusion_barrier,
-    invert_small,
+    contract_inner_axis,
+    evaluate_with_jvps,
+    evaluate_with_partials,
+    invert_small_matrices,
+    make_fusion_barrier,
     solve_node_equations,
-    value_and_jvps,
-    value_and_partials,
-    weighted_sum,
+    sum_with_weights,
 )
 
 PhaseConstants = tuple[Elementwise, ...]
@@ -151,7 +151,7 @@ class _LinearizationContext(NamedTuple):
     def value_and_tangents(self, function: Callable, point: tuple, point_tangents: tuple) -> tuple:
         """Return the value and the tangents of `function(*point, *constants)`."""
         if not self.parameter_indices:
-            return value_and_jvps(
+            return evaluate_with_jvps(
                 lambda *point: function(*point, *self.constants), point, point_tangents
             )
         n_trailing_axes = point_tangents[0].shape[0] - self.n_tangents
@@ -162,7 +162,7 @@ class _LinearizationContext(NamedTuple):
         constants_tangents = (
             jnp.pad(tangent, zero_tangents) for tangent in self.constants_tangents
         )
-        return value_and_jvps(
+        return evaluate_with_jvps(
             function, (*point, *self.constants), (*point_tangents, *constants_tangents)
         )
 
@@ -174,7 +174,7 @@ def _make_linearization_context(
     compute_constants: Callable[..., PhaseConstants],
 ) -> _LinearizationContext:
     """Return the context of a linearization, with the constants and their tangents."""
-    prevent_fusion = fusion_barrier(parameters)
+    prevent_fusion = make_fusion_barrier(parameters)
     dtype, lanes = parameters.dtype, parameters.shape[1:]
     unit_parameter_tangents = np.eye(parameters.shape[0], dtype=dtype)[list(parameter_indices)]
     parameter_tangents = tuple(
@@ -182,7 +182,7 @@ def _make_linearization_context(
         for x in unit_parameter_tangents.T
     )
     if parameter_indices:
-        constants, constants_tangents = value_and_jvps(
+        constants, constants_tangents = evaluate_with_jvps(
             compute_constants, tuple(parameters), parameter_tangents
         )
     else:
@@ -258,10 +258,10 @@ def _evaluate_interval_end(
     duration_fraction, h, accelerations = mesh_interval
     _, q, v, _, q_tangents, v_tangents = tangent_state
     duration_unit = _make_unit_tangent(q_tangents.shape[0], -1, h.dtype)[:, 0]
-    rate_increment = weighted_sum(END_WEIGHTS, accelerations)
-    position_increment = weighted_sum(DOUBLE_END_WEIGHTS, accelerations)
-    rate_increment_tangents = weighted_sum(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
-    position_increment_tangents = weighted_sum(DOUBLE_END_WEIGHTS, acceleration_tangents)
+    rate_increment = sum_with_weights(END_WEIGHTS, accelerations)
+    position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, accelerations)
+    rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(0, 1)
+    position_increment_tangents = sum_with_weights(DOUBLE_END_WEIGHTS, acceleration_tangents)
     position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
     q_tangents = (
         q_tangents
@@ -323,7 +323,7 @@ def _linearize_residual(
     # The partial derivatives stay separate arrays at first, because each is a small kernel and
     # stacking them is a copy.
     residual_value, partials_by_output = linearization_context.prevent_fusion(
-        value_and_partials(evaluate_residual, residual_arguments)
+        evaluate_with_partials(evaluate_residual, residual_arguments)
     )
     partials_by_argument = list(zip(*partials_by_output, strict=True))
     jacobian = jnp.stack(
@@ -600,11 +600,11 @@ def linearize_cycle(
     right_hand_sides = drop_section_tangents(return_tangents) + correction_unit_vector * (
         return_state - section_state
     )
-    closing_matrix = invert_small(
+    closing_matrix = invert_small_matrices(
         jnp.eye(linearization_context.section_size, dtype=dtype)[:, :, None] - monodromy
     )
     closed_section_tangents = jnp.swapaxes(
-        contract_axes(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
+        contract_inner_axis(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
     def close_cycle(tangents: Array) -> Array:

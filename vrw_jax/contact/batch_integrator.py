@@ -38,7 +38,7 @@ from vrw_jax.integrator import (
     find_guard_minimum,
     fit_guard_parabola,
 )
-from vrw_jax.numerics import StepOptions, tree_where
+from vrw_jax.numerics import StepOptions, select_tree_leaves
 from vrw_jax.wheel import Outcome, Symbols, compute_wheel_units
 
 N_CONTACT_ROWS = 9
@@ -261,7 +261,7 @@ def init_interval(
     roundoff = compute_guard_scales(dynamics) * (
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
-    time_unit = compute_wheel_units(dynamics.s).time
+    time_unit = compute_wheel_units(dynamics.s).time_unit
     min_guard_rate = -roundoff / (interval_options.max_roundoff_fall_time * time_unit)
     is_initiating = is_initiating | ((guard_values <= roundoff) & (guard_rates > min_guard_rate))
     is_triggered = ~is_initiating & (
@@ -322,7 +322,7 @@ def integrate_interval(
     dynamics = dynamics_fn(input_columns)
     guard_scales, options = (
         compute_guard_scales(dynamics),
-        compute_wheel_units(dynamics.s).scale_times(options),
+        compute_wheel_units(dynamics.s).scale_times_to_seconds(options),
     )
 
     def try_step(state: IntervalState) -> IntervalState:
@@ -560,12 +560,12 @@ def integrator_step(
     )
     status = jnp.where(is_singular, Outcome.PAINLEVE_PARADOX, status)
     return state._replace(
-        point=tree_where(is_state_updated, end_point, start_point),
+        point=select_tree_leaves(is_state_updated, end_point, start_point),
         guard_values=jnp.where(is_accepted, attempt.guard_values, state.guard_values),
         interval_accumulators=interval_accumulators,
         h=jnp.where(is_running, next_h, h),
         time=time,
-        event_bracket=tree_where(is_running, next_bracket, event_bracket),
+        event_bracket=select_tree_leaves(is_running, next_bracket, event_bracket),
         status=jnp.where(is_running, status, state.status).astype(jnp.int32),
         triggered_guard=jnp.where(has_reached_event, event.guard, state.triggered_guard),
         n_solver_steps=state.n_solver_steps + is_running,

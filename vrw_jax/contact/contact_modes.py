@@ -34,7 +34,7 @@ from vrw_jax.contact.mechanics import (
     SlotPair,
     prevent_fusion,
 )
-from vrw_jax.numerics import Elementwise, tree_where
+from vrw_jax.numerics import Elementwise, select_tree_leaves
 from vrw_jax.wheel import Symbols, compute_wheel_units
 
 Friction = Elementwise | SlotPair
@@ -725,13 +725,13 @@ def choose_combination(
         combination, combination_violation, n_admissible = _least_violating(
             evaluate_combination, combinations
         )
-        best_combination, lowest_violation = tree_where(
+        best_combination, lowest_violation = select_tree_leaves(
             combination_violation < lowest_violation,
             (combination, combination_violation),
             (best_combination, lowest_violation),
         )
         n_solutions = n_solutions + n_admissible
-        return tree_where(
+        return select_tree_leaves(
             is_unfinished(state),
             _EnumerationState(remaining_mask, best_combination, lowest_violation, n_solutions),
             state,
@@ -786,7 +786,7 @@ def is_release_consistent(
         jnp.where(is_liftoff, -sin, release_direction * cos),
         jnp.where(is_liftoff, cos, release_direction * sin),
     )
-    acceleration_unit = compute_wheel_units(s).acceleration
+    acceleration_unit = compute_wheel_units(s).acceleration_unit
     shift_pair = lambda slot_pair, shift: (
         slot_pair[0] - acceleration_unit * shift * slot_weights[0],
         slot_pair[1] - acceleration_unit * shift * slot_weights[1],

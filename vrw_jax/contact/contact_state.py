@@ -37,7 +37,12 @@ from vrw_jax.contact.mechanics import (
     sum_over_legs,
 )
 from vrw_jax.numerics import Elementwise, Scalar
-from vrw_jax.wheel import Symbols, compute_wheel_units, is_at_rest, is_still
+from vrw_jax.wheel import (
+    Symbols,
+    are_coordinates_at_rest,
+    are_rates_negligible,
+    compute_wheel_units,
+)
 
 PackedState = Float[Array, "dim ..."]
 """Hub (x, z, theta), their rates, leg lengths, their rates, then the accumulators: see
@@ -349,8 +354,13 @@ def compute_guard_scales(dynamics: ModeDynamics) -> Array:
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     """Return the wheel's units of (hub x, z, theta, lengths) and of their rates."""
     units, angle_unit = compute_wheel_units(s), jnp.ones_like(s.L0)
-    position_units = [units.length, units.length, angle_unit, *[units.length] * s.n]
-    rate_units = [units.velocity, units.velocity, units.rate, *[units.velocity] * s.n]
+    position_units = [units.length_unit, units.length_unit, angle_unit, *[units.length_unit] * s.n]
+    rate_units = [
+        units.velocity_unit,
+        units.velocity_unit,
+        units.rate_unit,
+        *[units.velocity_unit] * s.n,
+    ]
     return jnp.stack(position_units), jnp.stack(rate_units)
 
 
@@ -361,8 +371,8 @@ def is_wheel_at_rest(
 
     - `atol`: absolute tolerance in the wheel's units.
     """
-    rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time
-    return is_at_rest(rates, accelerations, rate_units, time_unit, atol)
+    rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time_unit
+    return are_coordinates_at_rest(rates, accelerations, rate_units, time_unit, atol)
 
 
 def choose_stopping_guard(
@@ -381,7 +391,7 @@ def choose_stopping_guard(
     slip_signs = slip_sign(dynamics.slot_modes)
     has_just_slid = dynamics.contact_slots.gather_flags(dynamics.contact_state.has_just_slid)
     is_stopping = guard == guard_layout.rolling_rate
-    is_stopping &= is_still(rates, compute_state_units(dynamics.s)[1], atol)
+    is_stopping &= are_rates_negligible(rates, compute_state_units(dynamics.s)[1], atol)
     for slot_index in reversed(range(2)):
         slide_ends = is_stopping & (slip_signs[slot_index] != 0.0) & ~has_just_slid[slot_index]
         guard = jnp.where(slide_ends, guard_layout.slip_end + slot_index, guard)
@@ -391,7 +401,9 @@ def choose_stopping_guard(
 def compute_packed_units(s: Symbols) -> PackedState:
     """Return the wheel's unit of each entry of `pack_state`."""
     units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
-    accumulator_units = Accumulators(units.time, units.energy, units.energy, units.length)
+    accumulator_units = Accumulators(
+        units.time_unit, units.energy_unit, units.energy_unit, units.length_unit
+    )
     packed_units = (
         position_units[:3],
         rate_units[:3],

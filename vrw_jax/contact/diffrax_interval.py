@@ -112,7 +112,7 @@ def integrate_by_diffrax(
         is_running,
         options,
         compute_packed_units(dynamics.s),
-        compute_wheel_units(dynamics.s).time,
+        compute_wheel_units(dynamics.s).time_unit,
     )
     end_motion, end_accumulators = unpack_state(end.state)
     q, v = pack_coordinates(end_motion)
@@ -153,7 +153,7 @@ def sample_by_diffrax(
         scatter = dynamics.contact_slots.scatter
         return scatter(solution.tangential), scatter(solution.normal)
 
-    units = compute_packed_units(dynamics.s), compute_wheel_units(dynamics.s).time
+    units = compute_packed_units(dynamics.s), compute_wheel_units(dynamics.s).time_unit
     states = sample_in_units(
         partial(vector_field, dynamics), start, duration, n_samples, options, *units
     )

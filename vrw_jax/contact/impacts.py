@@ -53,7 +53,7 @@ from vrw_jax.contact.mechanics import (
     slot_friction,
     stop_gradients,
 )
-from vrw_jax.numerics import Elementwise, run_if_any, tree_where
+from vrw_jax.numerics import Elementwise, run_if_any, select_tree_leaves
 from vrw_jax.wheel import Symbols
 
 
@@ -189,7 +189,7 @@ def _solve_stopper_lcp(
         max_violation = jnp.maximum(
             jnp.max(violation, axis=0), level_solution.chosen_combination.violation
         )
-        best_solution = tree_where(
+        best_solution = select_tree_leaves(
             max_violation < best_solution[0],
             (max_violation, is_held, level_solution.chosen_combination),
             best_solution,
@@ -207,7 +207,7 @@ def _solve_stopper_lcp(
         enumerated_legs = jnp.where(
             is_tested, ((combination_code >> tested_rank) & 1) == 1, is_at_stopper
         )
-        return tree_where(
+        return select_tree_leaves(
             is_unfinished(state),
             (
                 jnp.where(is_pivoting, switched_legs, enumerated_legs),
@@ -618,7 +618,7 @@ def _bring_to_rest(
     )
     rest_modes = jnp.where(is_slip_reversed, ContactMode.STICK, rest_modes)
     return (
-        tree_where(
+        select_tree_leaves(
             has_changed,
             project_motion(contact_law.s, motion, rest_modes, is_locked, contact_law.friction),
             motion,
@@ -731,7 +731,7 @@ def resolve_event(
     rest_result = _bring_to_rest(
         contact_law, velocity_solution.motion, contact_slots, impact_modes, stays_locked, was_locked
     )
-    motion_after, contact_modes, is_at_stopper = tree_where(
+    motion_after, contact_modes, is_at_stopper = select_tree_leaves(
         is_impact, rest_result, (motion, contact_state.contact_modes, was_locked)
     )
     directions = leg_directions(s, motion.theta)

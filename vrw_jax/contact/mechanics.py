@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.numerics import Elementwise, Scalar, sine_cosine
+from vrw_jax.numerics import Elementwise, Scalar, compute_sine_cosine
 from vrw_jax.wheel import Symbols
 
 LegArray = Float[Array, "n_legs ..."]
@@ -58,7 +58,7 @@ def leg_directions(s: Symbols, theta: Elementwise) -> LegDirections:
     leg_angles = (s.alpha * np.arange(s.n)).reshape(-1, *(1,) * jnp.ndim(theta))
     half_turns = lax.stop_gradient(jnp.floor(theta / math.pi + 0.5))
     is_odd = half_turns - 2.0 * jnp.floor(0.5 * half_turns)
-    sin, cos = (x - 2.0 * is_odd * x for x in sine_cosine(theta - math.pi * half_turns))
+    sin, cos = (x - 2.0 * is_odd * x for x in compute_sine_cosine(theta - math.pi * half_turns))
     sin_leg, cos_leg = np.sin(leg_angles), np.cos(leg_angles)
     return LegDirections(sin * cos_leg + cos * sin_leg, cos * cos_leg - sin * sin_leg)
 

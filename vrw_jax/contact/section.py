@@ -13,7 +13,7 @@ from vrw_jax.models import (
     replace_invalid_inputs,
 )
 from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, length_at_touchdown
+from vrw_jax.wheel import Symbols, WheelParams, WheelUnits, compute_length_at_touchdown
 
 FullState = Float[Array, "n_full ..."]
 """State (theta-, dtheta-, vx-, vz-, L_1 ... L_n, dL_1 ... dL_n, code_1 ... code_n) just before the
@@ -37,9 +37,9 @@ def compute_section_units(units: WheelUnits, n: int) -> list[Elementwise]:
 
     Angles and codes have the unit 1.
     """
-    angle_unit = units.length / units.length
-    hub_units = [angle_unit, units.rate, units.velocity, units.velocity]
-    return [*hub_units, *[units.length] * n, *[units.velocity] * n, *[angle_unit] * n]
+    angle_unit = units.length_unit / units.length_unit
+    hub_units = [angle_unit, units.rate_unit, units.velocity_unit, units.velocity_unit]
+    return [*hub_units, *[units.length_unit] * n, *[units.velocity_unit] * n, *[angle_unit] * n]
 
 
 def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
@@ -48,7 +48,7 @@ def embed_section_state(s: Symbols, x: Float[Array, "3 ..."]) -> FullState:
     Leg 1 is at rest on the ground, and all other legs are in the air on their stoppers.
     """
     theta, dtheta, dL1 = x
-    sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), length_at_touchdown(s, theta)
+    sin, cos, L1 = jnp.sin(theta), jnp.cos(theta), compute_length_at_touchdown(s, theta)
     is_leg_1 = (jnp.arange(s.n) == 0).reshape(-1, *(1,) * theta.ndim)
     vx, vz = dL1 * sin + L1 * dtheta * cos, dL1 * cos - L1 * dtheta * sin
     return jnp.concatenate(

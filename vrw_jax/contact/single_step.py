@@ -46,7 +46,7 @@ from vrw_jax.contact.walk_kernel import (
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import ButcherTableau, load_explicit_tableau, sample_at_equal_times
 from vrw_jax.models import split_jacobian_by_leaf
-from vrw_jax.numerics import ForwardFunction, StepOptions, opaque_condition, unbatch
+from vrw_jax.numerics import ForwardFunction, StepOptions, make_opaque_condition, unbatch
 from vrw_jax.runtime import compile_cached_lane_function
 from vrw_jax.wheel import stack_parameters
 
@@ -364,7 +364,7 @@ def build_contact_step_sampler(
             )
             return lane_state, jax.tree.map(write_entry, interval_log, interval_entry)
 
-        should_continue = lambda state: opaque_condition(
+        should_continue = lambda state: make_opaque_condition(
             state[0].outcome == STATUS_UNFINISHED, state[0].counters.n_events
         )
         lane_state, interval_log = lax.while_loop(

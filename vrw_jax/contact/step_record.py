@@ -27,7 +27,7 @@ from vrw_jax.contact.impacts import (
 from vrw_jax.contact.mechanics import WheelMotion, landing_position
 from vrw_jax.contact.section import FullState, pack_section_state
 from vrw_jax.models import AbstractContactStep
-from vrw_jax.numerics import Elementwise, StepOptions, tree_where
+from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
 from vrw_jax.wheel import Outcome, Symbols, replace_rest_outcome
 
 
@@ -237,7 +237,7 @@ def record_event(
         jnp.stack(result.tangential_impulse),
     )
     previous_values = details.post_impact, details.landing_normal, details.landing_tangential
-    post_impact, normal, tangential = tree_where(is_first, opening_values, previous_values)
+    post_impact, normal, tangential = select_tree_leaves(is_first, opening_values, previous_values)
     stopper_impulse = jnp.minimum(details.margins.stopper_impulse, result.stopper_impulse)
     return details._replace(
         post_impact=post_impact,

@@ -47,7 +47,7 @@ from vrw_jax.validation import (
     check_int,
     check_reals,
     check_type,
-    raise_for_renamed_arguments,
+    with_renamed_arguments,
 )
 from vrw_jax.wheel import (
     FRICTION_NAME,
@@ -106,7 +106,7 @@ def _convert_restitution(value: Any) -> Array | None:
     return restitution
 
 
-@raise_for_renamed_arguments(infinite="infinite_friction_rule")
+@with_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractWheel):
     """Model of the wheel whose feet push on the ground and slide by Coulomb's law; no leg has a
     fixed role.

@@ -56,14 +56,19 @@ from vrw_jax.contact.step_record import (
     record_interval,
 )
 from vrw_jax.integrator import ButcherTableau
-from vrw_jax.numerics import StepOptions, opaque_condition, tree_where, zeros_like_output
+from vrw_jax.numerics import (
+    StepOptions,
+    make_opaque_condition,
+    make_zeros_like_output,
+    select_tree_leaves,
+)
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     Outcome,
     Symbols,
     compute_symbols,
+    make_wheel_from_parameters,
     stack_parameters,
-    wheel_from_parameters,
 )
 
 N_PARAMETERS = len(PARAMETER_NAMES)
@@ -216,7 +221,7 @@ class BatchWalkSettings(NamedTuple):
         """
         motion, contact_state = unpack_section_state(self.unpack_columns(input_columns)[0], x)
         dynamics = self.make_dynamics(input_columns, contact_state)
-        interval = zeros_like_output(lambda: self.begin_interval(dynamics, motion))
+        interval = make_zeros_like_output(lambda: self.begin_interval(dynamics, motion))
         q, v = pack_coordinates(motion)
         point = IntervalPoint(q, v, jnp.full_like(interval.point.dynamics_rows, jnp.inf))
         interval = interval._replace(
@@ -310,12 +315,12 @@ class BatchWalkSettings(NamedTuple):
         # A landing of the foremost foot opens the next step. Then every event is processed.
         opens_step, motion = has_landed & ~has_ended, motion_from_point(interval.point)
         opened_state = unpack_section_state(s, pack_section_state(motion, interval.contact_state))
-        motion, contact_state = tree_where(
+        motion, contact_state = select_tree_leaves(
             opens_step, opened_state, (motion, interval.contact_state)
         )
         new_counters, *new_records = self._init_records(motion.x)
         new_counters = new_counters._replace(n_solver_steps=counters.n_solver_steps)
-        counters, details, step_accumulators = tree_where(
+        counters, details, step_accumulators = select_tree_leaves(
             opens_step, (new_counters, *new_records), (counters, details, step_accumulators)
         )
         guard = jnp.where(opens_step, guard_layout.landing, interval.triggered_guard)
@@ -345,8 +350,10 @@ class BatchWalkSettings(NamedTuple):
         has_interval_ended = (interval.status != LaneStatus.RUNNING) & (
             lane_state.outcome == STATUS_UNFINISHED
         )
-        return tree_where(
-            has_interval_ended, tree_where(has_ended, ended_lane, continued_lane), lane_state
+        return select_tree_leaves(
+            has_interval_ended,
+            select_tree_leaves(has_ended, ended_lane, continued_lane),
+            lane_state,
         )
 
     def compute_result(self, lane_state: LaneState, tilt: Array | None) -> Any:
@@ -389,7 +396,7 @@ class BatchWalkSettings(NamedTuple):
     def replace_invalid(self, input_columns: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return input columns and states with invalid lanes replaced, and the valid lanes."""
         start_arguments = (
-            wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
+            make_wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
             input_columns[N_PARAMETERS],
             x,
             self.tilt(input_columns),
@@ -474,7 +481,7 @@ def run_walks(walk_settings: BatchWalkSettings, input_columns: Array, x: Array) 
         walk_settings, input_columns, lane_state
     )[1]
     should_continue = lambda lane_state: jnp.any(
-        opaque_condition(lane_state.outcome == STATUS_UNFINISHED, lane_state.counters.n_events)
+        make_opaque_condition(lane_state.outcome == STATUS_UNFINISHED, lane_state.counters.n_events)
     )
     lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
     return BatchWalkResult(

@@ -42,7 +42,7 @@ from vrw_jax.contact.walk_kernel import (
     LaneState,
 )
 from vrw_jax.integrator import ButcherTableau, compute_real_stability_limit
-from vrw_jax.numerics import StepOptions, run_if_any, tree_where
+from vrw_jax.numerics import StepOptions, run_if_any, select_tree_leaves
 from vrw_jax.wheel import compute_wheel_units
 
 
@@ -297,7 +297,7 @@ def _integrate_with_tangents(
     """Return the result of `integrate_interval`, and the tangent rows at the event."""
     dynamics = dynamics_fn(input_columns)
     guard_scales, last_stage = compute_guard_scales(dynamics), len(tableau.nodes) - 1
-    options = compute_wheel_units(dynamics.s).scale_times(options)
+    options = compute_wheel_units(dynamics.s).scale_times_to_seconds(options)
     has_later_moving_legs = _has_later_moving_legs(
         tangents, tangent_template, initial_state.contact_state
     )
@@ -360,7 +360,7 @@ def _integrate_with_tangents(
             end_tangent = _IntervalTangent(
                 q, v, interval_accumulators, stage_tangents[last_stage], start_tangent.time
             )
-            return tree_where(
+            return select_tree_leaves(
                 is_state_updated,
                 end_tangent,
                 start_tangent._replace(dynamics_rows=stage_tangents[0]),

@@ -19,11 +19,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.continuation.crossings import BranchJumpSuspicion, is_multiplier_change_explained
-from vrw_jax.numerics import Scalar, StatusCode, batch_sizes, tree_where, value_and_jacobian
+from vrw_jax.numerics import (
+    Scalar,
+    StatusCode,
+    batch_sizes,
+    evaluate_with_jacobian,
+    select_tree_leaves,
+)
 from vrw_jax.validation import (
     check_int,
     check_positive,
-    raise_for_renamed_arguments,
+    with_renamed_arguments,
 )
 
 ProblemUnknowns = Any
@@ -31,7 +37,7 @@ ProblemUnknowns = Any
 SectionVector = Float[Array, " n"]
 
 
-@raise_for_renamed_arguments(
+@with_renamed_arguments(
     first_step="initial_ds",
     largest_step="max_ds",
     smallest_step="min_ds",
@@ -146,7 +152,7 @@ def make_fixed_point_newton_step(
     from the image.
     """
     continuous_map = lambda x, p: return_map(jnp.concatenate([x, z[n_continuous:]]), p)
-    image_point, jacobians = value_and_jacobian(continuous_map, z[:n_continuous], p)
+    image_point, jacobians = evaluate_with_jacobian(continuous_map, z[:n_continuous], p)
     jacobian_z, jacobian_p = (jacobian[:n_continuous] for jacobian in jacobians)
     map_defect = image_point - z
     right_sides = jnp.stack([map_defect[:n_continuous], jacobian_p], -1)
@@ -702,19 +708,19 @@ def iterate_branches(
             is_accepted=trial_assessment.is_accepted & ~is_suspicious,
             has_failed=trial_assessment.has_failed | is_suspicious,
         )
-        current_point = tree_where(
+        current_point = select_tree_leaves(
             trial_assessment.is_accepted, new_point, continuation_state.current_point
         )
-        first_point = tree_where(
+        first_point = select_tree_leaves(
             trial_assessment.is_accepted & (continuation_state.n_points == 0),
             new_point,
             continuation_state.first_point,
         )
         # The cubic of the prediction must not cross a kink.
-        previous_point = tree_where(
+        previous_point = select_tree_leaves(
             trial_assessment.is_kink, new_point, continuation_state.current_point
         )
-        previous_point = tree_where(
+        previous_point = select_tree_leaves(
             trial_assessment.is_accepted, previous_point, continuation_state.previous_point
         )
         n_points = continuation_state.n_points + trial_assessment.is_accepted
@@ -729,7 +735,7 @@ def iterate_branches(
             problem, previous_point, current_point, n_points > 1, ds, parameter_bounds
         )
         is_finished = trial_assessment.is_accepted | trial_assessment.has_failed
-        next_trial_point = tree_where(
+        next_trial_point = select_tree_leaves(
             is_finished,
             next_trial_point,
             trial_point._replace(z=corrector_state.z, fraction=corrector_state.fraction),
@@ -760,7 +766,7 @@ def iterate_branches(
         )
         return next_state, new_point, trial_assessment.is_accepted
 
-    # Buffers are updated outside of `tree_where`, which would copy them in every iteration.
+    # Buffers are updated outside of `select_tree_leaves`, which would copy them in every iteration.
     continuation_state, branch_points = branch_batch
     next_states, new_points, is_accepted = jax.vmap(iterate_branch)(
         args_by_branch, direction_signs, continuation_state, newton_steps
@@ -774,7 +780,7 @@ def iterate_branches(
         new_points, mode="drop"
     )
     branch_points = jax.tree.map(write_point, branch_points, new_points._replace(tangent=()))
-    return jax.vmap(tree_where)(
+    return jax.vmap(select_tree_leaves)(
         are_branches_active(branch_batch), next_states, continuation_state
     ), branch_points
 

@@ -31,7 +31,7 @@ from vrw_jax.continuation.arclength import (
     iterate_branches,
     make_continuation_result,
 )
-from vrw_jax.numerics import take_rows, tree_where
+from vrw_jax.numerics import select_tree_leaves, select_tree_rows
 
 
 class PlaneSolveState(NamedTuple):
@@ -88,7 +88,7 @@ def iterate_plane_solve(
     )
     # A trial that is not finite keeps its state, so that no NaN reaches other batch elements.
     is_valid = jnp.isfinite(next_corrector.correction_norm)
-    next_corrector = tree_where(is_valid, next_corrector, corrector_state)._replace(
+    next_corrector = select_tree_leaves(is_valid, next_corrector, corrector_state)._replace(
         correction_norm=next_corrector.correction_norm
     )
     # The last Jacobian is exact if the correction is negligible; then no other iteration follows.
@@ -220,7 +220,7 @@ def _linearize_selected(
     lower_bound, upper_bound = np.asarray(parameter_bounds)
     p = lower_bound + (upper_bound - lower_bound) * np.asarray(fraction)
     selected_steps = problem.linearize(
-        *jax.device_put(take_rows((args_by_branch, z, p), is_selected))
+        *jax.device_put(select_tree_rows((args_by_branch, z, p), is_selected))
     )
     fill_with_nan = lambda selected_values: np.full(
         (len(is_selected), *selected_values.shape[1:]), np.nan
@@ -300,7 +300,7 @@ def _iterate_unfinished_plane_solves(
         next_state = iterate_plane_solve(
             problem, options, parameter_bounds, constraint_plane, plane_solve_state, newton_step
         )
-        return tree_where(
+        return select_tree_leaves(
             needs_newton_iteration(options, plane_solve_state), next_state, plane_solve_state
         )
 

@@ -11,15 +11,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.hybrid import ReturnMap, Termination, find_program
-from vrw_jax.numerics import Scalar, value_and_jacobian, zero_tangent
-from vrw_jax.printing import describe_elements, format_numbers, format_quantity, format_text
+from vrw_jax.numerics import Scalar, evaluate_with_jacobian, make_zero_tangent
+from vrw_jax.printing import (
+    format_heading_and_rows,
+    format_numbers,
+    format_quantity,
+    map_text_of_elements,
+)
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import (
     check_callable,
     check_int,
     check_positive,
     check_reals,
-    raise_for_renamed_arguments,
+    with_renamed_arguments,
 )
 
 
@@ -51,7 +56,7 @@ class FixedPointResult(NamedTuple):
         """Return a sentence about whether Newton's method converged; for a batch, an array of
         sentences.
         """
-        return describe_elements(_describe_newton_convergence, self.converged, self.n_iterations)
+        return map_text_of_elements(_describe_newton_convergence, self.converged, self.n_iterations)
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -67,7 +72,7 @@ class FixedPointResult(NamedTuple):
         ]
         if self.termination is not None:
             text_rows.append(("simulation", Termination(int(self.termination)).meaning))
-        return format_text("FixedPointResult", text_rows)
+        return format_heading_and_rows("FixedPointResult", text_rows)
 
 
 def _describe_newton_convergence(converged: bool, n_iterations: int) -> str:
@@ -85,7 +90,7 @@ MAX_NEWTON_ITERATIONS = 30
 the fixed point needs."""
 
 
-@raise_for_renamed_arguments(iterations="max_iterations")
+@with_renamed_arguments(iterations="max_iterations")
 def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],
@@ -212,7 +217,9 @@ def _compute_newton_correction(
     converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
 ) -> tuple[Array, Array, Array]:
     """Return Newton's correction, the map's Jacobian, and the defect map(x) - x."""
-    image_point, jacobian = value_and_jacobian(lambda y: converted_map(y, *closed_over_values), x)
+    image_point, jacobian = evaluate_with_jacobian(
+        lambda y: converted_map(y, *closed_over_values), x
+    )
     map_defect = image_point - x
     return (
         jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect),
@@ -348,7 +355,7 @@ def _run_newton_implicit_jvp(
         closed_over_values,
         closed_over_tangents,
     )
-    _, jacobian = value_and_jacobian(
+    _, jacobian = evaluate_with_jacobian(
         lambda x: converted_map(x, *closed_over_values), newton_result.x
     )
     point_tangent = jnp.linalg.solve(
@@ -356,5 +363,5 @@ def _run_newton_implicit_jvp(
     )
     point_tangent = jnp.where(newton_result.converged, point_tangent, 0.0)
     nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(point_tangent)
-    zero_tangents = zero_tangent(newton_result)
+    zero_tangents = make_zero_tangent(newton_result)
     return newton_result, zero_tangents._replace(x=point_tangent, jacobian=nan_jacobian_tangent)

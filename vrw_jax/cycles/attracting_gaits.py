@@ -15,7 +15,7 @@ from vrw_jax.cycles.gait_walks import (
     stack_section_units,
     walk_to_gaits,
 )
-from vrw_jax.numerics import concat_rows, take_rows
+from vrw_jax.numerics import concatenate_tree_rows, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -52,12 +52,13 @@ def find_attracting_gaits(gait_finder: Any, parameter_values: Any) -> tuple[np.n
     is_fallback_found = np.asarray(fallback_gaits.outcome) == Outcome.STEPPED
     found_wheels = missing_wheels[fallback_wheel_indices[is_fallback_found]]
     keeps_first_gaits = ~np.isin(gait_wheel_indices, found_wheels)
-    all_gaits = concat_rows(
-        take_rows(gaits, keeps_first_gaits), take_rows(fallback_gaits, is_fallback_found)
+    all_gaits = concatenate_tree_rows(
+        select_tree_rows(gaits, keeps_first_gaits),
+        select_tree_rows(fallback_gaits, is_fallback_found),
     )
     gait_wheel_indices = np.concatenate([gait_wheel_indices[keeps_first_gaits], found_wheels])
     gait_order = np.argsort(gait_wheel_indices, kind="stable")
-    return gait_wheel_indices[gait_order], jax.device_put(take_rows(all_gaits, gait_order))
+    return gait_wheel_indices[gait_order], jax.device_put(select_tree_rows(all_gaits, gait_order))
 
 
 def _find_gaits_from_starts(
@@ -124,7 +125,7 @@ def _find_gaits_from_starts(
             [] if len(selected_indices) > n_selected_before else [int(candidate_indices[0])]
         )
     # A wheel without a valid candidate gets a cycle that is marked as not found, with zeros.
-    selected_gaits = take_rows(candidate_gaits, selected_indices)
+    selected_gaits = select_tree_rows(candidate_gaits, selected_indices)
     is_missing = ~is_gait_valid[selected_indices]
     broadcast_mask = lambda leaf: is_missing.reshape(-1, *[1] * (leaf.ndim - 1))
     masked_gaits = jax.tree.map(
@@ -156,7 +157,9 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
         gait_indices[missing_wheels] = len(parameter_values) + find_slowest_gait_indices(
             other_wheel_indices, len(missing_wheels)
         )
-        slow_gaits = jax.device_put(take_rows(concat_rows(slow_gaits, other_gaits), gait_indices))
+        slow_gaits = jax.device_put(
+            select_tree_rows(concatenate_tree_rows(slow_gaits, other_gaits), gait_indices)
+        )
     return slow_gaits
 
 

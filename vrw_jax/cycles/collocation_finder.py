@@ -44,15 +44,15 @@ from vrw_jax.measures import (
     MEASURES,
 )
 from vrw_jax.models import AbstractStep, SectionState, StepResult, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, value_and_jacobian
+from vrw_jax.numerics import StepOptions, evaluate_with_jacobian
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import validate_arguments
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     WheelParams,
+    make_wheel_from_parameters,
     stack_parameters,
     transitions,
-    wheel_from_parameters,
 )
 
 
@@ -74,7 +74,9 @@ class CollocationFinder(AbstractGaitFinder):
         dict.fromkeys((*cycle_measures, *DIFFERENTIABLE_STEP_NAMES, *MARGIN_MEASURES))
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
-        measure_name for measure_name in readable_measures if not MEASURES[measure_name].dimension
+        measure_name
+        for measure_name in readable_measures
+        if not MEASURES[measure_name].leg_dimension
     )
     supports_cold_start: ClassVar[bool] = True
     default_measures: ClassVar[tuple[str, ...]] = tuple(
@@ -150,7 +152,9 @@ class CollocationFinder(AbstractGaitFinder):
     ) -> CollocationState:
         """Return the same cycle with the step of the given index as the first one."""
         previous_end_state = collocation_state.step_end_states[first_step_index - 1]
-        landing = transitions.land(params.symbols(), previous_end_state[0], *previous_end_state[2:])
+        landing = transitions.resolve_landing(
+            params.symbols(), previous_end_state[0], *previous_end_state[2:]
+        )
         solution, is_active, ends = jax.tree.map(
             lambda x: jnp.roll(x, -first_step_index, 0),
             (
@@ -159,7 +163,7 @@ class CollocationFinder(AbstractGaitFinder):
                 collocation_state.step_end_states,
             ),
         )
-        section_state = jnp.stack([landing.theta, landing.motion.dtheta])
+        section_state = jnp.stack([landing.theta_after, landing.motion_after.dtheta])
         return collocation_state._replace(
             solution=solution._replace(section_state=section_state),
             is_phase_active=is_active,
@@ -267,9 +271,9 @@ def compute_cycle_and_derivatives(
     """Return the cycle near `guess`, and its derivatives by all parameters on a leading axis."""
 
     find_cycle = lambda parameter_values: solve_limit_cycle(
-        wheel_from_parameters(parameter_values, system.n_legs), system, guess
+        make_wheel_from_parameters(parameter_values, system.n_legs), system, guess
     )
-    cycle, parameter_jacobian = value_and_jacobian(find_cycle, parameter_values)
+    cycle, parameter_jacobian = evaluate_with_jacobian(find_cycle, parameter_values)
     return cycle, move_derivative_axis_first(parameter_jacobian)
 
 
@@ -289,9 +293,9 @@ def compute_step_and_derivatives(
 
     n_values = parameter_values.shape[0]
     take_step = lambda step_inputs: model.take_step(
-        wheel_from_parameters(step_inputs[:n_values], n_legs), step_inputs[n_values:], options
+        make_wheel_from_parameters(step_inputs[:n_values], n_legs), step_inputs[n_values:], options
     )
-    step, input_jacobian = value_and_jacobian(
+    step, input_jacobian = evaluate_with_jacobian(
         take_step, jnp.concatenate([parameter_values, section_state])
     )
     input_tangents = jnp.concatenate(

@@ -40,7 +40,7 @@ from vrw_jax.cycles.phase_sequence import (
     make_held_landing_sequence,
 )
 from vrw_jax.numerics import BatchFunction, LaneArray, Vector
-from vrw_jax.wheel import WheelParams, stack_parameters, wheel_from_parameters
+from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_parameters
 
 LaneParameters = Float[Array, "n_parameters lanes"]
 """Float parameters of each lane, in the order of PARAMETER_NAMES."""
@@ -189,7 +189,7 @@ def predict_start_from_surface(
     Without DLS the duration of DLS is added to that of SLS-I.
     """
     predicted_solution = predict_gait(
-        wheel_from_parameters(parameters, system.n_legs), system.phase_meshes
+        make_wheel_from_parameters(parameters, system.n_legs), system.phase_meshes
     )
     dls_duration, sls1_duration, sls2_duration = predicted_solution.durations[0]
     phase_durations = jnp.stack(

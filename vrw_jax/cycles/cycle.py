@@ -17,7 +17,7 @@ from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_ending,
+    describe_step_ending,
     format_numbers,
     format_outcome_counts,
 )
@@ -136,7 +136,7 @@ class AbstractCycle(AbstractPrintable):
     @property
     def ending(self) -> Any:
         """Return a sentence about how the search ended; for a batch, an array of sentences."""
-        return describe_ending(self.outcome, Outcome)
+        return describe_step_ending(self.outcome, Outcome)
 
     @property
     def why(self) -> Any:

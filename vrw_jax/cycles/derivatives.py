@@ -31,17 +31,17 @@ from vrw_jax.models import unit_scaling as scales
 from vrw_jax.numerics import (
     BatchFunction,
     ExecutionWrapper,
+    apply_in_blocks,
     apply_jacobian,
-    implicit_jacobian,
-    make_blockwise,
+    make_implicit_jacobian,
+    make_zero_tangent,
     unbatch,
     with_implicit_derivative,
-    zero_tangent,
 )
 from vrw_jax.runtime import (
+    call_through_saved_trace,
     compile_cached_lane_function,
     with_default_jax_settings,
-    wrap_with_saved_trace,
 )
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols, compute_wheel_units
 
@@ -168,7 +168,7 @@ def compile_batch_function(
     if simd.is_machine_code_available():
         return compile_cached_lane_function(function, make_output_template, cache_key)
     register_export_types()
-    return wrap_with_saved_trace(make_blockwise(function, batch_size), cache_key)
+    return call_through_saved_trace(apply_in_blocks(function, batch_size), cache_key)
 
 
 def _make_derivative_compiler(
@@ -188,7 +188,7 @@ def _make_derivative_compiler(
                 (function_name, derivative_order, system),
                 batch_size,
             )
-        return make_blockwise(function, batch_size)
+        return apply_in_blocks(function, batch_size)
 
     return compile_function
 
@@ -221,10 +221,10 @@ def _search_in_scaled_units(
     unknown contains it.
     """
     wheel_units = compute_wheel_units(compute_symbols(system.n_legs, *parameters))._replace(
-        mass=1.0
+        mass_unit=1.0
     )
-    angle_unit, time_unit = jnp.ones_like(wheel_units.time), wheel_units.time
-    position_units = jnp.stack([angle_unit, wheel_units.length, wheel_units.length])
+    angle_unit, time_unit = jnp.ones_like(wheel_units.time_unit), wheel_units.time_unit
+    position_units = jnp.stack([angle_unit, wheel_units.length_unit, wheel_units.length_unit])
     section_units = jnp.stack([angle_unit, 1.0 / time_unit])
     end_units = jnp.concatenate([position_units[:2], position_units[:2] / time_unit])
 
@@ -249,7 +249,7 @@ def _search_in_scaled_units(
 
     scaled_guess = tuple(convert_units(state, operator.truediv) for state in si_guess)
     parameter_units = [
-        wheel_units.si_value(parameter_domain.unit)
+        wheel_units.compute_unit_in_si(parameter_domain.unit)
         for parameter_domain in PARAMETER_DOMAINS.values()
     ]
     scaled_parameters = [
@@ -293,7 +293,7 @@ def solve_cycle_with_derivatives(
     def jvp_rule(primals: tuple, tangents: tuple) -> tuple:
         collocation_state, diagnostics = solve_with_rule(*primals)
         tangent = apply_jacobian(compute_tangents(primals[0], collocation_state), tangents[0])
-        return (collocation_state, diagnostics), (tangent, zero_tangent(diagnostics))
+        return (collocation_state, diagnostics), (tangent, make_zero_tangent(diagnostics))
 
     return solve_with_rule(parameters, *(() if guess is None else (guess,)))
 
@@ -311,7 +311,7 @@ def attach_monodromy_derivatives(
     )
     compute_monodromy = functools.partial(_compute_masked_monodromy, system)
     compute_monodromy_tangents = functools.partial(_compute_monodromy_tangents, system)
-    compute_parameter_jacobian = implicit_jacobian(
+    compute_parameter_jacobian = make_implicit_jacobian(
         compute_monodromy,
         _make_tangent_function(system),
         compile_function,

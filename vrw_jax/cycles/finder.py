@@ -15,7 +15,7 @@ from vrw_jax.cycles.cycle import AbstractCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.slope_response import SlopeResponse, compute_step_slope_response
 from vrw_jax.models import AbstractStep, AbstractWheel
-from vrw_jax.numerics import StepOptions, take_rows, value_and_jacobian
+from vrw_jax.numerics import StepOptions, evaluate_with_jacobian, select_tree_rows
 from vrw_jax.wheel import Outcome, WheelParams
 
 STATE_AGREEMENT_TOLERANCE = 1e-8
@@ -70,7 +70,7 @@ def is_same_branch(
     The mean of the tangents at both gaits must predict most of the distance between the gaits. The
     same phases must take place, and no multiplier may have crossed 1.
     """
-    first_point, second_point = take_rows((first_point, second_point), ...)
+    first_point, second_point = select_tree_rows((first_point, second_point), ...)
     predicted_change = parameter_change @ (
         0.5 * (first_point.coordinate_derivatives + second_point.coordinate_derivatives)
     )
@@ -251,7 +251,7 @@ def measure_on_cycle(
         cycle = finder.find_cycle_from_values(parameter_values, guess)
         return jnp.stack(list(cycle.measures(measure_names).values())), cycle.outcome
 
-    (measure_values, outcome), (parameter_jacobian, _) = value_and_jacobian(
+    (measure_values, outcome), (parameter_jacobian, _) = evaluate_with_jacobian(
         measures_and_outcome, parameter_values
     )
     return GaitMeasures(measure_values, parameter_jacobian, outcome)

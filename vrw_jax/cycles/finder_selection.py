@@ -26,7 +26,7 @@ from vrw_jax.simulation import (
     check_single_wheel,
     check_step_options,
 )
-from vrw_jax.validation import check_type, is_traced
+from vrw_jax.validation import check_type, has_traced_leaf
 from vrw_jax.wheel import WheelParams
 
 CycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
@@ -77,7 +77,7 @@ def resolve_model_with_reason(
     selected_model: Any = check_model(model)
     if selected_model.fallback_model is selected_model or not isinstance(params, WheelParams):
         return model, None
-    if is_traced(params, model) or params.damping.ndim:
+    if has_traced_leaf(params, model) or params.damping.ndim:
         return model, None
     paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
     if not bool(paper_cycle.found):
@@ -95,7 +95,7 @@ def check_guess(guess: Any) -> Any:
     if guess is None or isinstance(guess, AbstractCycle | CollocationState):
         return guess
     section_state = check_section_state(guess, "guess")
-    if not is_traced(section_state) and not np.isfinite(section_state).all():
+    if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
         raise ValueError(
             f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
             "only: give a neighbour's cycle, or a section state near the gait."

@@ -18,8 +18,8 @@ from vrw_jax.wheel import (
     AbstractPhase,
     PhaseInstant,
     make_phases,
+    make_wheel_from_parameters,
     transitions,
-    wheel_from_parameters,
 )
 
 
@@ -28,7 +28,7 @@ def compute_force_peaks(
     system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> dict[str, Scalar]:
     """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps."""
-    wheel_symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
+    wheel_symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
     peaks_by_step, (_, phase_points_by_step) = (
         [],
         system.evaluate_phase_points(parameters, solution),
@@ -63,7 +63,7 @@ def compute_force_peaks(
             for extrema in (fore_force_extrema, total_force_extrema)
         )
         end_point = phase_points[-1].end
-        landing = transitions.land(wheel_symbols, end_point.q[0], *end_point.v)
+        landing = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
         peaks_by_step.append(
             {
                 "n_force_peaks": fore_peaks.n_peaks,
@@ -86,10 +86,12 @@ def _find_force_extrema(
     """Return the extrema of the normal force on the fore foot, or on both feet, in a phase."""
 
     def evaluate_acceleration(q: Array, v: Array) -> Array:
-        return jnp.stack(phase.acceleration(phase.motion_at(tuple(q), tuple(v)))[: phase.n_dof])
+        return jnp.stack(
+            phase.solve_acceleration(phase.compute_motion(tuple(q), tuple(v)))[: phase.n_dof]
+        )
 
     def evaluate_normal_force(q: Array, v: Array) -> Array:
-        phase_instant = PhaseInstant(phase, phase.motion_at(tuple(q), tuple(v)), None)
+        phase_instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)), None)
         normal_force = jnp.asarray(phase_instant.fore_force.normal)
         if with_rear_foot and phase_instant.rear_force is not None:
             normal_force = normal_force + phase_instant.rear_force.normal

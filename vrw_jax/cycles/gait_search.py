@@ -32,17 +32,17 @@ from vrw_jax.cycles.gait_walks import (
 from vrw_jax.cycles.limit_cycle_result import LimitCycle
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
     check_int,
-    check_not_traced,
     check_real,
     check_type,
-    is_traced,
-    raise_for_renamed_arguments,
+    has_traced_leaf,
+    require_untraced_arguments,
+    with_renamed_arguments,
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
 
@@ -104,7 +104,7 @@ def limit_cycle(
 
 
 @with_default_jax_settings
-@raise_for_renamed_arguments(lost="on_failure")
+@with_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
     *,
@@ -218,7 +218,7 @@ def limit_cycles(
         model = resolve_model(params, model)
         gait_finder = resolve_finder(params, model, options, check_int("period_n", period_n))
         if gait_finder.is_multistable:
-            check_not_traced("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
+            require_untraced_arguments("vrw.limit_cycles", "give vrw.limit_cycle a guess", params)
             return find_attracting_gaits(
                 gait_finder, gait_finder.model.parameter_values(params)[None]
             )[1]
@@ -230,12 +230,12 @@ def limit_cycles(
             invalid_params, period_n=period_n, model=model, options=options, which=which
         )
         return _take_rows_on_device(missing_cycle, slice(0, 0))
-    if is_traced(params):
+    if has_traced_leaf(params):
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch_shape), params)
         single_params = jax.tree.map(lambda x: x[0], params)
     else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
-        params, single_params = jax.device_put((params, take_rows(params, 0)))
+        params, single_params = jax.device_put((params, select_tree_rows(params, 0)))
     gait_finder = resolve_finder(single_params, model, options, check_int("period_n", period_n))
     cycle: Any = _search_with_fallbacks(gait_finder, params, None, options is None, which)
     return cycle
@@ -282,7 +282,10 @@ def _search_with_fallbacks(
     """Return the cycle of one wheel or of a batch, by the search and all fallbacks."""
     is_batch = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
-    has_no_values, is_concrete = is_traced(params_without_tangents), not is_traced(params)
+    has_no_values, is_concrete = (
+        has_traced_leaf(params_without_tangents),
+        not has_traced_leaf(params),
+    )
     if gait_finder.is_multistable and guess is None and not has_no_values:
         cycle = _find_chosen_gaits(
             gait_finder,
@@ -295,7 +298,7 @@ def _search_with_fallbacks(
         return cycle if is_concrete else _run_search(gait_finder, params, cycle.section_state)
     cycle = _run_search(gait_finder, params, guess)
     params_and_cycle = lax.stop_gradient((params, cycle))  # Differentiated arrays have values, too.
-    if not gait_finder.supports_cold_start or is_traced(params_and_cycle):
+    if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
         return cycle
     if not is_batch:
         params_and_cycle = _take_rows_on_device(params_and_cycle, None)
@@ -351,7 +354,7 @@ def _keep_first_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCyc
     )
     select_values: Any = jnp.where
     # NumPy compiles nothing for a new batch size.
-    if not is_traced((first_failure_reason, last_failure_reason)):
+    if not has_traced_leaf((first_failure_reason, last_failure_reason)):
         first_failure_reason, last_failure_reason = jax.tree.map(
             np.asarray, (first_failure_reason, last_failure_reason)
         )
@@ -370,7 +373,7 @@ def _run_search(finder: AbstractGaitFinder, params: WheelParams, guess: Any) -> 
     """Return the cycle of one wheel, or the cycles of a batch, without fallbacks."""
     if not params.damping.ndim:
         return finder.find_cycle(params, guess)
-    if guess is not None or is_traced(params):
+    if guess is not None or has_traced_leaf(params):
         return finder.find_cycles(params, guess)
     return map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
 
@@ -380,7 +383,7 @@ def _take_rows_on_device(tree: Any, row_indices: Any) -> Any:
 
     NumPy selects the rows, because JAX would compile a program for each shape.
     """
-    return jax.device_put(take_rows(tree, row_indices))
+    return jax.device_put(select_tree_rows(tree, row_indices))
 
 
 def _stack_concrete_parameters(params: WheelParams) -> np.ndarray:

@@ -42,7 +42,7 @@ from vrw_jax.cycles.slope_response import (
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, is_inside_jit
-from vrw_jax.printing import LabelAndText, describe_elements, format_numbers
+from vrw_jax.printing import LabelAndText, format_numbers, map_text_of_elements
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
@@ -51,9 +51,9 @@ from vrw_jax.wheel import (
     Symbols,
     WheelParams,
     make_phases,
+    make_wheel_from_parameters,
     stack_parameters,
     transitions,
-    wheel_from_parameters,
 )
 
 
@@ -225,7 +225,7 @@ class LimitCycle(AbstractCycle):
         """Return the margins over the first step, computed by one event-driven step."""
 
         def compute_step_margins(parameters: Array, section_state: Array) -> Margins:
-            wheel = wheel_from_parameters(parameters, self.system.n_legs)
+            wheel = make_wheel_from_parameters(parameters, self.system.n_legs)
             return step(wheel, section_state, model=self.model).margins
 
         return self._vmap_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
@@ -242,7 +242,7 @@ class LimitCycle(AbstractCycle):
             check_index = int(failed_check - 1) % len(ADMISSIBILITY_CHECKS)
             return f"{sentence} Broken: {ADMISSIBILITY_CHECKS[check_index]}."
 
-        return describe_elements(
+        return map_text_of_elements(
             describe_outcome, self.outcome, self.collocation_state.failed_check
         )
 
@@ -279,7 +279,7 @@ def _compute_takeoff_acceleration(
     system: CollocationSystem, parameters: Array, collocation_state: CollocationState
 ) -> Array:
     """Return the least take-off acceleration over the steps of a cycle, m/s^2."""
-    s = wheel_from_parameters(parameters, system.n_legs).symbols()
+    s = make_wheel_from_parameters(parameters, system.n_legs).symbols()
     _, steps = system.evaluate_phase_points(parameters, collocation_state.solution)
     return jnp.min(jnp.stack([compute_takeoff_acceleration(s, sls1) for _, sls1, _ in steps]))
 
@@ -322,19 +322,19 @@ def _solve_limit_cycle(
         replace_if_missing, parameters, stack_parameters(table_1).astype(parameters.dtype)
     )
 
-    symbols = wheel_from_parameters(parameters, system.n_legs).symbols()
+    symbols = make_wheel_from_parameters(parameters, system.n_legs).symbols()
     period_n = system.period_n
     # The states are theta, its rate and the rate of L1. At touchdown, L1 follows from theta.
     touchdown_states = jnp.concatenate(
         [collocation_state.step_end_states[:, :1], collocation_state.step_end_states[:, 2:]], 1
     )
     # The landing at the start of a step follows the state at the end of the previous step.
-    landings = jax.vmap(lambda given_value: transitions.land(symbols, *given_value))(
+    landings = jax.vmap(lambda given_value: transitions.resolve_landing(symbols, *given_value))(
         jnp.roll(touchdown_states, 1, 0)
     )
-    fore_force, rear_force = jax.vmap(lambda landing: transitions.landing_forces(symbols, landing))(
-        landings
-    )
+    fore_force, rear_force = jax.vmap(
+        lambda landing: transitions.compute_landing_forces(symbols, landing)
+    )(landings)
 
     def select_step_values(step_values: Array) -> Array:
         return zero_without_gait(step_values[0] if period_n == 1 else step_values)
@@ -356,7 +356,7 @@ def _solve_limit_cycle(
         section_state=zero_without_gait(touchdown_states[-1]),
         post_impact=zero_without_gait(collocation_state.solution.section_state),
         durations=select_step_values(durations),
-        step_length=select_step_values(landings.distance),
+        step_length=select_step_values(landings.foot_distance),
         indicators=DoubleSupportIndicators(
             lambda_I4=select_step_values(landings.rear_impulse.normal),
             lambda_2=select_step_values(fore_force.normal),
@@ -398,13 +398,13 @@ def sample_walk(
       the fast start of a step without double support, and Newton's method fails (33 at c = 221).
     """
     step_options, wheel_symbols = StepOptions(), params.symbols()
-    landing = transitions.land(wheel_symbols, *section_state)
-    post_impact_state = jnp.stack([landing.theta, landing.motion.dtheta])
+    landing = transitions.resolve_landing(wheel_symbols, *section_state)
+    post_impact_state = jnp.stack([landing.theta_after, landing.motion_after.dtheta])
 
     def sample_next_step(section_state: Array, _: None) -> tuple[Array, tuple]:
         trajectory = model.sample_step(params, section_state, step_options, n_samples)
         step_samples = (
-            transitions.land(wheel_symbols, *section_state).distance,
+            transitions.resolve_landing(wheel_symbols, *section_state).foot_distance,
             trajectory.durations,
             trajectory.state,
         )
@@ -480,7 +480,7 @@ def _sample_node_accelerations(
             for coordinate_samples in phase_samples.T
         ]
         node_accelerations = jnp.stack(
-            phase.acceleration(Motion.from_angle(*node_states))[: phase.n_dof], axis=-1
+            phase.solve_acceleration(Motion.from_angle(*node_states))[: phase.n_dof], axis=-1
         )
         accelerations.append(
             node_accelerations.reshape(mesh.n_intervals, N_GAUSS_NODES, phase.n_dof)

@@ -17,7 +17,7 @@ def compute_takeoff_acceleration(s: Symbols, sls1: PhasePoints) -> Elementwise:
 
     See `dynamics.takeoff_acceleration`.
     """
-    return dynamics.takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
+    return dynamics.compute_takeoff_acceleration(s, Motion.from_angle(*sls1.start.q, *sls1.start.v))
 
 
 KEPT_MARGIN_NAMES: tuple[str, ...] = (
@@ -62,7 +62,7 @@ def default_margins(params: WheelParams) -> Mapping[str, float]:
         0.177
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    params.require_single("take one after the other")
+    params.require_single_wheel("take one after the other")
     mass = float(params.hub_mass + params.n_legs * params.leg_mass)
     length, gravity = float(params.locked_length), float(params.gravity)
     unit_scales = {

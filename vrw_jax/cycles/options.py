@@ -10,11 +10,11 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     format_value,
-    raise_for_renamed_arguments,
+    with_renamed_arguments,
 )
 
 
-@raise_for_renamed_arguments(
+@with_renamed_arguments(
     steps="mesh_intervals",
     growth="mesh_grading",
     iterations="max_newton_iterations",

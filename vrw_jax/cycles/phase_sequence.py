@@ -20,7 +20,7 @@ from vrw_jax.collocation import (
     PhasePoints,
     PhaseSequence,
 )
-from vrw_jax.numerics import Elementwise, Vector, sine_cosine
+from vrw_jax.numerics import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.wheel import (
     PAPER_PHASES,
     SHARED_FAILURE_OUTCOMES,
@@ -29,7 +29,7 @@ from vrw_jax.wheel import (
     PhaseInstant,
     Symbols,
     compute_symbols,
-    rear_direction,
+    rotate_to_rear_leg,
     transitions,
 )
 
@@ -75,26 +75,28 @@ def _make_collocation_phase(
         phase_constants: PhaseConstants, point: PhasePoint
     ) -> tuple[AbstractPhase, Motion]:
         line_turn = (
-            sine_cosine(phase_constants[N_LANE_SYMBOLS]) if _has_line_turn(phase_constants) else ()
+            compute_sine_cosine(phase_constants[N_LANE_SYMBOLS])
+            if _has_line_turn(phase_constants)
+            else ()
         )
         phase = phase_class(
             _restore_symbols(n_legs, phase_constants), point.held_constants, True, line_turn
         )
-        return phase, phase.motion_at(point.q, point.v)
+        return phase, phase.compute_motion(point.q, point.v)
 
     def residual(
         phase_constants: PhaseConstants, point: PhasePoint, acceleration: Vector
     ) -> Vector:
         phase, motion = evaluate_phase(phase_constants, point)
-        return phase.dynamics_residual(motion, acceleration)
+        return phase.compute_dynamics_residual(motion, acceleration)
 
     def end_event(phase_constants: PhaseConstants, point: PhasePoint) -> Elementwise:
         phase, motion = evaluate_phase(phase_constants, point)
-        return phase.end_guard(PhaseInstant(phase, motion, None))
+        return phase.compute_end_guard(PhaseInstant(phase, motion, None))
 
     def guards(phase_constants: PhaseConstants, point: PhasePoint) -> Vector:
         phase, motion = evaluate_phase(phase_constants, point)
-        guard_values = phase.guards(PhaseInstant(phase, motion, None))
+        guard_values = phase.compute_guards(PhaseInstant(phase, motion, None))
         # Every guard keeps its index in ADMISSIBILITY_CHECKS, even if it is not checked.
         return (
             guard_values
@@ -106,7 +108,9 @@ def _make_collocation_phase(
         phase, motion = evaluate_phase(phase_constants, point)
         return PhasePoint(
             (),
-            *PAPER_PHASES[phase_index + 1].select_coordinates(point.q[0], phase.reset_map(motion)),
+            *PAPER_PHASES[phase_index + 1].select_coordinates(
+                point.q[0], phase.reset_motion(motion)
+            ),
         )
 
     def reset_to_section(phase_constants: PhaseConstants, point: PhasePoint) -> PhasePoint:
@@ -115,7 +119,7 @@ def _make_collocation_phase(
         theta = (
             theta - phase_constants[N_LANE_SYMBOLS] if _has_line_turn(phase_constants) else theta
         )
-        return PhasePoint((), transitions.land_on_both_feet(s, theta, dtheta, dL1), ())
+        return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())
 
     reset_function = reset_to_section if phase_class is PAPER_PHASES[-1] else reset_to_next_phase
     return CollocationPhase(
@@ -161,8 +165,8 @@ def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> Ph
 
     def make_start_point(phase_constants: PhaseConstants, section_state: Vector) -> PhasePoint:
         s = _restore_symbols(n_legs, phase_constants)
-        sin, cos = sine_cosine(section_state[0])
-        foot_distance = s.L0 * s.sin_alpha / rear_direction(s, sin, cos).cos
+        sin, cos = compute_sine_cosine(section_state[0])
+        foot_distance = s.L0 * s.sin_alpha / rotate_to_rear_leg(s, sin, cos).cos
         return PhasePoint((foot_distance,), section_state[:1], section_state[1:])
 
     def evaluate_transition_margins(
@@ -173,7 +177,9 @@ def make_held_landing_sequence(n_legs: int, stop_at_lift_off: bool = True) -> Ph
         dls, sls1, sls2 = phase_points
         lift_off_guard = phases[0].event(phase_constants, dls.start)
         (theta, _), (dtheta, dL1) = sls2.end.q, sls2.end.v
-        landing = transitions.land(_restore_symbols(n_legs, phase_constants), theta, dtheta, dL1)
+        landing = transitions.resolve_landing(
+            _restore_symbols(n_legs, phase_constants), theta, dtheta, dL1
+        )
         return (
             jnp.where(is_phase_active[0], lift_off_guard, -lift_off_guard),
             landing.rear_impulse.normal,

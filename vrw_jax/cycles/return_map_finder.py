@@ -32,7 +32,7 @@ from vrw_jax.measures import (
     SHARED_STEP_MEASURE_NAMES,
 )
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import Scalar, StepOptions, value_and_jacobian
+from vrw_jax.numerics import Scalar, StepOptions, evaluate_with_jacobian
 from vrw_jax.printing import LabelAndText, format_numbers
 from vrw_jax.simulation import validate_arguments, walk_toward_gait
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
@@ -267,7 +267,7 @@ class ReturnMapFinder(AbstractReturnMapFinder):
 
     @eqx.filter_jit
     def find_gait(self, parameter_values: ParameterValues, start_state: Array) -> Gait:
-        cycle, parameter_jacobian = value_and_jacobian(
+        cycle, parameter_jacobian = evaluate_with_jacobian(
             lambda parameter_values: self.find_cycle_from_values(parameter_values, start_state),
             parameter_values,
         )

@@ -13,7 +13,7 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_names, check_not_traced, suggest_name
+from vrw_jax.validation import check_names, format_name_suggestion, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -51,7 +51,7 @@ def sensitivities(
         >>> round(float(table.elasticity.sel(measure="speed", parameter="slope")), 3)
         1.887
     """
-    check_not_traced("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
+    require_untraced_arguments("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options)
     measure_names = (
@@ -61,7 +61,7 @@ def sensitivities(
     if unknown_names or not measure_names:
         raise ValueError(
             f"measures holds {', '.join(unknown_names) or 'nothing'}"
-            f"{suggest_name(unknown_names[0], gait_finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
+            f"{format_name_suggestion(unknown_names[0], gait_finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
             "but the measures of a cycle are "
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )

@@ -41,9 +41,9 @@ from vrw_jax.cycles.return_map_finder import (
 )
 from vrw_jax.measures import UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models import AbstractStep, AbstractWheel
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
 from vrw_jax.simulation import validate_arguments
-from vrw_jax.validation import is_traced
+from vrw_jax.validation import has_traced_leaf
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -97,7 +97,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         With traced inputs, derivatives of the single step are used.
         """
         params, section_state, model, options = prepare_search(self, params, guess)
-        if is_traced(params, section_state, model):
+        if has_traced_leaf(params, section_state, model):
             return find_return_map_cycle(
                 params, section_state, model, options, self.period_n, uses_implicit_jvp=True
             )
@@ -107,7 +107,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
         )
 
     def find_cycles(self, params: WheelParams, guess: Any = None) -> Any:
-        if is_traced(params, guess):
+        if has_traced_leaf(params, guess):
             return eqx.filter_vmap(self.find_cycle)(params, guess)
         parameter_values = jax.vmap(self.model.parameter_values)(params)
         section_states = getattr(guess, "section_state", guess)
@@ -215,7 +215,7 @@ def _add_batch_axis(x: Array) -> Array:
 
 def _remove_batch_axis(tree: Any) -> Any:
     """Return the first element of every leaf, the inverse of `_add_batch_axis`."""
-    return jax.device_put(take_rows(tree, 0))
+    return jax.device_put(select_tree_rows(tree, 0))
 
 
 class _ContactFixedPoints(NamedTuple):

@@ -312,7 +312,8 @@ def _draw_measure_samples(
     axes: Axes, scan: xr.Dataset, x: str, y: str, measure_name: str, marker_size: float
 ) -> PathCollection:
     """Draw samples in the colors of a measure, or in gray if they have no gait, and return the
-    collection of points."""
+    collection of points.
+    """
     dot_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
     has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
     color_limits = _find_color_limits(
@@ -483,7 +484,8 @@ def _find_extended_color_bar_ends(
     panel_values: Sequence[np.ndarray], color_limits: tuple[float, float]
 ) -> Literal["neither", "min", "max", "both"]:
     """Return the ends of a color bar beyond which there are values: "neither", "min", "max" or
-    "both"."""
+    "both".
+    """
     finite_values = np.concatenate(
         [values_of_panel[np.isfinite(values_of_panel)] for values_of_panel in panel_values]
     )
@@ -535,7 +537,8 @@ def _find_cell_edges(sample_positions: np.ndarray) -> np.ndarray:
 
 def _get_outcome_codes(scan: xr.Dataset) -> xr.DataArray:
     """Return the outcome codes of a scan, with `UNSTABLE_CYCLE_CODE` for unstable cycles if the
-    spectral radius is known."""
+    spectral radius is known.
+    """
     outcome_codes = scan.outcome.astype(int)
     if "spectral_radius" not in scan:
         return outcome_codes
@@ -549,7 +552,7 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
         if margin_name not in scan or scan.sizes[x] < 2 or scan.sizes[y] < 2:
             continue
         margin_array = scan[margin_name]
-        if MARGIN_MEASURES[margin_name].dimension:
+        if MARGIN_MEASURES[margin_name].leg_dimension:
             margin_array = margin_array.min("leg")
         if margin_name == "clearance_sls1" and "takeoff_acceleration" in scan:
             # Without missing values the line has no steps.
@@ -568,7 +571,7 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
             [],
             color=line_color,
             linestyle=line_style,
-            label=MARGIN_MEASURES[margin_name].violation,
+            label=MARGIN_MEASURES[margin_name].violation_text,
         )
     return legend_lines
 

@@ -182,12 +182,14 @@ def require_dataset_variables(
     argument_name: str, dataset: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
     """Raise an error unless `dataset` is a dataset that contains the needed variables or
-    attributes."""
+    attributes.
+    """
     check_type(argument_name, dataset, xr.Dataset, remedy_text)
     missing_names = [
         variable_name
         for variable_name in needed_names
-        if variable_name not in dataset.variables and variable_name not in dataset.attrs
+        if variable_name not in dataset.variables
+        and variable_name not in dataset.variable_attributes
     ]
     if missing_names:
         raise ValueError(
@@ -199,7 +201,8 @@ def require_variables_of_datasets(
     argument_name: str, datasets: Any, needed_names: Sequence[str], remedy_text: str
 ) -> None:
     """Raise an error unless `datasets` is a nonempty list of datasets that contain the needed
-    variables."""
+    variables.
+    """
     check_type(argument_name, datasets, (list, tuple), f"{remedy_text}, several in a list")
     if not datasets:
         raise ValueError(f"{argument_name} is empty, but something is to be drawn: {remedy_text}.")
@@ -211,7 +214,8 @@ def require_variables_of_datasets(
 
 def typeset_greek_symbols(text: str) -> str:
     """Return text with symbols such as "λ2⁺" as formulas, because the font lacks some of these
-    symbols."""
+    symbols.
+    """
     return re.sub(r"[θλ]\S*", lambda match: f"${format_mathtext(match[0])}$", text)
 
 
@@ -262,7 +266,8 @@ def draw_markers(
     **style_overrides: Any,
 ) -> None:
     """Draw markers without a line, filled with `fill_color`; the fill color "white" makes markers
-    open."""
+    open.
+    """
     marker_style: dict[str, Any] = {
         "markersize": 3.2,
         "markeredgewidth": 0.7,
@@ -308,7 +313,8 @@ def draw_outcome_cells(
     drawn_codes: Sequence[int] | np.ndarray,
 ) -> None:
     """Draw cells over (x, y) in the colors of their outcomes. Codes not in `drawn_codes` are
-    omitted."""
+    omitted.
+    """
     outcome_color_map = ListedColormap(
         [select_outcome_style(int(drawn_code))[1] for drawn_code in drawn_codes]
     )

@@ -1,5 +1,6 @@
 """Tornado plots: for each measure, the changes that each parameter causes, as bars sorted by
-length."""
+length.
+"""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -19,7 +20,7 @@ from vrw_jax.figures.style import (
     typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
-from vrw_jax.validation import check_known_name, check_names, check_positive
+from vrw_jax.validation import check_names, check_positive, require_known_name
 from vrw_jax.wheel import check_parameter_name
 
 MAX_PANELS_PER_ROW = 3
@@ -71,7 +72,7 @@ def tornado_figure(
     if measures is not None:
         measure_names = check_names("measures", measures)
     for measure_name in measure_names:
-        check_known_name(measure_name, known_measures, "measure of this table")
+        require_known_name(measure_name, known_measures, "measure of this table")
     if not measure_names:
         raise ValueError('measures is empty, but something is to be drawn: give "speed", say.')
     measure_changes = table.elasticity  # changes in per cent for 1 %

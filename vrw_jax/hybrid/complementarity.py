@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import StatusCode
-from vrw_jax.validation import is_traced
+from vrw_jax.validation import has_traced_leaf
 
 MAX_LCP_CONTACTS = 10
 """Largest number of contacts of an LCP, chosen because the enumeration solves two to that power
@@ -58,7 +58,7 @@ def enumerate_lcp_solutions(
             f"n) and "
             f"(n,) with n from 1 to {MAX_LCP_CONTACTS}."
         )
-    if not is_traced(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
+    if not has_traced_leaf(matrix, free_gap) and not np.isfinite(np.append(matrix, free_gap)).all():
         raise ValueError(
             "matrix or free_gap contains a number that is not finite: give finite numbers."
         )

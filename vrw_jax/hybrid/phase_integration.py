@@ -38,8 +38,8 @@ from vrw_jax.numerics import (
     StepOptions,
     evaluate_cubic,
     find_cubic_minimum,
-    opaque_condition,
-    tree_where,
+    make_opaque_condition,
+    select_tree_leaves,
 )
 from vrw_jax.runtime import lazy_import
 
@@ -275,7 +275,7 @@ def integrate_phase(
     solver_stepper = _make_stepper(field, options, event_options.max_step_growth)
     phase_context = _PhaseContext(solver_stepper, monitored_functions, options, event_options)
     phase_state = lax.while_loop(
-        lambda phase_state: opaque_condition(
+        lambda phase_state: make_opaque_condition(
             phase_state.purpose != StepPurpose.DONE, phase_state.n_tried_steps
         ),
         functools.partial(_advance_phase_state, phase_context),
@@ -441,7 +441,7 @@ def _advance_phase_state(context: _PhaseContext, phase_state: _PhaseState) -> _P
         following_length = jnp.where(is_refining, length_to_minimum, following_length)
     return _PhaseState(
         purpose=purpose,
-        accepted_step=tree_where(
+        accepted_step=select_tree_leaves(
             step_assessment.is_accepted | has_arrived, accepted_step, previous_step
         ),
         next_length=following_length,
@@ -490,7 +490,7 @@ def _try_solver_step(
             phase_state.refinement.margin_index, phase_state.minimum.start_state
         )
         restarts_at_minimum = minimum_start, stepper.init_solver_state(minimum_start, options)
-        start_state = tree_where(
+        start_state = select_tree_leaves(
             phase_state.purpose == StepPurpose.REFINEMENT, restarts_at_minimum, start_state
         )
     end_state, error_estimate, solver_state = stepper.advance_state(
@@ -583,7 +583,7 @@ def _assess_solver_step(
         is_stuck=is_integrating & ~has_crossed & cannot_continue,
         following_length=jnp.where(has_crossed, event_length_guess, following_length),
         time_tolerance=lax.stop_gradient(jnp.maximum(options.rtol * length, time_resolution)),
-        controller_state=tree_where(
+        controller_state=select_tree_leaves(
             is_integrating & ~must_retry, controller_state, phase_state.controller_state
         ),
         n_tried_steps=n_tried_steps,
@@ -758,7 +758,7 @@ def _integrate_sample_interval(
         time = jnp.where(
             is_last_step, interval, jnp.where(is_within_tolerance, time + step_length, time)
         )
-        state, solver_state = tree_where(
+        state, solver_state = select_tree_leaves(
             is_within_tolerance, (end_state, end_solver_state), (state, solver_state)
         )
         return time, state, solver_state, next_length, controller_state, n_tried_steps + 1

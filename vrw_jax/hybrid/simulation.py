@@ -20,8 +20,14 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.hybrid.minima import MonitoredFunctions, StateArray
 from vrw_jax.hybrid.phase_integration import PhaseEnd, VectorField, integrate_phase
 from vrw_jax.hybrid.program_cache import call_compiled
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions, forbid_reverse_mode, opaque_condition
-from vrw_jax.printing import describe_ending
+from vrw_jax.numerics import (
+    Scalar,
+    StatusCode,
+    StepOptions,
+    forbid_reverse_mode,
+    make_opaque_condition,
+)
+from vrw_jax.printing import describe_step_ending
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
@@ -102,7 +108,7 @@ class HybridSolution(NamedTuple):
     @property
     def ending(self) -> Any:
         """Return a sentence about the end of the simulation; for a batch, an array of sentences."""
-        return describe_ending(self.termination, Termination)
+        return describe_step_ending(self.termination, Termination)
 
 
 @with_default_jax_settings
@@ -423,7 +429,7 @@ def _simulate_modes(
         mode=zero_count + mode,
         solver_steps=zero_count, termination=zero_count + STATUS_RUNNING_CODE,
     )  # fmt: skip
-    is_running = lambda carry: opaque_condition(
+    is_running = lambda carry: make_opaque_condition(
         carry[0].termination == STATUS_RUNNING_CODE, carry[0].n_events
     )
     return lax.while_loop(is_running, advance_event, (initial_solution, zero_count, traced_zero))[0]

@@ -19,7 +19,7 @@ from vrw_jax.integrator.tableaus import (
     load_explicit_tableau,
     rk_step,
 )
-from vrw_jax.numerics import StepOptions, Vector, tree_where
+from vrw_jax.numerics import StepOptions, Vector, select_tree_leaves
 
 
 class CrossingStep(NamedTuple):
@@ -112,7 +112,7 @@ def locate_event(
             lower_bound=lower_bound,
             upper_bound=upper_bound,
             is_unresolved=event_search.is_unresolved & ~has_arrived,
-            end=tree_where(has_arrived, step_end, event_search.end),
+            end=select_tree_leaves(has_arrived, step_end, event_search.end),
             remaining_time=jnp.where(has_arrived, time_change, event_search.remaining_time),
             guard=jnp.where(has_arrived, guard_index, event_search.guard),
             n_tried_steps=event_search.n_tried_steps + event_search.is_unresolved,
@@ -187,7 +187,7 @@ def _refine_event_location(
     def take_short_step(loop_carry: tuple) -> tuple:
         step_end, remaining_time, length, guard_index, is_distant, n_iterations = loop_carry
         takes_short_step = can_step(is_distant, remaining_time)
-        step_end = tree_where(
+        step_end = select_tree_leaves(
             takes_short_step,
             rk_step(
                 low_order_tableau, evaluate_acceleration, step_end, remaining_time, with_error=False
@@ -236,7 +236,7 @@ def _refine_event_location(
     v = tuple(
         x + remaining_time * y for x, y in zip(end.v, end.acceleration.acceleration, strict=False)
     )
-    end = tree_where(is_distant, crossing_step.start, end._replace(q=q, v=v))
+    end = select_tree_leaves(is_distant, crossing_step.start, end._replace(q=q, v=v))
     return event_search._replace(
         length=length,
         is_unresolved=event_search.is_unresolved | is_distant,

@@ -43,7 +43,7 @@ from vrw_jax.integrator.tangents import (
     apply_batched_jvp_rule,
     stack_directions,
 )
-from vrw_jax.numerics import StepOptions, Vector, tree_where, zero_tangent
+from vrw_jax.numerics import StepOptions, Vector, make_zero_tangent, select_tree_leaves
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simd import mark_noinline
 
@@ -169,7 +169,7 @@ def integrate_batch_phase(
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             evaluate_with_tangents, primals, tangents[:4]
         )
-        zero_phase_end = zero_tangent(phase_end)
+        zero_phase_end = make_zero_tangent(phase_end)
         state_tangent = zero_phase_end.state._replace(q=q, v=v)
         return phase_end, zero_phase_end._replace(
             state=state_tangent, duration=event_time_tangent, minima=minima_tangents
@@ -336,7 +336,7 @@ def _integrate_to_event(
     )
     is_event_unresolved = has_crossed & event_search.is_unresolved
     duration = integrator_state.time + jnp.where(has_crossed, event_search.length, 0.0)
-    end_state = tree_where(has_crossed, event_search.end, integrator_state.state)
+    end_state = select_tree_leaves(has_crossed, event_search.end, integrator_state.state)
     minima, minima_result = integrator_state.minima, None
     if phase.margins is not None and minima is not None:
         margin_arguments = phase.margins, phase.evaluate
@@ -431,7 +431,7 @@ def _integrate_until_crossing(
         status, crossing_bits, is_accepted, time, length = _classify_step(
             options, integrator_state, length_factor, is_rejected, end_values
         )
-        state, guard_values = tree_where(
+        state, guard_values = select_tree_leaves(
             is_accepted,
             (rk_step.end, end_values),
             (integrator_state.state, integrator_state.guard_values),
@@ -442,7 +442,7 @@ def _integrate_until_crossing(
             if stage_values
             else integrator_state.guard_values
         )
-        new_middle_values, new_end_values = tree_where(
+        new_middle_values, new_end_values = select_tree_leaves(
             was_running,
             (middle_values, end_values),
             (integrator_state.middle_values, integrator_state.end_values),
@@ -654,7 +654,7 @@ def sample_at_equal_times(
         )
         is_running = time_left > 0.0
         return (
-            tree_where(is_running & is_within_tolerance, step_end, sample_state),
+            select_tree_leaves(is_running & is_within_tolerance, step_end, sample_state),
             jnp.where(is_running, h, loop_carry[1]),
             jnp.where(
                 is_running & is_within_tolerance,

@@ -22,7 +22,7 @@ from vrw_jax.numerics import (
     StepOptions,
     Vector,
     find_cubic_minimum,
-    tree_where,
+    select_tree_leaves,
 )
 
 
@@ -242,7 +242,7 @@ def refine_minima(
                 is_unresolved=minimum_search.is_unresolved & ~has_converged,
                 n_iterations=minimum_search.n_iterations,
             )
-            return tree_where(
+            return select_tree_leaves(
                 minimum_search.is_unresolved, improved_search, minimum_search
             )._replace(n_iterations=minimum_search.n_iterations + 1)
 

@@ -29,7 +29,7 @@ from vrw_jax.integrator.tableaus import (
     StageState,
     evaluate_stage,
 )
-from vrw_jax.numerics import Vector, run_if_any, zero_tangent
+from vrw_jax.numerics import Vector, make_zero_tangent, run_if_any
 from vrw_jax.runtime import with_default_jax_settings
 
 
@@ -344,7 +344,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
             outputs, float_tangents = apply_batched_jvp_rule(
                 evaluate_with_tangents, primals, tangent
             )
-            return outputs, eqx.combine(float_tangents, zero_tangent(outputs))
+            return outputs, eqx.combine(float_tangents, make_zero_tangent(outputs))
 
         return differentiable_function(*float_arguments)
 

@@ -1,6 +1,6 @@
-"""Table of measures and margins: names, symbols, units and meanings."""
+"""Table of measures and margins: names, symbols, units and descriptions."""
 
-from vrw_jax.measures.provenance import provenance
+from vrw_jax.measures.provenance import collect_provenance_attributes
 from vrw_jax.measures.table import (
     CONTACT_MEASURES,
     CONTACT_MODE_NAMES,
@@ -21,9 +21,9 @@ from vrw_jax.measures.table import (
     UNILATERAL_DIFFERENTIABLE_NAMES,
     UNILATERAL_STEP_MEASURES,
     describe_violation,
-    flag_attrs,
     get_measure,
-    locked_leg_coordinate,
-    make_variables,
-    measure_attrs,
+    make_flag_attributes,
+    make_labeled_variables,
+    make_locked_leg_coordinate,
+    make_measure_attributes,
 )

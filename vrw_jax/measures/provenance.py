@@ -1,4 +1,4 @@
-"""Provenance of results: versions, device, number format, tolerances and parameters."""
+"""Provenance of results: versions, device, floating type, tolerances and parameters."""
 
 import functools
 import importlib.metadata
@@ -10,20 +10,19 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
-def provenance(
+def collect_provenance_attributes(
     params: WheelParams, model: object, options: StepOptions
 ) -> dict[str, str | float | int]:
-    """Return the origin of a result as dataset attributes.
-
-    The attributes are versions, device, number format, tolerances and parameters.
+    """Return dataset attributes with the versions, device, floating type, tolerances and parameters
+    of a result.
     """
     library_names = ("vrw-jax", "jax", "diffrax", "numpy")
-    parameter_attrs: dict[str, str | float | int] = {
+    parameter_attributes: dict[str, str | float | int] = {
         f"parameter_{library_name}": float(getattr(params, library_name))
         for library_name in PARAMETER_NAMES
         if getattr(params, library_name).ndim == 0
     }
-    return parameter_attrs | {
+    return parameter_attributes | {
         "parameter_n_legs": params.n_legs,
         "model": repr(model),
         "versions": ", ".join(

@@ -1,7 +1,7 @@
 """Measures of a step, a cycle or a trajectory: one table of names, units and symbols.
 
 Every labeled result takes its units and long names from this table, so that scans, trajectories and
-figures use the same names. In the frame, x points downhill along the slope and z is normal to the
+figures use the same names. The axis x points downhill along the slope, and z is normal to the
 slope.
 """
 
@@ -19,13 +19,13 @@ from vrw_jax.wheel import PAPER_PHASES, PARAMETER_DOMAINS, Outcome
 
 @dataclass(frozen=True)
 class Measure:
-    """Quantity with name, unit, symbol and meaning.
+    """Quantity with name, unit, symbol and description.
 
-    - `unit`: unit of SI, "1" for a pure number;
+    - `unit`: SI unit, "1" for a pure number;
     - `equation`: number of the paper's equation, "" if there is none;
-    - `dimension`: "leg" if there is one value per leg, otherwise "". Margins have values of the
-      locked legs 3..n, `CONTACT_MEASURES` of every leg;
-    - `violation`: clause on the consequence of a negative value, "" without one;
+    - `leg_dimension`: "leg" if the measure has one number per leg, otherwise "". Margins have
+      numbers for the locked legs 3..n, `CONTACT_MEASURES` for every leg;
+    - `violation_text`: clause on the consequence of a negative margin, otherwise "";
     - `is_shared`: whether the steps of every model have the measure;
     - `is_code`: whether the measure is a whole number without derivatives;
     - `is_ratio`: whether several steps are summarized by the mean, not by the sum.
@@ -37,8 +37,8 @@ class Measure:
     long_name: str
     description: str
     equation: str = ""
-    dimension: str = ""
-    violation: str = ""
+    leg_dimension: str = ""
+    violation_text: str = ""
     is_shared: bool = False
     is_code: bool = False
     is_ratio: bool = False
@@ -49,7 +49,7 @@ class Measure:
         return format_mathtext(self.symbol)
 
     @property
-    def label(self) -> str:
+    def label_with_symbol(self) -> str:
         """Return the name with the symbol."""
         has_symbol = self.symbol in self.long_name
         return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
@@ -60,25 +60,25 @@ class Measure:
         return "" if self.unit == "1" else self.unit
 
     @property
-    def attrs(self) -> dict[str, str]:
-        """Return the attributes of a labeled variable that holds this quantity."""
-        attrs = {
+    def variable_attributes(self) -> dict[str, str]:
+        """Return the attributes of a dataset variable that contains this quantity."""
+        attributes = {
             "units": self.unit,
             "long_name": self.long_name,
             "symbol": self.symbol,
             "description": self.description,
         }
-        return attrs | ({"equation": self.equation} if self.equation else {})
+        return attributes | ({"equation": self.equation} if self.equation else {})
 
-    def format_with_unit(self, value: object) -> str:
-        """Return a number with its unit as text, with six significant digits."""
-        return f"{float(np.asarray(value)):.6g} {self.display_unit}".strip()
+    def format_with_unit(self, measured_value: object) -> str:
+        """Return a number with this measure's unit as text, with six significant digits."""
+        return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
 
 
 def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
-    """Return the measures by name.
+    """Return a dictionary of the measures by name.
 
-    Raise `ValueError` if two measures have the same name.
+    Raise a `ValueError` if two measures have the same name.
     """
     measure_by_name = {measure.name: measure for measure in measures}
     if len(measure_by_name) != len(measures):
@@ -117,13 +117,13 @@ STEP_MEASURES = _index_measures_by_name(
             "Rate of the length of Leg 1 at that time, third component of the section state."),
     Measure("lambda_I4", "N s", "λ_I4", "DLS indicator λ_I4",
             "Normal impulse on the rear foot if the landing stops both feet.", "(35)",
-            violation="landing frees the rear foot"),
+            violation_text="landing frees the rear foot"),
     Measure("lambda_2_plus", "N", "λ2⁺", "DLS indicator λ2⁺",
             "Normal force on the fore foot just after landing if both feet are at rest.", "(38)",
-            violation="fore foot pulls at once"),
+            violation_text="fore foot pulls at once"),
     Measure("lambda_4_plus", "N", "λ4⁺", "DLS indicator λ4⁺",
             "Normal force on the rear foot just after landing if both feet are at rest.", "(38)",
-            violation="rear foot lifts at once"),
+            violation_text="rear foot lifts at once"),
     Measure("energy_lost_landing", "J", "ΔE_I", "energy lost in the landing",
             "Mechanical energy lost in collision I.", "(18)"),
     Measure("energy_lost_stopper", "J", "ΔE_II", "energy lost at the stopper",
@@ -142,48 +142,48 @@ STEP_MEASURES = _index_measures_by_name(
 MARGIN_MEASURES = _index_measures_by_name(
     Measure("fore_foot_force", "N", "min λ2", "least normal force on the fore foot",
             "Negative if the ground would have to pull on Leg 1.",
-            violation="fore foot pulls"),
+            violation_text="fore foot pulls"),
     Measure("takeoff_acceleration", "m/s^2", "z̈2⁺", "normal acceleration of foot 2 at take-off",
             "Acceleration of the rear foot just after take-off; negative if the foot scuffs "
-            "immediately.", violation="rear foot scuffs at take-off"),
+            "immediately.", violation_text="rear foot scuffs at take-off"),
     Measure("clearance_sls1", "m", "min z2, SLS-I", "foot clearance in SLS-I",
             "Least height of foot 2 in SLS-I; negative if the foot scuffs.",
-            violation="rear foot scuffs in SLS-I"),
+            violation_text="rear foot scuffs in SLS-I"),
     Measure("clearance_sls2", "m", "min z2, SLS-II", "foot clearance in SLS-II",
             "Least height of foot 2 in SLS-II; negative if the foot scuffs.",
-            violation="rear foot scuffs in SLS-II"),
+            violation_text="rear foot scuffs in SLS-II"),
     Measure("locked_stopper_force", "N", "min F_stop", "stopper force of the locked legs",
             "Least force of the stopper on each of Legs 3 to n; negative if a stopper has to pull.",
-            dimension="leg", violation="locked leg leaves its stopper"),
+            leg_dimension="leg", violation_text="locked leg leaves its stopper"),
     Measure("rear_stopper_force", "N", "min F_stop,2", "stopper force of Leg 2 in SLS-II",
             "Least force of the stopper on Leg 2 in SLS-II; negative if the stopper has to pull.",
-            violation="Leg 2 leaves its stopper"),
+            violation_text="Leg 2 leaves its stopper"),
     Measure("contraction", "m", "min(L0 - L1)", "contraction of Leg 1",
             "Least contraction after the landing; negative if Leg 1 passes its stopper.",
-            violation="Leg 1 passes its stopper"),
+            violation_text="Leg 1 passes its stopper"),
     Measure("friction_fore", "1", "μ - |λ1|/λ2", "friction left at the fore foot",
             "Friction coefficient of the model minus the coefficient that the fore foot needs.",
-            violation="fore foot slides"),
+            violation_text="fore foot slides"),
     Measure("friction_rear", "1", "μ - |λ3⁺|/λ4⁺", "friction left at the rear foot after landing",
             "Friction coefficient minus the one that the rear foot needs just after landing.",
-            violation="rear foot slides just after landing"),
+            violation_text="rear foot slides just after landing"),
     Measure("landing_stopper_impulse", "N s", "I_stop, I", "stopper impulse at the landing",
             "Impulse on each of Legs 3 to n; negative if a stopper has to pull in the landing.",
-            dimension="leg", violation="landing throws a locked leg off"),
+            leg_dimension="leg", violation_text="landing throws a locked leg off"),
     Measure("hit_stopper_impulse", "N s", "I_stop, II", "stopper impulse at collision II",
             "Impulse on each of Legs 3 to n; negative if a stopper has to pull in the collision.",
-            dimension="leg", violation="collision II throws a locked leg off"),
+            leg_dimension="leg", violation_text="collision II throws a locked leg off"),
     Measure("hit_planted_impulse", "N s", "λ_s2", "normal impulse of the planted foot",
             "Impulse of collision II; negative if the ground would have to pull.", "(22)",
-            violation="foot pulls in collision II"),
+            violation_text="foot pulls in collision II"),
     Measure("landing_friction_fore", "1", "μ - |λ_I1|/λ_I2",
             "friction left at the fore foot in the landing",
             "Friction coefficient minus the one that the fore foot needs in the landing impulse.",
-            violation="fore foot slides in the landing"),
+            violation_text="fore foot slides in the landing"),
     Measure("landing_friction_rear", "1", "μ - |λ_I3|/λ_I4",
             "friction left at the rear foot in the landing",
             "Friction coefficient minus the one that the rear foot needs in the landing impulse.",
-            violation="rear foot slides in the landing"),
+            violation_text="rear foot slides in the landing"),
 )
 """Margins of the model over one step, signed, negative where violated: `Margins`."""
 
@@ -203,11 +203,11 @@ UNILATERAL_STEP_MEASURES = _index_measures_by_name(
 STOPPER_MARGIN_MEASURES = _index_measures_by_name(
     Measure("stopper_force", "N", "min F_stop", "least force of a stopper on a leg in the air",
             "Negative if a stopper has to pull on a leg.",
-            violation="a leg in the air leaves its stopper"),
+            violation_text="a leg in the air leaves its stopper"),
     Measure("stopper_impulse", "N s", "min I_stop",
             "least impulse of a stopper on a leg in the air",
             "Negative if a stopper has to pull on a leg in an impact.",
-            violation="an impact throws a leg off its stopper"),
+            violation_text="an impact throws a leg off its stopper"),
 )
 """Margins of a step with unilateral contact and stoppers that hold legs in the air, negative if
 violated."""
@@ -335,19 +335,19 @@ TRAJECTORY_MEASURES = _index_measures_by_name(
 
 CONTACT_MEASURES = _index_measures_by_name(
     Measure("length", "m", "L", "length of the leg", "Distance from the hub to the foot.",
-            dimension="leg"),
+            leg_dimension="leg"),
     Measure("length_rate", "m/s", "L̇", "rate of the leg's length", "Rate of the distance.",
-            dimension="leg"),
-    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", dimension="leg"),
-    Measure("foot_z", "m", "z", "foot above the slope", "Height.", dimension="leg"),
+            leg_dimension="leg"),
+    Measure("foot_x", "m", "x", "foot along the slope", "Downhill position.", leg_dimension="leg"),
+    Measure("foot_z", "m", "z", "foot above the slope", "Height.", leg_dimension="leg"),
     Measure("tangential", "N", "λ_t", "tangential force on the foot", "Positive downhill.",
-            dimension="leg"),
+            leg_dimension="leg"),
     Measure("normal", "N", "λ_n", "normal force on the foot", "Positive if the ground pushes.",
-            dimension="leg"),
+            leg_dimension="leg"),
     Measure("contact", "1", "contact", "contact mode of the foot", "Code of the mode.",
-            dimension="leg"),
+            leg_dimension="leg"),
     Measure("on_stopper", "1", "on stopper", "whether the leg is on its stopper", "1 or 0.",
-            dimension="leg"),
+            leg_dimension="leg"),
 )
 """Variables of a trajectory with unilateral contact, of each leg 1..n."""
 
@@ -382,64 +382,70 @@ CONTACT_MODE_NAMES = ("in the air", "at rest", "sliding downhill", "sliding uphi
 """Names of the contact modes of a foot, in order: values 0, 1, 2, 3 of `contact`."""
 
 
-def flag_attrs(names: Iterable[str]) -> dict[str, object]:
-    """Return the CF attributes of an integer variable whose values 0, 1, ... have these names."""
-    names = [name.replace(" ", "_") for name in names]
-    return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+def make_flag_attributes(flag_names: Iterable[str]) -> dict[str, object]:
+    """Return the CF attributes of an integer variable whose numbers 0, 1, ... mean `flag_names`."""
+    flag_names = [flag_name.replace(" ", "_") for flag_name in flag_names]
+    return {"flag_values": list(range(len(flag_names))), "flag_meanings": " ".join(flag_names)}
 
 
-def get_measure(name: str) -> Measure:
-    """Return the measure with this name.
+def get_measure(measure_name: str) -> Measure:
+    """Return the measure with the name `measure_name`.
 
     The name may end with a leg, as "[5]", and begin with the minus of an upper bound.
     """
-    return MEASURES[name.removeprefix("-").partition("[")[0]]
+    return MEASURES[measure_name.removeprefix("-").partition("[")[0]]
 
 
-def make_variables(
-    columns_by_name: Mapping[str, np.ndarray], dimension: str
+def make_labeled_variables(
+    columns_by_name: Mapping[str, np.ndarray], row_dimension: str
 ) -> dict[str, xr.Variable]:
-    """Return the labeled variables of columns over one dimension, and over `leg` for measures per
+    """Return dataset variables of columns over one dimension, and over `leg` for measures per
     leg.
     """
-    select_dimensions = lambda name: (
-        (dimension, MEASURES[name].dimension) if MEASURES[name].dimension else dimension
+    dimension_selector = lambda name: (
+        (row_dimension, MEASURES[name].leg_dimension)
+        if MEASURES[name].leg_dimension
+        else row_dimension
     )
     return {
-        name: xr.Variable(select_dimensions(name), x, measure_attrs(name))
+        name: xr.Variable(dimension_selector(name), x, make_measure_attributes(name))
         for name, x in columns_by_name.items()
     }
 
 
-def locked_leg_coordinate(n_legs: int) -> xr.Variable:
-    """Return the coordinate `leg` of margins of the locked legs 3..n."""
-    attrs = {"long_name": "locked leg", "units": "1"}
-    return xr.Variable("leg", np.arange(3, n_legs + 1), attrs)
+def make_locked_leg_coordinate(n_legs: int) -> xr.Variable:
+    """Return the dataset coordinate `leg` of margins of the locked legs 3..n."""
+    attributes = {"long_name": "locked leg", "units": "1"}
+    return xr.Variable("leg", np.arange(3, n_legs + 1), attributes)
 
 
-def describe_violation(name: str) -> str:
-    """Return the text of the event at which a margin or indicator is zero.
+def describe_violation(margin_name: str) -> str:
+    """Return a text that describes the event at which a margin or indicator is zero.
 
     The name may end with a leg, as "[5]".
     """
-    base_name, _, leg_text = name.partition("[")
-    if base_name in STEP_MEASURES and not MEASURES[base_name].violation:
-        return f"{MEASURES[base_name].long_name} is zero"
-    if base_name not in MEASURES or not MEASURES[base_name].violation:
-        return name.replace("_", " ")
-    symbol_text = f"{MEASURES[base_name].symbol} = 0: " if base_name in STEP_MEASURES else ""
+    name_without_leg, _, leg_suffix = margin_name.partition("[")
+    if name_without_leg in STEP_MEASURES and not MEASURES[name_without_leg].violation_text:
+        return f"{MEASURES[name_without_leg].long_name} is zero"
+    if name_without_leg not in MEASURES or not MEASURES[name_without_leg].violation_text:
+        return margin_name.replace("_", " ")
+    symbol_text = (
+        f"{MEASURES[name_without_leg].symbol} = 0: " if name_without_leg in STEP_MEASURES else ""
+    )
     return (
-        symbol_text + MEASURES[base_name].violation + (f", leg {leg_text[:-1]}" if leg_text else "")
+        symbol_text
+        + MEASURES[name_without_leg].violation_text
+        + (f", leg {leg_suffix[:-1]}" if leg_suffix else "")
     )
 
 
-def measure_attrs(name: str) -> dict[str, object]:
-    """Return the attributes of the variable `name`, with flag names for codes."""
-    attrs: dict[str, object] = dict(MEASURES[name].attrs)
-    if name == "phase":
-        attrs |= flag_attrs(PHASE_NAMES)
-    if name == "contact":
-        attrs |= flag_attrs(CONTACT_MODE_NAMES)
-    if name == "outcome":
-        attrs |= flag_attrs(outcome.name for outcome in Outcome)
-    return attrs
+def make_measure_attributes(variable_name: str) -> dict[str, object]:
+    """Return the attributes of the dataset variable `variable_name`, with flag names for codes."""
+    attributes: dict[str, object] = dict(MEASURES[variable_name].variable_attributes)
+    if variable_name == "phase":
+        attributes |= make_flag_attributes(PHASE_NAMES)
+    if variable_name == "contact":
+        attributes |= make_flag_attributes(CONTACT_MODE_NAMES)
+    if variable_name == "outcome":
+        attributes |= make_flag_attributes(outcome_member.name for outcome_member in Outcome)
+    return attributes

@@ -52,7 +52,7 @@ from vrw_jax.numerics import (
     ForwardFunction,
     StepOptions,
     Vector,
-    sine_cosine,
+    compute_sine_cosine,
     unbatch,
 )
 from vrw_jax.runtime import compile_cached_lane_function
@@ -115,9 +115,9 @@ def make_batch_phase(
     """
 
     def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
-        sin, cos = sine_cosine(q[0])
+        sin, cos = compute_sine_cosine(q[0])
         return StageAccelerations(
-            sin, cos, phase.acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
+            sin, cos, phase.solve_acceleration(phase.complete_motion(sin, cos, q, v))[: phase.n_dof]
         )
 
     def complete_stage_motion(stage: StageState) -> Motion:
@@ -129,20 +129,20 @@ def make_batch_phase(
         return PhaseInstant(phase, complete_stage_motion(stage), stage.acceleration.acceleration)
 
     implicit_dynamics = ImplicitDynamics(
-        lambda stage: phase.dynamics_residual(
+        lambda stage: phase.compute_dynamics_residual(
             complete_stage_motion(stage), stage.acceleration.acceleration
         ),
         lambda stage, right_hand_side: phase.solve_dynamics(
             complete_stage_motion(stage), right_hand_side
         ),
     )
-    evaluate_stage_margins = lambda stage: phase.evaluate_margins(make_phase_instant(stage))
+    evaluate_stage_margins = lambda stage: phase.compute_margins(make_phase_instant(stage))
     recorded_margins = (
         MarginFunctions(evaluate_stage_margins, phase.margins_counted_at_start)
         if records_margins
         else None
     )
-    evaluate_guards = lambda stage: phase.guards(make_phase_instant(stage))
+    evaluate_guards = lambda stage: phase.compute_guards(make_phase_instant(stage))
     return BatchPhase(
         evaluate_acceleration,
         evaluate_guards,
@@ -215,7 +215,7 @@ def run_batch_phases(
         is_compiled_separately,
         stiff_start_options,
     )
-    land = with_batched_jvp(transitions.land)
+    land = with_batched_jvp(transitions.resolve_landing)
     return run_step_phases(run_phase, params, x, options, stop_at_lift_off, land)
 
 
@@ -236,7 +236,7 @@ def _make_phase_runner(
         is_active_lane: Array,
         previous_end: PhaseResult | None,
     ) -> PhaseResult:
-        scaled_options = compute_wheel_units(phase.s).scale_times(options)
+        scaled_options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
         if previous_end is not None:
             engine_carry: _PhaseCarry = previous_end.engine_carry
@@ -252,19 +252,19 @@ def _make_phase_runner(
                 max_transient_dt = transient_dt_in_transient_times * phase.s.m / phase.s.c
                 dt0 = jnp.minimum(stiff_start_options.max_first_step_ratio * dt0, max_transient_dt)
                 dt0 = jnp.where(engine_carry.has_phase_run, dt0, engine_carry.next_dt)
-        float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sin_cos), eqx.is_array)
+        float_leaves, static_leaves = eqx.partition((phase.s, phase.tilt_sine_cosine), eqx.is_array)
 
         def make_phase(float_leaves: Any, constants: Vector) -> BatchPhase:
             s, tilt_sin_cos = eqx.combine(float_leaves, static_leaves)
             rebuilt_phase = dataclasses.replace(
-                phase, s=s, constants=constants, tilt_sin_cos=tilt_sin_cos
+                phase, s=s, phase_constants=constants, tilt_sine_cosine=tilt_sin_cos
             )
             return make_batch_phase(rebuilt_phase, records_margins, is_compiled_separately)
 
         phase_end = integrate_batch_phase(
             make_phase,
             float_leaves,
-            phase.constants,
+            phase.phase_constants,
             tableau,
             q,
             v,
@@ -428,7 +428,8 @@ def build_step_sampler(
     argument_structure: Any, stop_at_lift_off: bool, n_samples: int
 ) -> BatchFunction:
     """Return a function from the leaves of (params, x, options) to samples at equal times of each
-    phase."""
+    phase.
+    """
     trace_config = _StepTraceConfig(argument_structure, stop_at_lift_off, None)
 
     def sample_step_of_lanes(*argument_leaves: Array) -> Trajectory:
@@ -440,7 +441,7 @@ def build_step_sampler(
                 *phase_start,
                 phase_end.duration,
                 n_samples,
-                compute_wheel_units(phase.s).scale_times(options),
+                compute_wheel_units(phase.s).scale_times_to_seconds(options),
             )
             for phase, phase_start, phase_end in zip(
                 phase_sequence.phases,

@@ -13,13 +13,13 @@ from vrw_jax.models.step_inputs import SectionState, complete_line_slopes
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.printing import format_quantity
-from vrw_jax.validation import is_traced
+from vrw_jax.validation import has_traced_leaf
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     WheelParams,
     WheelUnits,
-    wheel_from_parameters,
+    make_wheel_from_parameters,
 )
 
 StepGroundValues = tuple[Array, ...]
@@ -50,7 +50,7 @@ class AbstractWheel(eqx.Module):
     """Whether springs and dampers affect the motion. Tuning and scans vary them only then."""
 
     def __repr__(self) -> str:
-        if is_traced(self):
+        if has_traced_leaf(self):
             return eqx.tree_pformat(self)
         format_number = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
         format_field_value = lambda x: format_number(x) if eqx.is_array(x) else repr(x)
@@ -105,7 +105,7 @@ class AbstractWheel(eqx.Module):
             model_with_friction = eqx.tree_at(
                 lambda ground: ground.friction, self, parameter_values[n]
             )
-        return model_with_friction, wheel_from_parameters(parameter_values[:n], n_legs)
+        return model_with_friction, make_wheel_from_parameters(parameter_values[:n], n_legs)
 
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
@@ -168,7 +168,8 @@ class AbstractWheel(eqx.Module):
 
     def split_ground(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
         """Return the ground of each step if slope or friction are arrays over steps, otherwise
-        None."""
+        None.
+        """
         if jnp.ndim(params.slope) == 0:
             return None
         line_slopes = complete_line_slopes(params.slope, n_steps)
@@ -178,7 +179,8 @@ class AbstractWheel(eqx.Module):
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return model and wheel on the ground of one step, which is the slopes of two lines, see
-        `split_slopes`."""
+        `split_slopes`.
+        """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 
     def section_size(self, params: WheelParams) -> int:
@@ -194,7 +196,7 @@ class AbstractWheel(eqx.Module):
 
     def section_units(self, units: WheelUnits, n_legs: int) -> list[Elementwise]:
         """Return the wheel's unit of each entry of a section state."""
-        return [units.length / units.length, units.rate, units.velocity]
+        return [units.length_unit / units.length_unit, units.rate_unit, units.velocity_unit]
 
     def embed_section(self, params: WheelParams, x: Array) -> Array:
         """Return the section state of this model for `x`, which may be the paper's three

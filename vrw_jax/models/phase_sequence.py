@@ -27,7 +27,13 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import Elementwise, StepOptions, Vector, sine_cosine, tree_where
+from vrw_jax.numerics import (
+    Elementwise,
+    StepOptions,
+    Vector,
+    compute_sine_cosine,
+    select_tree_leaves,
+)
 from vrw_jax.wheel import (
     MAX_SI_VALUE,
     AbstractPhase,
@@ -86,7 +92,7 @@ def run_step_phases(
     x: SectionStateEntries,
     options: StepOptions,
     stop_at_lift_off: bool,
-    evaluate_landing: Callable[..., Landing] = transitions.land,
+    evaluate_landing: Callable[..., Landing] = transitions.resolve_landing,
 ) -> PhaseSequenceResult:
     """Return the result of all phases of one step from the section state `x`, given entry by entry.
 
@@ -100,15 +106,15 @@ def run_step_phases(
     params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
     s = params.symbols()
     landing_result = evaluate_landing(s, *x)
-    tilt_sin_cos = () if next_line_tilt is None else sine_cosine(next_line_tilt)
-    step_phases = make_phases(s, landing_result.distance, stop_at_lift_off, tilt_sin_cos)
+    tilt_sin_cos = () if next_line_tilt is None else compute_sine_cosine(next_line_tilt)
+    step_phases = make_phases(s, landing_result.foot_distance, stop_at_lift_off, tilt_sin_cos)
     # A landing that releases the rear foot continues in SLS-I.
-    is_double_support_active = is_valid_step & landing_result.keeps_rear_foot
+    is_double_support_active = is_valid_step & landing_result.is_rear_foot_planted
     remaining_phases = _run_remaining_phases(
         integrate_phase,
         step_phases,
-        landing_result.theta,
-        landing_result.motion,
+        landing_result.theta_after,
+        landing_result.motion_after,
         is_valid_step,
         is_double_support_active,
         options,
@@ -149,9 +155,9 @@ def _run_remaining_phases(
         if previous_phase is not None:
             end_state = (
                 phase_ends[-1].q[0],
-                previous_phase.motion_at(phase_ends[-1].q, phase_ends[-1].v),
+                previous_phase.compute_motion(phase_ends[-1].q, phase_ends[-1].v),
             )
-            wheel_angle, wheel_motion = tree_where(
+            wheel_angle, wheel_motion = select_tree_leaves(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
             is_phase_active = step_outcome == Outcome.STEPPED
@@ -159,16 +165,19 @@ def _run_remaining_phases(
                 jnp.asarray(state_component, jnp.result_type(wheel_angle))
                 for state_component in SAFE_SINGLE_SUPPORT_STATE
             )
-            safe_state = safe_theta, Motion(*sine_cosine(safe_theta), *safe_lengths_and_rates)
-            wheel_angle, wheel_motion = tree_where(
+            safe_state = (
+                safe_theta,
+                Motion(*compute_sine_cosine(safe_theta), *safe_lengths_and_rates),
+            )
+            wheel_angle, wheel_motion = select_tree_leaves(
                 is_phase_active, (wheel_angle, wheel_motion), safe_state
             )
-            wheel_motion = previous_phase.reset_map(wheel_motion)
+            wheel_motion = previous_phase.reset_motion(wheel_motion)
         start_state = phase.select_coordinates(wheel_angle, wheel_motion)
         phase_end = integrate_phase(
             phase, *start_state, is_phase_active, phase_ends[-1] if phase_ends else None
         )
-        phase_outcome = phase.outcome_of_guard(phase_end.guard, phase_end.is_timed_out)
+        phase_outcome = phase.select_guard_outcome(phase_end.guard, phase_end.is_timed_out)
         if phase.can_come_to_rest:
             is_at_rest = phase.is_at_rest(phase_end.q, phase_end.v, options.atol)
             phase_outcome = replace_rest_outcome(phase_outcome, is_at_rest)
@@ -287,34 +296,35 @@ def make_step_result(
         phase_sequence.outcome == Outcome.STEPPED,
     )
     double_support, single_support_1, single_support_2 = make_phases(
-        s, landing_result.distance, stop_at_lift_off=True
+        s, landing_result.foot_distance, stop_at_lift_off=True
     )
-    liftoff_motion = double_support.motion_at(phase_ends[0].q, phase_ends[0].v)
+    liftoff_motion = double_support.compute_motion(phase_ends[0].q, phase_ends[0].v)
     stopper_state = [
         jnp.where(hits_stopper, x, jnp.asarray(safe_value, x.dtype))
         for x, safe_value in zip(
             (*phase_ends[1].q, *phase_ends[1].v), SAFE_SINGLE_SUPPORT_STATE, strict=True
         )
     ]
-    stopper_hit = transitions.hit_stopper(
-        s, single_support_1.motion_at(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
+    stopper_hit = transitions.resolve_stopper_collision(
+        s, single_support_1.compute_motion(tuple(stopper_state[:3]), tuple(stopper_state[3:]))
     )
-    last_motion = single_support_2.motion_at(phase_ends[2].q, phase_ends[2].v)
+    last_motion = single_support_2.compute_motion(phase_ends[2].q, phase_ends[2].v)
     initial_energy, final_energy = (
-        dynamics.mechanical_energy(s, m).total for m in (landing_result.motion, last_motion)
+        dynamics.compute_mechanical_energy(s, m).total_energy
+        for m in (landing_result.motion_after, last_motion)
     )
-    fore_force, rear_force = transitions.landing_forces(s, landing_result)
+    fore_force, rear_force = transitions.compute_landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)
     return StepResult(
         section_state=advance_result.section_state,
         post_impact=jnp.stack(
             [
                 jnp.where(has_begun, x, 0.0)
-                for x in (landing_result.theta, landing_result.motion.dtheta)
+                for x in (landing_result.theta_after, landing_result.motion_after.dtheta)
             ]
         ),
         durations=advance_result.durations,
-        step_length=jnp.where(has_begun, landing_result.distance, 0.0),
+        step_length=jnp.where(has_begun, landing_result.foot_distance, 0.0),
         indicators=DoubleSupportIndicators(
             lambda_I4=jnp.where(has_begun, landing_result.rear_impulse.normal, 0.0),
             lambda_2=jnp.where(has_begun, fore_force.normal, 0.0),
@@ -324,10 +334,10 @@ def make_step_result(
             phase_sequence, rear_force, liftoff_motion, stopper_hit, friction
         ),
         energy=EnergyLoss(
-            landing=jnp.where(has_begun, landing_result.energy_lost, 0.0),
-            stopper=jnp.where(hits_stopper, stopper_hit.energy_lost, 0.0),
+            landing=jnp.where(has_begun, landing_result.energy_loss, 0.0),
+            stopper=jnp.where(hits_stopper, stopper_hit.energy_loss, 0.0),
             damping=jnp.where(
-                has_stepped, initial_energy - final_energy - stopper_hit.energy_lost, 0.0
+                has_stepped, initial_energy - final_energy - stopper_hit.energy_loss, 0.0
             ),
         ),
         outcome=advance_result.outcome,
@@ -371,7 +381,7 @@ def evaluate_phase_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array,
       axes of `y`.
     """
     coordinates = tuple(y)
-    wheel_motion = phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
+    wheel_motion = phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
     phase_instant = PhaseInstant(phase, wheel_motion, None)
     zero = 0.0 * wheel_motion.L1
     rear_force = phase_instant.rear_force or dynamics.FootForce(zero, zero)
@@ -387,7 +397,7 @@ def evaluate_phase_states(phase: AbstractPhase, y: Array) -> tuple[Array, Array,
             ]
         ),
         jnp.stack([*phase_instant.fore_force, *rear_force]),
-        jnp.stack(dynamics.mechanical_energy(phase.s, wheel_motion)),
+        jnp.stack(dynamics.compute_mechanical_energy(phase.s, wheel_motion)),
     )
 
 
@@ -395,7 +405,7 @@ def _make_step_margins(
     phase_sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
-    stopper_hit: transitions.StopperHit,
+    stopper_hit: transitions.StopperCollision,
     friction: Elementwise | float,
 ) -> Margins:
     """Return the margins of the step.
@@ -421,7 +431,8 @@ def _make_step_margins(
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:
         """Return the minimum of a margin over those of the phases that happened, or 0 if none
-        happened."""
+        happened.
+        """
         lowest_value: Any = jnp.inf
         for phase_index in phase_indices:
             phase_minimum = jnp.asarray(getattr(phase_minima[phase_index], margin_name))
@@ -431,20 +442,24 @@ def _make_step_margins(
         return jnp.where(jnp.isfinite(lowest_value), lowest_value, 0.0)
 
     def compute_friction_margin(foot_force: dynamics.FootForce, is_loaded: Array) -> Array:
-        required_friction = jnp.where(is_loaded, dynamics.required_friction(foot_force), 0.0)
+        required_friction = jnp.where(
+            is_loaded, dynamics.compute_required_friction(foot_force), 0.0
+        )
         return jnp.where(has_begun, friction - required_friction, 0.0)
 
     def compute_stopper_impulses(
         motion_after: Motion, hub_jump: tuple, has_collision: Array
     ) -> Array:
-        leg_impulses = transitions.locked_leg_impulses(s, motion_after, hub_jump, range(3, s.n + 1))
+        leg_impulses = transitions.compute_locked_leg_impulses(
+            s, motion_after, hub_jump, range(3, s.n + 1)
+        )
         return jnp.where(has_collision, leg_impulses, 0.0)
 
     return Margins(
         fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
-            phase_occurrences[1] & landing_result.keeps_rear_foot,
-            dynamics.takeoff_acceleration(s, liftoff_motion),
+            phase_occurrences[1] & landing_result.is_rear_foot_planted,
+            dynamics.compute_takeoff_acceleration(s, liftoff_motion),
             0.0,
         ),
         clearance_sls1=find_lowest_margin("rear_clearance", 1),
@@ -455,14 +470,14 @@ def _make_step_margins(
         friction_fore=jnp.where(has_begun, friction + find_lowest_margin("friction", 0, 1, 2), 0.0),
         friction_rear=compute_friction_margin(rear_force, phase_occurrences[0]),
         landing_stopper_impulse=compute_stopper_impulses(
-            landing_result.motion, landing_result.hub_jump, has_begun
+            landing_result.motion_after, landing_result.hub_velocity_jump, has_begun
         ),
         hit_stopper_impulse=compute_stopper_impulses(
-            stopper_hit.motion, stopper_hit.hub_jump, hits_stopper
+            stopper_hit.motion_after, stopper_hit.hub_velocity_jump, hits_stopper
         ),
         hit_planted_impulse=jnp.where(hits_stopper, stopper_hit.foot_impulse.normal, 0.0),
         landing_friction_fore=compute_friction_margin(landing_result.fore_impulse, has_begun),
         landing_friction_rear=compute_friction_margin(
-            landing_result.rear_impulse, has_begun & landing_result.keeps_rear_foot
+            landing_result.rear_impulse, has_begun & landing_result.is_rear_foot_planted
         ),
     )

@@ -26,7 +26,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import Elementwise, StepOptions, tree_where
+from vrw_jax.numerics import Elementwise, StepOptions, select_tree_leaves
 from vrw_jax.validation import check_bool
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
@@ -34,8 +34,8 @@ from vrw_jax.wheel import (
     Outcome,
     Symbols,
     WheelParams,
+    compute_rear_foot_height,
     dynamics,
-    rear_foot_height,
     require_known_friction,
     transitions,
 )
@@ -127,12 +127,12 @@ class RigidWheel(AbstractWheel):
         if not self.held_landing:
             return (s.Mt * s.L0**2 * s.cos_alpha + _compute_hub_inertia(s)) / foot_inertia
         half_angle = jnp.asarray(0.5 * s.alpha, s.L0.dtype)
-        motion_after_landing = transitions.land(
+        motion_after_landing = transitions.resolve_landing(
             s, half_angle, jnp.ones_like(half_angle), jnp.zeros_like(half_angle)
-        ).motion
-        M = dynamics.mass_matrix(s, motion_after_landing.L1, motion_after_landing.L2)
+        ).motion_after
+        M = dynamics.compute_mass_matrix(s, motion_after_landing.L1, motion_after_landing.L2)
         return (
-            M.multiply(
+            M.multiply_vector(
                 (motion_after_landing.dtheta, motion_after_landing.dL1, motion_after_landing.dL2)
             )[0]
             / foot_inertia
@@ -140,7 +140,8 @@ class RigidWheel(AbstractWheel):
 
     def make_vertical_rate_map(self, params: WheelParams) -> "VerticalRateMap":
         """Return the map from the squared rate at the vertical of one stance leg to that at the
-        vertical of the next."""
+        vertical of the next.
+        """
         s = params.symbols()
         half_angle, doubled_gravity_stiffness = 0.5 * s.alpha, 2.0 * _compute_gravity_stiffness(s)
         return VerticalRateMap(
@@ -209,7 +210,9 @@ class RigidWheel(AbstractWheel):
                 takeoff_acceleration=zero,
                 clearance_sls1=zero,
                 clearance_sls2=zero_unless_stepped(
-                    rear_foot_height(s, rolling_motion.compute_motion_at_angle(end_angle + zero))
+                    compute_rear_foot_height(
+                        s, rolling_motion.compute_motion_at_angle(end_angle + zero)
+                    )
                 ),
                 locked_stopper_force=zero_unless_stepped(margin_minima[3:]),
                 rear_stopper_force=zero_unless_stepped(margin_minima[2]),
@@ -292,12 +295,12 @@ class RigidWheel(AbstractWheel):
         motion_after = rolling_motion.compute_motion_at_angle(
             -jnp.asarray(0.5 * s.alpha, zero.dtype) + zero
         )
-        hub_jump = transitions.hub_velocity_jump(
-            transitions.motion_before_landing(s, *x), motion_after
+        hub_jump = transitions.compute_hub_velocity_jump(
+            transitions.compute_motion_before_landing(s, *x), motion_after
         )
         holds_rear_foot = self.held_landing
         rear_impulse = (
-            transitions.land(s, *x).rear_impulse
+            transitions.resolve_landing(s, *x).rear_impulse
             if holds_rear_foot
             else dynamics.FootForce(zero, zero)
         )
@@ -307,10 +310,10 @@ class RigidWheel(AbstractWheel):
             s.Mt * hub_jump[0] - rear_impulse.tangential, s.Mt * hub_jump[1] - rear_impulse.normal
         )
         friction_margins = tuple(
-            friction - dynamics.required_friction(foot_impulse)
+            friction - dynamics.compute_required_friction(foot_impulse)
             for foot_impulse in (fore_impulse, rear_impulse)
         )
-        stopper_impulses = transitions.locked_leg_impulses(
+        stopper_impulses = transitions.compute_locked_leg_impulses(
             s, motion_after, hub_jump, range(3, s.n + 1)
         )
         return rear_impulse, friction_margins, stopper_impulses
@@ -413,7 +416,8 @@ class RollingMotion(eqx.Module):
 
     def compute_squared_rate(self, theta: Elementwise) -> Elementwise:
         """Return the square of dtheta at theta, rad^2/s^2. It is negative if the wheel does not
-        reach theta."""
+        reach theta.
+        """
         s = self.s
         height_drop = _compute_cosine_from_vertical(
             s, self.first_angle
@@ -475,7 +479,7 @@ class RollingMotion(eqx.Module):
 
     def compute_foot_force_at_angle(self, theta: Elementwise) -> dynamics.FootForce:
         """Return the force of the ground on the stance foot at theta, N."""
-        return dynamics.fore_foot_force(
+        return dynamics.compute_fore_foot_force(
             self.s, self.compute_motion_at_angle(theta), self.compute_acceleration_at_angle(theta)
         )
 
@@ -483,7 +487,7 @@ class RollingMotion(eqx.Module):
         self, theta: Elementwise, legs: range
     ) -> Float[Array, "n ..."]:
         """Return the forces of the stoppers of `legs` at theta, N."""
-        return dynamics.stopper_force(
+        return dynamics.compute_stopper_force(
             self.s,
             self.compute_motion_at_angle(theta),
             self.compute_acceleration_at_angle(theta),
@@ -492,7 +496,8 @@ class RollingMotion(eqx.Module):
 
     def evaluate_states_at_angles(self, theta: Elementwise) -> tuple[Array, Array, Array]:
         """Return coordinates with rates, forces of both feet (N) and energies (J) at theta, on the
-        first axis."""
+        first axis.
+        """
         wheel_motion, foot_force, zero = (
             self.compute_motion_at_angle(theta),
             self.compute_foot_force_at_angle(theta),
@@ -512,7 +517,7 @@ class RollingMotion(eqx.Module):
         return (
             coordinates_and_rates,
             foot_forces,
-            jnp.stack(dynamics.mechanical_energy(self.s, wheel_motion)),
+            jnp.stack(dynamics.compute_mechanical_energy(self.s, wheel_motion)),
         )
 
     def evaluate_margins_at_angles(self, theta: Array) -> Array:
@@ -525,7 +530,9 @@ class RollingMotion(eqx.Module):
             self.compute_stopper_force_at_angle(theta[leg], range(leg, leg + 1))[0]
             for leg in range(2, self.s.n + 1)
         ]
-        required_friction = dynamics.required_friction(self.compute_foot_force_at_angle(theta[1]))
+        required_friction = dynamics.compute_required_friction(
+            self.compute_foot_force_at_angle(theta[1])
+        )
         return jnp.stack(
             [self.compute_foot_force_at_angle(theta[0]).normal, -required_friction, *stopper_forces]
         )
@@ -557,7 +564,7 @@ class RollingMotion(eqx.Module):
                 )
                 candidate_angles = jnp.clip(bracket_centers + angle_offset, -half_angle, end_angle)
                 candidate_margins = self.evaluate_margins_at_angles(candidate_angles)
-                return tree_where(
+                return select_tree_leaves(
                     candidate_margins < lowest_angles_and_margins[1],
                     (candidate_angles, candidate_margins),
                     lowest_angles_and_margins,

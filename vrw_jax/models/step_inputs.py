@@ -31,7 +31,8 @@ SectionStateEntries = Float[Array, "section ..."] | tuple[Array, ...]
 
 def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
     """Return whether parameters and start are finite, in their domains and rolling forward. NaN
-    gives False."""
+    gives False.
+    """
     wheel_angle, angular_rate = x[0], x[1]
     is_upright = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
         jnp.abs(wheel_angle - params.leg_angle) < 0.5 * jnp.pi
@@ -97,7 +98,7 @@ def split_slopes(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
 
 def is_valid_slope(slope: Elementwise) -> Array:
     """Return whether a slope (rad) lies in the domain of slopes. NaN gives False."""
-    return jnp.asarray(PARAMETER_DOMAINS["slope"].contains(slope))
+    return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_value(slope))
 
 
 def select_stance_line_and_tilt(

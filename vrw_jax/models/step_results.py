@@ -14,7 +14,7 @@ from vrw_jax.models.step_inputs import AnySectionState
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_ending,
+    describe_step_ending,
     format_outcome_counts,
     format_quantity,
 )
@@ -42,7 +42,7 @@ class AbstractMeasureGroup(AbstractPrintable):
         measure_items = self.measures().items()
         return [
             (
-                MEASURES[measure_name].label,
+                MEASURES[measure_name].label_with_symbol,
                 format_quantity(measure_value, MEASURES[measure_name].unit),
             )
             for measure_name, measure_value in measure_items
@@ -145,7 +145,8 @@ class Margins(AbstractMeasureGroup):
 
 class AbstractStep(AbstractPrintable):
     """Results of one step that every model reports. Under `vmap` each field gains the axis of the
-    batch."""
+    batch.
+    """
 
     section_state: eqx.AbstractVar[Array]  # just before the next touchdown
     post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
@@ -157,7 +158,7 @@ class AbstractStep(AbstractPrintable):
     @property
     def ending(self) -> Any:
         """Return how the step ended, as a sentence; a batch has an array of sentences."""
-        return describe_ending(self.outcome, Outcome)
+        return describe_step_ending(self.outcome, Outcome)
 
     @property
     def period(self) -> Array:
@@ -214,10 +215,10 @@ class AbstractStep(AbstractPrintable):
             value_text = measure_description.format_with_unit(lowest_value)
             if measure_name in MARGIN_MEASURES:
                 text_rows.append(
-                    (f"margin: {measure_description.label}", value_text + verdict_text)
+                    (f"margin: {measure_description.label_with_symbol}", value_text + verdict_text)
                 )
             else:
-                text_rows.append((measure_description.label, value_text))
+                text_rows.append((measure_description.label_with_symbol, value_text))
         return text_rows
 
     def model_selection(self) -> dict[str, Array]:

@@ -68,17 +68,19 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
 
     def unpack_motion(y: StateArray) -> Motion:
         coordinates = tuple(y)
-        return phase.motion_at(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
+        return phase.compute_motion(coordinates[: phase.n_dof], coordinates[phase.n_dof :])
 
     def evaluate_vector_field(y: StateArray) -> StateArray:
-        return jnp.stack([*y[phase.n_dof :], *phase.acceleration(unpack_motion(y))[: phase.n_dof]])
+        return jnp.stack(
+            [*y[phase.n_dof :], *phase.solve_acceleration(unpack_motion(y))[: phase.n_dof]]
+        )
 
     def evaluate_guards_and_margins(y: StateArray) -> Array:
         phase_instant = PhaseInstant(phase, unpack_motion(y), None)
         return jnp.stack(
             [
-                *phase.guards(phase_instant),
-                *(phase.evaluate_margins(phase_instant) if records_margins else ()),
+                *phase.compute_guards(phase_instant),
+                *(phase.compute_margins(phase_instant) if records_margins else ()),
             ]
         )
 
@@ -176,7 +178,7 @@ class ViscoelasticWheel(AbstractWheel):
             start_vector = jnp.stack([*phase_start[0], *phase_start[1]])
             state_and_time_units = (
                 jnp.stack(phase.coordinate_units),
-                compute_wheel_units(phase.s).time,
+                compute_wheel_units(phase.s).time_unit,
             )
             phase_samples.append(
                 sample_in_units(
@@ -234,7 +236,7 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
             is_active,
             options,
             jnp.stack(phase.coordinate_units),
-            compute_wheel_units(phase.s).time,
+            compute_wheel_units(phase.s).time_unit,
         )
         end_state = tuple(phase_end.state)
         return PhaseResult(
@@ -255,7 +257,8 @@ def _compile_step_function(
     model: ViscoelasticWheel, argument_structure: Any, is_detailed: bool
 ) -> ForwardFunction:
     """Return the function of a step over the leaves of (params, x, options), differentiable in any
-    mode."""
+    mode.
+    """
 
     static_options = jax.tree.unflatten(argument_structure, [0.0] * argument_structure.num_leaves)[
         2

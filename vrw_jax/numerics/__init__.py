@@ -6,36 +6,36 @@ from vrw_jax.numerics.autodiff import (
     ForwardFunction,
     apply_jacobian,
     enable_all_ad_modes,
-    implicit_jacobian,
-    value_and_jacobian,
+    evaluate_with_jacobian,
+    make_implicit_jacobian,
+    make_zero_tangent,
     with_implicit_derivative,
-    zero_tangent,
 )
 from vrw_jax.numerics.batch_algebra import (
     FusionBarrierFn,
     LaneArray,
     apply_matrix,
-    contract_axes,
-    fusion_barrier,
-    invert_small,
+    contract_inner_axis,
+    evaluate_with_jvps,
+    evaluate_with_partials,
+    invert_small_matrices,
+    make_fusion_barrier,
     solve_node_equations,
-    value_and_jvps,
-    value_and_partials,
-    weighted_sum,
+    sum_with_weights,
 )
 from vrw_jax.numerics.batching import (
     BatchFunction,
-    concat_rows,
+    apply_in_blocks,
+    concatenate_tree_rows,
     is_inside_jit,
-    make_blockwise,
+    make_opaque_condition,
+    make_zeros_like_output,
     map_in_batches,
     map_in_numpy_batches,
-    opaque_condition,
     run_if_any,
-    take_rows,
-    tree_where,
+    select_tree_leaves,
+    select_tree_rows,
     unbatch,
-    zeros_like_output,
 )
 from vrw_jax.numerics.cubic_minima import (
     MINIMUM_LOCATION_TOLERANCE,
@@ -45,6 +45,6 @@ from vrw_jax.numerics.cubic_minima import (
 from vrw_jax.numerics.forward_only import forbid_reverse_mode
 from vrw_jax.numerics.options import EngineName, SolverName, StepOptions
 from vrw_jax.numerics.status_codes import StatusCode
-from vrw_jax.numerics.trigonometry import sine_cosine
+from vrw_jax.numerics.trigonometry import compute_sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
 from vrw_jax.validation import raise_for_missing_numerics_name as __getattr__

@@ -34,11 +34,12 @@ def enable_all_ad_modes(
     """Return `function` with derivatives in forward and reverse mode, to any order.
 
     `function(*arrays)` must take only floating-point arrays, be differentiable by `jax.jvp` to the
-    requested order, and not close over values that are themselves differentiated. For derivatives,
-    `function_to_differentiate` replaces it, for example the same function with tighter tolerances.
-    `make_jacobian` may return (Jacobian with respect to these arguments, value) and the other
-    outputs in another way. Function and Jacobians are compiled once each: outside of `jit`, forward
-    mode, reverse mode and single directions all call the same compiled Jacobian.
+    requested order, and not close over values that are themselves differentiated. If
+    `function_to_differentiate` is given, derivatives are computed from it, for example from the
+    same function with tighter tolerances. `make_jacobian` may provide another function that returns
+    (Jacobian with respect to the given arguments, value) and the other outputs. Function and
+    Jacobians are compiled once each: outside of `jit`, forward mode, reverse mode and single
+    directions all call the same compiled Jacobian.
     """
     differentiable_function = (
         function if function_to_differentiate is None else function_to_differentiate
@@ -48,7 +49,7 @@ def enable_all_ad_modes(
 
     @functools.cache
     def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        forward_jacobian = _make_forward_jacobian(differentiable_function, argnums)
+        forward_jacobian = _make_forward_jacobian_function(differentiable_function, argnums)
         return (
             enable_all_ad_modes(forward_jacobian)
             if make_jacobian is None
@@ -57,37 +58,39 @@ def enable_all_ad_modes(
 
     @with_default_jax_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
-        argnums = tuple(
+        perturbed_argnums = tuple(
             i
             for i, tangent_or_zero in enumerate(tangents)
             if not isinstance(tangent_or_zero, SymbolicZero)
         )
-        if not argnums:
-            outputs = wrapped_function(*primals)
-            return outputs, zero_tangent(outputs)
-        (argument_jacobians, float_outputs), other_outputs = get_differentiable_jacobian(argnums)(
-            *primals
-        )
+        if not perturbed_argnums:
+            jacobian_result = wrapped_function(*primals)
+            return jacobian_result, make_zero_tangent(jacobian_result)
+        (argument_jacobians, float_outputs), other_outputs = get_differentiable_jacobian(
+            perturbed_argnums
+        )(*primals)
         output_tangent = _apply_argument_jacobians(
-            float_outputs, argument_jacobians, tuple(tangents[i] for i in argnums)
+            float_outputs, argument_jacobians, tuple(tangents[i] for i in perturbed_argnums)
         )
-        return (float_outputs, other_outputs), (output_tangent, zero_tangent(other_outputs))
+        return (float_outputs, other_outputs), (output_tangent, make_zero_tangent(other_outputs))
 
     wrapped_function.defjvp(wrapped_jvp, symbolic_zeros=True)
 
     def call_function(*arrays: Any) -> tuple:
-        is_traced = any(isinstance(x, jax.core.Tracer) for x in arrays)
+        has_traced_argument = any(isinstance(x, jax.core.Tracer) for x in arrays)
         # The rule costs as much as a solver step, so it is applied only to traced arguments.
-        return wrapped_function(*arrays) if is_traced else compiled_function(*arrays)
+        return wrapped_function(*arrays) if has_traced_argument else compiled_function(*arrays)
 
     return call_function
 
 
-def _make_forward_jacobian(function: ForwardFunction, argnums: tuple[int, ...]) -> ForwardFunction:
-    """Return a function of the Jacobians of the float outputs, one for each differentiated
-    argument.
+def _make_forward_jacobian_function(
+    function: ForwardFunction, argnums: tuple[int, ...]
+) -> ForwardFunction:
+    """Return a function that computes the Jacobians of the float outputs, one for each
+    differentiated argument.
 
-    Its result is (Jacobians, float outputs), and the other outputs.
+    The returned function gives (Jacobians, float outputs), and the other outputs.
     """
 
     def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, PyTree]:
@@ -95,7 +98,7 @@ def _make_forward_jacobian(function: ForwardFunction, argnums: tuple[int, ...]) 
         return float_outputs, (float_outputs, other_outputs)
 
     def evaluate_jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
-        argument_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
+        output_jacobians, (float_outputs, other_outputs) = jax.jacfwd(
             evaluate_with_aux, argnums=argnums, has_aux=True
         )(*arrays)
         jacobians_by_argument = tuple(
@@ -104,7 +107,7 @@ def _make_forward_jacobian(function: ForwardFunction, argnums: tuple[int, ...]) 
                     argument_index
                 ],
                 float_outputs,
-                argument_jacobians,
+                output_jacobians,
             )
             for argument_index in range(len(argnums))
         )
@@ -114,20 +117,22 @@ def _make_forward_jacobian(function: ForwardFunction, argnums: tuple[int, ...]) 
 
 
 @jax.jit
-def _apply_argument_jacobians(template: PyTree, jacobians: PyTree, tangents: tuple) -> PyTree:
-    """Return Jacobians times tangents, leaf by leaf.
+def _apply_argument_jacobians(
+    output_template: PyTree, jacobians: PyTree, tangents: tuple
+) -> PyTree:
+    """Return the sum of Jacobians times tangents, leaf by leaf.
 
     Products are written as sums, because a matrix product of small arrays is a library call.
     """
 
     def apply_leaf(_: Array, *leaf_jacobians: Array) -> Array:
-        terms = [
+        product_terms = [
             jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
             for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
         ]
-        return sum(terms[1:], start=terms[0])
+        return sum(product_terms[1:], start=product_terms[0])
 
-    return jax.tree.map(apply_leaf, template, *jacobians)
+    return jax.tree.map(apply_leaf, output_template, *jacobians)
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
@@ -137,69 +142,75 @@ ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
 def with_implicit_derivative(
     function: BatchFunction,
     compute_tangents: Callable,
-    wrap_execution: ExecutionWrapper,
-    order: int = 0,
+    execution_wrapper: ExecutionWrapper,
+    derivative_order: int = 0,
 ) -> Callable:
     """Return `function(p, z)` of one wheel, differentiable along z = z(p) to any order and in any
     mode.
 
     `function(p, z)` acts on a batch. `compute_tangents(p, z)` returns dz/dp of one wheel with a
-    leading axis over p. It is correct if z = z(p), and is itself made by this function. The rule
-    ignores the tangent of z, which can only be dz/dp times that of p. It returns the total
-    derivative times the tangent of p.
+    leading axis over p. Its result is correct if z = z(p), and it must itself have been made by
+    `with_implicit_derivative`. The derivative rule returns the total derivative with respect to p
+    times the tangent of p. The rule ignores the tangent of z, which can only be dz/dp times the
+    tangent of p.
     """
-    unbatched_function = unbatch(wrap_execution(function, order))
+    unbatched_function = unbatch(execution_wrapper(function, derivative_order))
     wrapped_function = jax.custom_jvp(lambda p, z: unbatched_function(p, z))
 
     @wrapped_function.defjvp
     @with_default_jax_settings
     def wrapped_jvp(primals: tuple, tangents: tuple) -> tuple:
-        jacobian = implicit_jacobian(function, compute_tangents, wrap_execution, order + 1)(
-            *primals
-        )
+        jacobian = make_implicit_jacobian(
+            function, compute_tangents, execution_wrapper, derivative_order + 1
+        )(*primals)
         return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])
 
     return wrapped_function
 
 
-def implicit_jacobian(
+def make_implicit_jacobian(
     function: BatchFunction,
     compute_tangents: Callable,
-    wrap_execution: ExecutionWrapper,
-    order: int = 1,
+    execution_wrapper: ExecutionWrapper,
+    derivative_order: int = 1,
     make_jacobian: BatchFunction | None = None,
 ) -> Callable:
     """Return a function that computes d function(p, z(p)) / dp, with a leading axis over p.
 
-    The result is differentiable as in `with_implicit_derivative`. `make_jacobian(p, (z, dz/dp))`
-    may compute the same Jacobian faster.
+    The returned function is differentiable as in `with_implicit_derivative`. `make_jacobian(p, (z,
+    dz/dp))` may compute the same Jacobian faster.
     """
 
     def jvp_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
         """Return the derivatives over a batch, computed one direction after another.
 
-        The code is then as short as for one direction.
+        The compiled code is then as short as for one direction.
         """
-        n_parameters, (z, dz) = p.shape[0], z_and_jacobian
+        n_parameters, (z, z_jacobian) = p.shape[0], z_and_jacobian
         unit_tangents = jnp.broadcast_to(
             jnp.eye(n_parameters, dtype=p.dtype)[:, :, None], (n_parameters, *p.shape)
         )
-        return lax.map(lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, dz))
+        return lax.map(
+            lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, z_jacobian)
+        )
 
     def compute_known_tangents(
         p: Array, z_and_jacobian: tuple[PyTree, PyTree]
     ) -> tuple[PyTree, PyTree]:
-        z, dz = z_and_jacobian
+        z, z_jacobian = z_and_jacobian
         second_derivatives = jax.jacfwd(compute_tangents)(p, z)
-        return dz, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
+        return z_jacobian, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
 
     jacobian_function = with_implicit_derivative(
-        make_jacobian or jvp_sequentially, compute_known_tangents, wrap_execution, order
+        make_jacobian or jvp_sequentially,
+        compute_known_tangents,
+        execution_wrapper,
+        derivative_order,
     )
     return lambda p, z: jacobian_function(p, lax.stop_gradient((z, compute_tangents(p, z))))
 
 
-def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
+def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
     """Return the outputs of `function`, and the derivatives of its float outputs on last axes.
 
     One program computes both. With several arguments, the derivatives of a leaf are a tuple with
@@ -210,23 +221,27 @@ def value_and_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]
         float_outputs, other_outputs = eqx.partition(function(*arguments), eqx.is_inexact_array)
         return float_outputs, (float_outputs, other_outputs)
 
-    argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
     output_jacobian, (float_jacobians, other_outputs) = jax.jacfwd(
-        select_float_outputs, argnums, has_aux=True
+        select_float_outputs, all_argnums, has_aux=True
     )(*arguments)
     return eqx.combine(float_jacobians, other_outputs), output_jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
-    """Return the Jacobian (leading axis: inputs) times the tangent, leaf by leaf."""
+    """Return the Jacobian times the tangent, leaf by leaf. The leading axis of the Jacobian runs
+    over inputs.
+    """
     return jax.tree.map(lambda jacobian_leaf: jnp.tensordot(tangent, jacobian_leaf, 1), jacobian)
 
 
-def zero_tangent(tree: PyTree) -> PyTree:
-    """Return the zero tangent of any tree of outputs."""
-    make_zero = lambda x: (
+def make_zero_tangent(tree: PyTree) -> PyTree:
+    """Return the zero tangent of a tree of outputs, with float0 leaves for outputs that are not
+    floats.
+    """
+    leaf_zero_maker = lambda x: (
         jnp.zeros_like(x)
         if jnp.issubdtype(jnp.result_type(x), jnp.inexact)
         else np.zeros(jnp.shape(x), jax.dtypes.float0)
     )
-    return jax.tree.map(make_zero, tree)
+    return jax.tree.map(leaf_zero_maker, tree)

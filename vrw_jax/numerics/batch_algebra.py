@@ -1,8 +1,8 @@
 """Linear algebra of many small systems together, batch last, as sums of elementwise products.
 
-XLA on CPU computes inexpensive intermediate results again for each use, which costs more than all
-arithmetic of this module. A `lax.cond` prevents this: its predicate is always true, but XLA cannot
-prove that at compile time.
+XLA on CPU recomputes inexpensive intermediate results for each use, which costs more than all
+arithmetic of this module. A `lax.cond` prevents this recomputation, because XLA cannot prove at
+compile time that its predicate is always true.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,10 @@ LaneArray = Float[Array, "... lanes"]
 FusionBarrierFn = Callable[[Any], Any]
 
 
-def fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
+def make_fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
     """Return an identity function across which XLA cannot fuse operations.
 
-    `lane_values` must not contain NaN, a fact that XLA cannot prove.
+    `lane_values` must not contain NaN. XLA cannot prove that it does not.
     """
     if simd.targets_machine_code():
         return lax.optimization_barrier
@@ -41,7 +41,9 @@ def fusion_barrier(lane_values: Float[Array, "... lanes"]) -> FusionBarrierFn:
 
 
 def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
-    """Return a matrix product over the leading axis as a sum of elementwise products."""
+    """Return the product of a matrix and the leading axis of `x`, as a sum of elementwise
+    products.
+    """
     broadcast_shape = (-1,) + (1,) * (x.ndim - 1)
     weighted_terms = [
         x[j] * matrix[:, j].astype(x.dtype).reshape(broadcast_shape) for j in range(matrix.shape[1])
@@ -49,25 +51,25 @@ def apply_matrix(matrix: np.ndarray, x: Array) -> Array:
     return sum(weighted_terms[1:], start=weighted_terms[0])
 
 
-def weighted_sum(weights: np.ndarray, x: Array) -> Array:
-    """Return the weighted sum over the leading axis."""
+def sum_with_weights(weights: np.ndarray, x: Array) -> Array:
+    """Return the weighted sum of `x` over its leading axis."""
     weighted_terms = [float(weights[j]) * x[j] for j in range(len(weights))]
     return sum(weighted_terms[1:], start=weighted_terms[0])
 
 
-def contract_axes(left_array: Array, right_array: Array) -> Array:
-    """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over the
-    batch.
+def contract_inner_axis(left_array: Array, right_array: Array) -> Array:
+    """Return the sum over s of left[..., s, lanes] * right[s, ..., lanes], elementwise over
+    lanes.
     """
-    new_axes = (slice(None),) * (left_array.ndim - 2) + (None,) * (right_array.ndim - 2)
+    broadcast_slices = (slice(None),) * (left_array.ndim - 2) + (None,) * (right_array.ndim - 2)
     product_terms = [
-        left_array[..., s, :][(*new_axes, slice(None))] * right_array[s]
+        left_array[..., s, :][(*broadcast_slices, slice(None))] * right_array[s]
         for s in range(right_array.shape[0])
     ]
     return sum(product_terms[1:], start=product_terms[0])
 
 
-def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
+def invert_small_matrices(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]:
     """Return the inverse of each 1x1, 2x2 or 3x3 matrix by cofactors."""
     matrix_entries = matrix
     if matrix_entries.shape[0] == 1:
@@ -89,20 +91,20 @@ def invert_small(matrix: Float[Array, "n n lanes"]) -> Float[Array, "n n lanes"]
             f"the matrix has {matrix_entries.shape[0]} rows, but only 1, 2 or 3 are built."
         )
 
-    def cofactor(i: int, j: int) -> Array:
+    def compute_cofactor(i: int, j: int) -> Array:
         (a, b), (c, d) = ((i + 1) % 3, (i + 2) % 3), ((j + 1) % 3, (j + 2) % 3)
         return (
             matrix_entries[a, c] * matrix_entries[b, d]
             - matrix_entries[a, d] * matrix_entries[b, c]
         )
 
-    adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
+    adjugate = [[compute_cofactor(j, i) for j in range(3)] for i in range(3)]
     determinant = (
         matrix_entries[0, 0] * adjugate[0][0]
         + matrix_entries[0, 1] * adjugate[1][0]
         + matrix_entries[0, 2] * adjugate[2][0]
     )
-    return jnp.stack([jnp.stack(row) for row in adjugate]) / determinant
+    return jnp.stack([jnp.stack(adjugate_row) for adjugate_row in adjugate]) / determinant
 
 
 @jax.custom_jvp
@@ -115,31 +117,32 @@ def solve_node_equations(
 
     The method is block elimination without pivoting. The matrix is the mass matrix plus terms of
     order h, so its diagonal blocks stay regular. `barrier_values` is the argument of
-    `fusion_barrier`.
+    `make_fusion_barrier`.
     """
-    prevent_fusion = fusion_barrier(barrier_values)
+    barrier_function = make_fusion_barrier(barrier_values)
     n_nodes, n_coordinates = matrix.shape[:2]
     remaining_system = jnp.concatenate(
         [matrix.reshape(n_nodes, n_coordinates, n_nodes * n_coordinates, -1), rhs], axis=2
     )
     eliminated_rows: list[Array] = []
     for _ in range(n_nodes):
-        pivot_block = remaining_system[0]
-        block_row = contract_axes(
-            invert_small(pivot_block[:, :n_coordinates]), pivot_block[:, n_coordinates:]
+        inverse_pivot_block = remaining_system[0]
+        block_row_matrix = contract_inner_axis(
+            invert_small_matrices(inverse_pivot_block[:, :n_coordinates]),
+            inverse_pivot_block[:, n_coordinates:],
         )
         if len(eliminated_rows) < n_nodes - 1:
-            block_row = prevent_fusion(block_row)
-            remaining_system = prevent_fusion(
+            block_row_matrix = barrier_function(block_row_matrix)
+            remaining_system = barrier_function(
                 remaining_system[1:, :, n_coordinates:]
-                - contract_axes(remaining_system[1:, :, :n_coordinates], block_row)
+                - contract_inner_axis(remaining_system[1:, :, :n_coordinates], block_row_matrix)
             )
-        eliminated_rows.append(block_row)
+        eliminated_rows.append(block_row_matrix)
     solution = eliminated_rows[-1]
-    for block_row in eliminated_rows[-2::-1]:
+    for block_row_matrix in eliminated_rows[-2::-1]:
         n_solved_blocks = solution.shape[0]
-        block_solution = block_row[:, n_solved_blocks:] - contract_axes(
-            block_row[:, :n_solved_blocks], solution
+        block_solution = block_row_matrix[:, n_solved_blocks:] - contract_inner_axis(
+            block_row_matrix[:, :n_solved_blocks], solution
         )
         solution = jnp.concatenate([block_solution, solution])
     return solution.reshape(n_nodes, n_coordinates, *solution.shape[1:])
@@ -148,35 +151,45 @@ def solve_node_equations(
 @solve_node_equations.defjvp
 @with_default_jax_settings
 def _solve_node_equations_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Return the solution and its tangent, by a second solve.
+    """Return the solution and its tangent, which a second solve computes.
 
     Differentiation of the elimination would double its work.
     """
-    (matrix, _, barrier_values), (d_matrix, d_rhs, _) = primals, tangents
+    (matrix, _, barrier_values), (matrix_tangent, rhs_tangent, _) = primals, tangents
     solution = solve_node_equations(*primals)
-    n_nodes, dim = matrix.shape[:2]
-    flat_tangent = d_matrix.reshape(n_nodes, dim, n_nodes * dim, -1)
-    matrix_term = contract_axes(flat_tangent, solution.reshape(n_nodes * dim, *solution.shape[2:]))
-    return solution, solve_node_equations(matrix, d_rhs - matrix_term, barrier_values)
+    n_nodes, n_coordinates = matrix.shape[:2]
+    flat_matrix_tangent = matrix_tangent.reshape(
+        n_nodes, n_coordinates, n_nodes * n_coordinates, -1
+    )
+    matrix_tangent_product = contract_inner_axis(
+        flat_matrix_tangent, solution.reshape(n_nodes * n_coordinates, *solution.shape[2:])
+    )
+    return solution, solve_node_equations(
+        matrix, rhs_tangent - matrix_tangent_product, barrier_values
+    )
 
 
-def value_and_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple:
-    """Return value and JVPs of `function` along tangents with a leading axis of directions."""
-    compute_jvp = lambda *t: jax.jvp(function, primals, t)
-    return jax.vmap(compute_jvp, in_axes=0, out_axes=(None, 0))(*tangents)
+def evaluate_with_jvps(function: Callable, primals: tuple, tangents: tuple) -> tuple:
+    """Return the value of `function`, and its JVPs along tangents with a leading axis of
+    directions.
+    """
+    linearized_function = lambda *t: jax.jvp(function, primals, t)
+    return jax.vmap(linearized_function, in_axes=0, out_axes=(None, 0))(*tangents)
 
 
-def value_and_partials(
+def evaluate_with_partials(
     function: Callable[..., Vector], arguments: Sequence[Array]
 ) -> tuple[Vector, list[Vector]]:
-    """Return the value of an elementwise function, and the derivatives of each output by all
-    arguments.
+    """Return the value of an elementwise function, and the derivatives of each output with respect
+    to all arguments.
 
     The derivatives use reverse mode, because a phase has fewer equations than arguments.
     """
-    function_values, apply_jvp = jax.linearize(function, *arguments)
+    function_values, linearized_function = jax.linearize(function, *arguments)
     partials_by_output = []
     for i, output_value in enumerate(function_values):
-        apply_transpose = jax.linear_transpose(lambda *t, i=i: apply_jvp(*t)[i], *arguments)
-        partials_by_output.append(apply_transpose(jnp.ones_like(output_value)))
+        transposed_function = jax.linear_transpose(
+            lambda *t, i=i: linearized_function(*t)[i], *arguments
+        )
+        partials_by_output.append(transposed_function(jnp.ones_like(output_value)))
     return function_values, partials_by_output

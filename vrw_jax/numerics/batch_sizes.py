@@ -1,8 +1,8 @@
-"""Batch sizes: numbers of elements that one call of a compiled program computes.
+"""Batch sizes: the number of elements that one call of a compiled program computes.
 
-A larger batch costs less per element; a smaller one wastes less on padding and memory. If several
-sizes are given, a batch is padded to the smallest size that holds it, and each size is compiled
-once.
+A larger batch costs less per element, and a smaller batch wastes less memory and padding. If
+several sizes are given, a batch is padded to the smallest size that holds it, and each size is
+compiled once.
 """
 
 DIFFRAX_BATCH_SIZE = 256

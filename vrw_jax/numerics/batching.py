@@ -1,4 +1,4 @@
-"""Batch functions with the batch on the last axis, as functions of one element for `jax.vmap`.
+"""Conversion between functions of a batch, with the batch on the last axis, and of one element.
 
 Code with independent wheels on the last axis runs several times faster than the same code for one
 wheel under `jax.vmap`. `unbatch` merges every `vmap`, including nested ones, into that axis.
@@ -22,9 +22,9 @@ BatchFunction = Callable[..., PyTree[Array]]
 
 
 def unbatch(function: BatchFunction) -> BatchFunction:
-    """Return `function` for arrays without the batch axis.
+    """Return `function` for one element, whose arrays have no batch axis.
 
-    Under `jax.vmap` the result calls `function` for the whole batch.
+    Under `jax.vmap` the returned function calls `function` once for the whole batch.
     """
     batched_function = custom_vmap(function)
 
@@ -43,11 +43,11 @@ def unbatch(function: BatchFunction) -> BatchFunction:
         def split_lanes(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], axis_size, n_lanes), -2, 0)
 
-        batched_outputs = batched_function(
+        outputs_with_lanes_last = batched_function(
             *jax.tree.map(merge_into_lanes, arrays, tuple(is_batched_by_argument))
         )
-        return jax.tree.map(split_lanes, batched_outputs), jax.tree.map(
-            lambda _: True, batched_outputs
+        return jax.tree.map(split_lanes, outputs_with_lanes_last), jax.tree.map(
+            lambda _: True, outputs_with_lanes_last
         )
 
     def evaluate_single(*arrays: PyTree) -> PyTree:
@@ -57,19 +57,19 @@ def unbatch(function: BatchFunction) -> BatchFunction:
     return evaluate_single
 
 
-def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
+def apply_in_blocks(function: BatchFunction, block_size: int) -> BatchFunction:
     """Return `function` applied to `block_size` batch elements at a time, so that arrays stay in
     cache.
 
-    The first array has the batch axis; scalars are the same for all elements.
+    The first array has the batch axis. Scalars are the same for all elements.
     """
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
-        leaves, tree_structure = jax.tree.flatten(arrays)
-        n_lanes = leaves[0].shape[-1]
+        argument_leaves, tree_structure = jax.tree.flatten(arrays)
+        n_lanes = argument_leaves[0].shape[-1]
         if n_lanes <= block_size:
             return function(*arrays)
-        has_lane_axis_by_leaf = [jnp.ndim(x) > 0 for x in leaves]
+        has_lane_axis_by_leaf = [jnp.ndim(x) > 0 for x in argument_leaves]
 
         def split_blocks(x: Array) -> Array:  # The last element pads the last block.
             n_padding = -n_lanes % block_size
@@ -77,10 +77,10 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
             return jnp.moveaxis(padded_array.reshape(*x.shape[:-1], -1, block_size), -2, 0)
 
         def evaluate_block(batched_leaves: list[Array]) -> PyTree:
-            remaining_leaves = iter(batched_leaves)
+            leaf_blocks_iterator = iter(batched_leaves)
             block_leaves = [
-                next(remaining_leaves) if has_lane_axis else x
-                for x, has_lane_axis in zip(leaves, has_lane_axis_by_leaf, strict=True)
+                next(leaf_blocks_iterator) if has_lane_axis else x
+                for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
             ]
             return function(*jax.tree.unflatten(tree_structure, block_leaves))
 
@@ -92,7 +92,7 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
 
         split_leaves = [
             split_blocks(x)
-            for x, has_lane_axis in zip(leaves, has_lane_axis_by_leaf, strict=True)
+            for x, has_lane_axis in zip(argument_leaves, has_lane_axis_by_leaf, strict=True)
             if has_lane_axis
         ]
         return jax.tree.map(merge_blocks, lax.map(evaluate_block, split_leaves))
@@ -103,68 +103,71 @@ def make_blockwise(function: BatchFunction, block_size: int) -> BatchFunction:
 def is_inside_jit() -> bool:
     """Return whether an enclosing `jax.jit` compiles the present calls.
 
-    A nested jit would only trace the function once more, which is wasted under a derivative.
+    A nested jit would only trace the function once more, which is unnecessary under a derivative.
     """
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
 def run_if_any(
-    is_needed: Array, function: Callable[[PyTree], PyTree], fallback_value: PyTree
+    is_any_element_active: Array, function: Callable[[PyTree], PyTree], fallback_value: PyTree
 ) -> PyTree:
-    """Return `function(fallback_value)` if `is_needed` is set, otherwise `fallback_value`.
+    """Return `function(fallback_value)` if `is_any_element_active` is true, otherwise
+    `fallback_value`.
 
-    `is_needed` is one flag for the whole batch.
-
-    The call is a loop of at most one iteration, which machine code skips if the flag is not set.
+    `is_any_element_active` is one flag for the whole batch. The call is a loop of at most one
+    iteration, which machine code skips if the flag is false.
     """
-    call_once = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
-    return lax.while_loop(lambda loop_carry: loop_carry[0], call_once, (is_needed, fallback_value))[
-        1
-    ]
+    guarded_call = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
+    return lax.while_loop(
+        lambda loop_carry: loop_carry[0], guarded_call, (is_any_element_active, fallback_value)
+    )[1]
 
 
-def opaque_condition(condition: Array, count: Array) -> Array:
-    """Return `condition` as a loop condition that also reads a count, which is never negative.
+def make_opaque_condition(loop_condition: Array, nonnegative_count: Array) -> Array:
+    """Return `loop_condition` as a condition that also reads a count, which is never negative.
 
-    If a condition reads only one number, XLA looks for an iteration counter with a copy of the
-    loop's body. That takes a fifth of the compile time of a step with unilateral contact.
+    If a loop condition reads only one number, XLA looks for an iteration counter in a copy of the
+    loop's body. This search takes a fifth of the compile time of a step with unilateral contact.
     """
-    return condition & (count >= 0)
+    return loop_condition & (nonnegative_count >= 0)
 
 
-def tree_where(condition: Array, tree_if_true: PyTree, tree_if_false: PyTree) -> PyTree:
-    """Return `jnp.where(condition, if_true, if_false)` of each pair of leaves."""
+def select_tree_leaves(condition: Array, tree_if_true: PyTree, tree_if_false: PyTree) -> PyTree:
+    """Return a tree with leaves of `tree_if_true` where `condition` is true, otherwise of
+    `tree_if_false`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree_if_true, tree_if_false)
 
 
-def zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-    """Return zeros in the structure of the output of `function`, which is not called."""
-    make_zeros = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
-    return jax.tree.map(make_zeros, jax.eval_shape(function, *arguments))
+def make_zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
+    """Return zeros in the structure of the output of `function`, without a call of it."""
+    zero_maker = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)
+    return jax.tree.map(zero_maker, jax.eval_shape(function, *arguments))
 
 
-def take_rows(tree: PyTree, row_indices: Any) -> PyTree:
-    """Return the selected rows of arrays with a leading axis, as NumPy arrays."""
+def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
+    """Return selected rows of arrays with a leading axis, as NumPy arrays."""
     return jax.tree.map(lambda x: np.asarray(x)[row_indices], tree)
 
 
-def concat_rows(*trees: PyTree) -> PyTree:
-    """Return the trees concatenated along the leading axis, as NumPy arrays."""
+def concatenate_tree_rows(*trees: PyTree) -> PyTree:
+    """Return trees of arrays, concatenated along the leading axis, as NumPy arrays."""
     return jax.tree.map(
-        lambda *leaf_parts: np.concatenate([np.asarray(leaf_part) for leaf_part in leaf_parts]),
+        lambda *leaf_parts: np.concatenate([np.asarray(leaf_rows) for leaf_rows in leaf_parts]),
         *trees,
     )
 
 
 def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
-    """Return `function` of trees with a leading axis, in batches padded to one of `batch_sizes`.
+    """Return `function` of trees with a leading axis, called in batches padded to one of
+    `batch_sizes`.
 
-    The function is therefore compiled for few shapes. Inputs and outputs are JAX arrays.
+    Padding limits the number of shapes for which the function is compiled. Inputs and outputs are
+    JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))
-    call_on_device = lambda *rows: function(*jax.device_put(rows))
-    return jax.device_put(map_in_numpy_batches(call_on_device, batch_sizes, *trees))
+    device_function = lambda *rows: function(*jax.device_put(rows))
+    return jax.device_put(map_in_numpy_batches(device_function, batch_sizes, *trees))
 
 
 def map_in_numpy_batches(
@@ -181,19 +184,19 @@ def map_in_numpy_batches(
         batch_size = _choose_batch_size(n_rows - first_row, batch_sizes)
         last_row = min(first_row + batch_size, n_rows)
         row_indices = np.minimum(np.arange(first_row, first_row + batch_size), n_rows - 1)
-        batch_result = function(*take_rows(trees, row_indices))
-        batch_results.append(take_rows(batch_result, slice(0, last_row - first_row)))
+        batch_result = function(*select_tree_rows(trees, row_indices))
+        batch_results.append(select_tree_rows(batch_result, slice(0, last_row - first_row)))
         first_row = last_row
-    return concat_rows(*batch_results) if len(batch_results) > 1 else batch_results[0]
+    return concatenate_tree_rows(*batch_results) if len(batch_results) > 1 else batch_results[0]
 
 
-def _choose_batch_size(n_rows: int, sizes: tuple[int, ...]) -> int:
+def _choose_batch_size(n_rows: int, batch_sizes: tuple[int, ...]) -> int:
     """Return the batch size for a number of rows.
 
-    It is the smallest of `sizes` that holds all rows. The next smaller size is chosen if several
-    batches of that size have at most half as many elements.
+    The batch size is the smallest of `batch_sizes` that holds all rows. The next smaller size is
+    chosen if several batches of that size have at most half as many elements.
     """
-    i = min(bisect.bisect_left(sizes, n_rows), len(sizes) - 1)
-    if i > 0 and -(-n_rows // sizes[i - 1]) * sizes[i - 1] <= sizes[i] // 2:
-        return sizes[i - 1]
-    return sizes[i]
+    i = min(bisect.bisect_left(batch_sizes, n_rows), len(batch_sizes) - 1)
+    if i > 0 and -(-n_rows // batch_sizes[i - 1]) * batch_sizes[i - 1] <= batch_sizes[i] // 2:
+        return batch_sizes[i - 1]
+    return batch_sizes[i]

@@ -1,4 +1,4 @@
-"""Minimum of a margin within a solver step, from its values and rates at both ends."""
+"""Minimum of a margin within a solver step, from the margin's values and rates at both ends."""
 
 import jax
 import jax.numpy as jnp
@@ -9,40 +9,49 @@ MINIMUM_LOCATION_TOLERANCE = 1e-6
 chosen because the error of the minimum is the square of this number."""
 
 
-def evaluate_cubic(x: Array, v0: Array, r0: Array, v1: Array, r1: Array) -> Array:
+def evaluate_cubic(
+    x: Array, value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
+) -> Array:
     """Return the cubic Hermite interpolant at `x` in [0, 1].
 
-    The rates r0 and r1 are multiplied by the step length.
+    The rates at 0 and 1 are multiplied by the step length.
     """
     return (
-        (1 + 2 * x) * (1 - x) ** 2 * v0
-        + x * (1 - x) ** 2 * r0
-        + x * x * (3 - 2 * x) * v1
-        + x * x * (x - 1) * r1
+        (1 + 2 * x) * (1 - x) ** 2 * value_at_0
+        + x * (1 - x) ** 2 * rate_at_0
+        + x * x * (3 - 2 * x) * value_at_1
+        + x * x * (x - 1) * rate_at_1
     )
 
 
 @jax.jit  # The function is traced once for all margins.
-def find_cubic_minimum(v0: Array, r0: Array, v1: Array, r1: Array) -> tuple[Array, Array]:
-    """Return location in (0, 1) and value of the cubic's interior minimum.
+def find_cubic_minimum(
+    value_at_0: Array, rate_at_0: Array, value_at_1: Array, rate_at_1: Array
+) -> tuple[Array, Array]:
+    """Return the location in (0, 1) and the value of the interior minimum of the cubic Hermite
+    interpolant.
 
-    The value is infinite if no interior minimum exists.
+    The value is infinite if the cubic has no interior minimum.
     """
-    quadratic_coefficient = 3.0 * (2.0 * v0 + r0 - 2.0 * v1 + r1)
-    linear_coefficient = 2.0 * (-3.0 * v0 - 2.0 * r0 + 3.0 * v1 - r1)
-    discriminant = linear_coefficient * linear_coefficient - 4.0 * quadratic_coefficient * r0
+    quadratic_coefficient = 3.0 * (2.0 * value_at_0 + rate_at_0 - 2.0 * value_at_1 + rate_at_1)
+    linear_coefficient = 2.0 * (-3.0 * value_at_0 - 2.0 * rate_at_0 + 3.0 * value_at_1 - rate_at_1)
+    discriminant = linear_coefficient * linear_coefficient - 4.0 * quadratic_coefficient * rate_at_0
     discriminant_root = jnp.sqrt(jnp.where(discriminant > 0.0, discriminant, 1.0))
     # The minimum is the root with positive curvature, computed without cancellation.
-    location_denominator = jnp.where(
+    minimum_denominator = jnp.where(
         linear_coefficient >= 0.0,
         -(linear_coefficient + discriminant_root),
         2.0 * quadratic_coefficient,
     )
-    location_numerator = jnp.where(
-        linear_coefficient >= 0.0, 2.0 * r0, discriminant_root - linear_coefficient
+    minimum_numerator = jnp.where(
+        linear_coefficient >= 0.0, 2.0 * rate_at_0, discriminant_root - linear_coefficient
     )
-    nonzero_denominator = jnp.where(location_denominator == 0.0, 1.0, location_denominator)
-    x = jnp.where(location_denominator == 0.0, -1.0, location_numerator / nonzero_denominator)
-    has_minimum = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
-    x = jnp.where(has_minimum, x, 0.5)
-    return x, jnp.where(has_minimum, evaluate_cubic(x, v0, r0, v1, r1), jnp.inf)
+    safe_denominator = jnp.where(minimum_denominator == 0.0, 1.0, minimum_denominator)
+    x = jnp.where(minimum_denominator == 0.0, -1.0, minimum_numerator / safe_denominator)
+    has_interior_minimum = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
+    x = jnp.where(has_interior_minimum, x, 0.5)
+    return x, jnp.where(
+        has_interior_minimum,
+        evaluate_cubic(x, value_at_0, rate_at_0, value_at_1, rate_at_1),
+        jnp.inf,
+    )

@@ -1,4 +1,4 @@
-"""Clear error for reverse mode through a loop of unknown length."""
+"""Error message for reverse mode through a loop of unknown length."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
-_FORWARD_ONLY = Primitive("forward_only")
+_FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
 """The identity, whose transpose raises an error."""
 
 
@@ -21,21 +21,21 @@ def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, name: str) -> Non
     )
 
 
-_FORWARD_ONLY.def_impl(lambda x, *, name: x)
-_FORWARD_ONLY.def_abstract_eval(lambda x, *, name: x)
-ad.deflinear2(_FORWARD_ONLY, _raise_reverse_mode_error)
-batching.defvectorized(_FORWARD_ONLY)
-mlir.register_lowering(_FORWARD_ONLY, lambda _context, x, *, name: [x])
+_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, name: x)
+_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, name: x)
+ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
+batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
+mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, name: [x])
 
 
-def forbid_reverse_mode(name: str, tree: PyTree) -> PyTree:
-    """Return `tree`, the results of `hybrid.<name>`, marked so that reverse mode raises an
-    error.
+def forbid_reverse_mode(name: str, function_result: PyTree) -> PyTree:
+    """Return `function_result`, the results of `hybrid.<name>`, marked so that reverse mode raises
+    an error.
     """
 
     def mark_leaf(leaf: Any) -> Any:
         if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
-            return _FORWARD_ONLY.bind(leaf, name=name)
+            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, name=name)
         return leaf
 
-    return jax.tree.map(mark_leaf, tree)
+    return jax.tree.map(mark_leaf, function_result)

@@ -16,7 +16,7 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     check_reals,
-    raise_for_renamed_arguments,
+    with_renamed_arguments,
 )
 
 SolverName = Literal[
@@ -46,17 +46,19 @@ REAL_OPTION_NAMES = ("rtol", "atol", "derivative_tightening", "max_phase_time", 
 """Names of the options that are real numbers."""
 
 
-def _make_positive_field(name: str, default: float) -> Any:
-    """Return a field of a dataclass for a positive number."""
-    return eqx.field(converter=functools.partial(check_reals, name), default=default)
+def _make_positive_field(option_name: str, default_value: float) -> Any:
+    """Return the dataclass field of an option that must be a positive number."""
+    return eqx.field(converter=functools.partial(check_reals, option_name), default=default_value)
 
 
-def _make_positive_int_field(name: str, default: int) -> Any:
-    """Return a field of a dataclass for a positive integer."""
-    return eqx.field(static=True, converter=functools.partial(check_int, name), default=default)
+def _make_positive_int_field(option_name: str, default_value: int) -> Any:
+    """Return the dataclass field of an option that must be a positive integer."""
+    return eqx.field(
+        static=True, converter=functools.partial(check_int, option_name), default=default_value
+    )
 
 
-@raise_for_renamed_arguments(
+@with_renamed_arguments(
     first_step="dt0",
     event_steps="max_event_iterations",
     monitor_steps="max_margin_search_iterations",
@@ -64,19 +66,20 @@ def _make_positive_int_field(name: str, default: int) -> Any:
 class StepOptions(AbstractPrintable):
     """Numerical options of an event-driven step; the tolerances may change without recompiling.
 
-    Lengths and times are in the wheel's own units, which are those of SI for a wheel of Table 1's
-    size. For another wheel `atol`, `max_phase_time` and `dt0` are multiplied by its own units: the
-    length L_0 / 1 m and the time sqrt((L_0 / 1 m) (9.81 m/s^2 / g)).
+    Lengths and times are in the wheel's units, which are SI units for a wheel of Table 1's size.
+    For another wheel `atol`, `max_phase_time` and `dt0` are multiplied by the wheel's units. The
+    unit of length is L_0 / 1 m, and that of time is sqrt((L_0 / 1 m) (9.81 m/s^2 / g)).
 
     - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
-    - `engine`: "diffrax" is the reference for any solver, device and order of derivative; "lanes"
-      is its machine code for explicit solvers on CPUs; "auto" takes "lanes" if it is available;
+    - `engine`: "diffrax" supports any solver, device and order of derivative; "lanes" is machine
+      code of the same method for explicit solvers on CPUs; "auto" selects "lanes" if it is
+      available;
     - `rtol`, `atol`: relative and absolute tolerance of each solver step, in m, rad, m/s, rad/s;
     - `derivative_tightening`: factor by which tolerances are divided for derivatives, because
-      derivatives take no part in the step-size control; their error is then at most ten times that
-      of values without it, with unilateral contact up to 300 times;
-    - `max_phase_time`: limit of one phase, s;
-    - `max_solver_steps`: limit of tried solver steps in one phase;
+      step-size control ignores derivatives. The error of a derivative is then at most ten times
+      that of a value, and at most 300 times with unilateral contact;
+    - `max_phase_time`: limit of the duration of one phase, s;
+    - `max_solver_steps`: limit of attempted solver steps in one phase;
     - `dt0`: first solver step of each phase, s;
     - `max_event_iterations`: limit of iterations to locate an event;
     - `max_margin_search_iterations`: limit of secant steps to the minimum of a margin.
@@ -117,22 +120,27 @@ class StepOptions(AbstractPrintable):
     def __check_init__(self) -> None:
         check_choice("solver", self.solver, SOLVER_NAMES)
         check_choice("engine", self.engine, get_args(EngineName))
-        for name in REAL_OPTION_NAMES:
-            value = getattr(self, name)
-            if not isinstance(value, jax.core.Tracer):
+        for option_name in REAL_OPTION_NAMES:
+            option_value = getattr(self, option_name)
+            if not isinstance(option_value, jax.core.Tracer):
                 # Options under `jax.vmap` have several numbers.
-                for number_dtype in np.ravel(np.asarray(value)):
-                    check_positive(name, number_dtype)
+                for option_number in np.ravel(np.asarray(option_value)):
+                    check_positive(option_name, option_number)
 
     def summary_rows(self) -> list[LabelAndText]:
-        units = {"max_phase_time": "s", "dt0": "s"}
+        unit_by_option = {"max_phase_time": "s", "dt0": "s"}
         return [
-            (name, value if isinstance(value, str) else format_quantity(value, units.get(name, "")))
-            for name, value in vars(self).items()
+            (
+                option_name,
+                option_value
+                if isinstance(option_value, str)
+                else format_quantity(option_value, unit_by_option.get(option_name, "")),
+            )
+            for option_name, option_value in vars(self).items()
         ]
 
     def with_engine(self, engine: EngineName) -> "StepOptions":
-        """Return these options with another engine; "auto" leaves the engine unchanged."""
+        """Return these options with another engine. "auto" leaves the engine unchanged."""
         check_choice("engine", engine, get_args(EngineName))
         return self if engine == "auto" else dataclasses.replace(self, engine=engine)
 
@@ -144,54 +152,64 @@ class StepOptions(AbstractPrintable):
         return cls(rtol=1e-13, atol=1e-13)
 
     def with_derivative_tolerances(self) -> "StepOptions":
-        """Return these options with tolerances tightened for derivatives, down to round-off."""
+        """Return these options with tolerances tightened for derivatives, but not below
+        round-off.
+        """
         return self.with_tightened_tolerances(self.derivative_tightening)
 
-    def with_tightened_tolerances(self, factor: Scalar | float) -> "StepOptions":
-        """Return these options with tolerances divided by `factor`, down to round-off."""
-        tolerances = self.rtol, self.atol
+    def with_tightened_tolerances(self, tightening_factor: Scalar | float) -> "StepOptions":
+        """Return these options with tolerances divided by `tightening_factor`, but not below
+        round-off.
+        """
+        present_tolerances = self.rtol, self.atol
         return eqx.tree_at(
-            lambda o: (o.rtol, o.atol), self, _tighten_tolerances(tolerances, factor)
+            lambda o: (o.rtol, o.atol),
+            self,
+            _tighten_tolerances(present_tolerances, tightening_factor),
         )
 
-    def require_scalars(self) -> None:
-        """Raise a ValueError if an option contains several numbers where one is required."""
-        for name in REAL_OPTION_NAMES:
-            if shape := getattr(getattr(self, name), "shape", ()):
+    def require_scalar_options(self) -> None:
+        """Raise a `ValueError` if an option contains several numbers."""
+        for option_name in REAL_OPTION_NAMES:
+            if option_shape := getattr(getattr(self, option_name), "shape", ()):
                 raise ValueError(
-                    f"{name} has shape {shape}, but options hold one number each: give a float, or "
+                    f"{option_name} has shape {option_shape}, but options hold one number each: "
+                    "give a float, or "
                     "map over the options with jax.vmap."
                 )
 
     def check_tolerances(self, float_dtype: np.dtype) -> None:
-        """Raise a ValueError for an `rtol` below the resolution of the number format.
+        """Raise a `ValueError` if `rtol` is below the resolution of the floating type
+        `float_dtype`.
 
         `atol` has no such limit, because states may be as small as their units make them. 64-bit
-        arrays that were made before `jax_enable_x64` was switched off count as 32-bit ones.
+        arrays that were made before `jax_enable_x64` was switched off count as 32-bit arrays.
         """
         float_dtype = jax.dtypes.canonicalize_dtype(float_dtype)
-        min_tolerance = (
+        min_rtol = (
             MIN_TOLERANCE_IN_EPS if float_dtype == np.float64 else TIGHTENING_FLOOR_IN_EPS
         ) * float(jnp.finfo(float_dtype).eps)
         rtol = self.rtol
-        if isinstance(rtol, jax.core.Tracer) or np.ndim(rtol) or np.asarray(rtol) >= min_tolerance:
+        if isinstance(rtol, jax.core.Tracer) or np.ndim(rtol) or np.asarray(rtol) >= min_rtol:
             return
-        remedy_text = f"ask for no less, as with StepOptions(rtol={1e2 * min_tolerance:.0e})"
+        remedy_text = f"ask for no less, as with StepOptions(rtol={1e2 * min_rtol:.0e})"
         if float_dtype == np.float32:
-            start_remedy_text = (
+            restart_remedy_text = (
                 "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
             )
-            remedy_text = f"{start_remedy_text}, or {remedy_text}"
+            remedy_text = f"{restart_remedy_text}, or {remedy_text}"
         raise ValueError(
             f"rtol is {float(rtol):g}, but {np.dtype(float_dtype).name} numbers can't resolve less "
-            f"than {min_tolerance:.0e}: {remedy_text}."
+            f"than {min_rtol:.0e}: {remedy_text}."
         )
 
 
 @jax.jit
 def _tighten_tolerances(
-    tolerances: tuple[Scalar, ...], factor: Scalar | float
+    tolerances: tuple[Scalar, ...], tightening_factor: Scalar | float
 ) -> tuple[Scalar, ...]:
-    """Return tolerances divided by a factor, down to round-off."""
+    """Return tolerances divided by a factor, but not below round-off."""
     min_tolerance = TIGHTENING_FLOOR_IN_EPS * jnp.finfo(tolerances[0].dtype).eps
-    return tuple(jnp.maximum(x / factor, jnp.minimum(min_tolerance, x)) for x in tolerances)
+    return tuple(
+        jnp.maximum(x / tightening_factor, jnp.minimum(min_tolerance, x)) for x in tolerances
+    )

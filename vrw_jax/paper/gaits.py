@@ -19,10 +19,10 @@ import numpy as np
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
-    locked_leg_coordinate,
-    make_variables,
-    measure_attrs,
-    provenance,
+    collect_provenance_attributes,
+    make_labeled_variables,
+    make_locked_leg_coordinate,
+    make_measure_attributes,
 )
 from vrw_jax.models import SectionState, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions
@@ -105,7 +105,7 @@ def walk_into_gait(
             "last_change": last_change,
             "settled": int(is_settled),
         }
-        | provenance(params, make_formally_continued_model(), StepOptions()),
+        | collect_provenance_attributes(params, make_formally_continued_model(), StepOptions()),
     )
 
 
@@ -206,7 +206,7 @@ def _make_gait_dataset(
     measure_columns: dict[str, np.ndarray],
 ) -> xr.Dataset:
     """Return the labeled dataset of measures over a parameter."""
-    dataset_variables = make_variables(
+    dataset_variables = make_labeled_variables(
         {
             measure_name: measure_columns[measure_name]
             for measure_name in STEP_MEASURES | MARGIN_MEASURES
@@ -229,12 +229,16 @@ def _make_gait_dataset(
     }
     dataset_coordinates = {
         parameter_name: xr.Variable(
-            parameter_name, np.asarray(parameter_values, float), measure_attrs(parameter_name)
+            parameter_name,
+            np.asarray(parameter_values, float),
+            make_measure_attributes(parameter_name),
         ),
         "component": ["theta", "dtheta", "dL1"],
-        "leg": locked_leg_coordinate(params.n_legs),
+        "leg": make_locked_leg_coordinate(params.n_legs),
     }
-    provenance_attributes = provenance(params, make_formally_continued_model(), StepOptions())
+    provenance_attributes = collect_provenance_attributes(
+        params, make_formally_continued_model(), StepOptions()
+    )
     provenance_attributes.pop(f"parameter_{parameter_name}")
     dataset_attributes = {
         "title": f"Gaits walked to along {parameter_name}"

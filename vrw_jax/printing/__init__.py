@@ -1,15 +1,15 @@
-"""Texts and tables of results."""
+"""Conversion of results to text and tables."""
 
 from vrw_jax.printing.text import (
     AbstractPrintable,
     LabelAndText,
-    describe_elements,
-    describe_ending,
+    describe_step_ending,
+    format_heading_and_rows,
     format_html_table,
     format_markdown_table,
     format_mathtext,
     format_numbers,
     format_outcome_counts,
     format_quantity,
-    format_text,
+    map_text_of_elements,
 )

@@ -1,4 +1,4 @@
-"""Printing of results: lines of text, tables in HTML and Markdown, symbols as mathtext."""
+"""Text of results: lines, tables in HTML and Markdown, and symbols as mathtext."""
 
 import abc
 import enum
@@ -16,13 +16,12 @@ LabelAndText = tuple[str, str]
 
 
 def has_concrete_numbers(result_tree: Any) -> bool:
-    """Return whether all numbers of a result are set and concrete. The result is False inside
-    `jit`."""
-    is_concrete_leaf = lambda tree_leaf: (
+    """Return whether all numbers of a result are set and concrete. Inside `jit` they are not."""
+    concreteness_test = lambda tree_leaf: (
         eqx.is_array_like(tree_leaf) and not isinstance(tree_leaf, int | jax.core.Tracer)
     )
     has_all_fields = not any(field_value is None for field_value in vars(result_tree).values())
-    return has_all_fields and all(map(is_concrete_leaf, jax.tree.leaves(result_tree)))
+    return has_all_fields and all(map(concreteness_test, jax.tree.leaves(result_tree)))
 
 
 class AbstractPrintable(eqx.Module):
@@ -30,31 +29,30 @@ class AbstractPrintable(eqx.Module):
 
     @abc.abstractmethod
     def summary_rows(self) -> list[LabelAndText]:
-        """Return the pairs (name, text) to print, one per line."""
+        """Return pairs (name, text), each of which is printed on one line."""
 
     @property
-    def title(self) -> str:
+    def printed_heading(self) -> str:
         """Return the heading of the printed result."""
         return type(self).__name__
 
     def __repr__(self) -> str:
         return (
-            format_text(self.title, self.summary_rows())
+            format_heading_and_rows(self.printed_heading, self.summary_rows())
             if has_concrete_numbers(self)
             else eqx.tree_pformat(self)
         )
 
     def _repr_html_(self) -> str:
         return (
-            format_html_table(self.title, self.summary_rows())
+            format_html_table(self.printed_heading, self.summary_rows())
             if has_concrete_numbers(self)
             else f"<pre>{self!r}</pre>"
         )
 
 
 def format_quantity(quantity_value: object, quantity_unit: str) -> str:
-    """Return a number with its unit as text. Several numbers are described by their count and
-    range."""
+    """Return a number with its unit as text. Several numbers are described by count and range."""
     value_array, quantity_unit = (
         np.asarray(quantity_value),
         "" if quantity_unit == "1" else quantity_unit,
@@ -69,67 +67,68 @@ def format_quantity(quantity_value: object, quantity_unit: str) -> str:
     return f"{value_array.size} values{range_text}".rstrip()
 
 
-def format_outcome_counts(outcomes: Any, status_class: type[enum.IntEnum]) -> str:
-    """Return a text with the number of outcomes, their shape, and the count of each outcome."""
-    n_outcomes, outcome_shape = np.size(outcomes), np.shape(outcomes)
+def format_outcome_counts(outcomes: Any, status_code_class: type[enum.IntEnum]) -> str:
+    """Return a text with the number of outcomes, the shape of their array, and the count of each
+    outcome.
+    """
+    n_outcomes, outcome_array_shape = np.size(outcomes), np.shape(outcomes)
     outcome_codes, outcome_counts = np.unique(np.asarray(outcomes), return_counts=True)
-    count_texts = (
-        f"{outcome_count:,} {status_class(int(status_code)).name}"
+    outcome_count_texts = (
+        f"{outcome_count:,} {status_code_class(int(status_code)).name}"
         for status_code, outcome_count in zip(outcome_codes, outcome_counts, strict=True)
     )
-    return f"{n_outcomes:,} in shape {outcome_shape}: {', '.join(count_texts)}"
+    return f"{n_outcomes:,} in shape {outcome_array_shape}: {', '.join(outcome_count_texts)}"
 
 
-def describe_elements(describe_element: Callable[..., str], *element_values: Any) -> Any:
-    """Return the text of numbers. For a batch, return an array with the text of each element."""
-    return np.vectorize(describe_element, otypes=[object])(*element_values)[()]
+def map_text_of_elements(element_text_function: Callable[..., str], *element_values: Any) -> Any:
+    """Return the text of one element, or an array with the text of each element of a batch."""
+    return np.vectorize(element_text_function, otypes=[object])(*element_values)[()]
 
 
-def describe_ending(status_codes: Any, status_class: type[enum.IntEnum]) -> Any:
-    """Return the sentence of a status code. For a batch, return an array with one sentence per
-    element."""
-    describe_code = lambda code: status_class(int(code)).meaning  # type: ignore[attr-defined]
-    return describe_elements(describe_code, status_codes)
+def describe_step_ending(status_codes: Any, status_code_class: type[enum.IntEnum]) -> Any:
+    """Return the sentence of a status code, or an array of sentences for a batch."""
+    code_describer = lambda code: status_code_class(int(code)).meaning  # type: ignore[attr-defined]
+    return map_text_of_elements(code_describer, status_codes)
 
 
-def format_text(text_title: str, text_rows: Iterable[LabelAndText]) -> str:
-    """Return a title and indented rows as one text."""
+def format_heading_and_rows(heading_text: str, text_rows: Iterable[LabelAndText]) -> str:
+    """Return a heading and indented rows as one text."""
     return "\n".join(
-        [text_title, *(f"  {row_label}: {row_text}" for row_label, row_text in text_rows)]
+        [heading_text, *(f"  {row_label}: {row_text}" for row_label, row_text in text_rows)]
     )
 
 
 def format_html_table(
     table_title: str, text_rows: Iterable[Sequence[str]], header_cells: Sequence[str] = ()
 ) -> str:
-    """Return the rows as an HTML table, in which the first cell of each row is a header."""
-    format_cell = lambda cell_tag, cell_text: (
+    """Return rows as an HTML table, in which the first cell of each row is a header."""
+    cell_formatter = lambda cell_tag, cell_text: (
         f"<{cell_tag} style='text-align:left'>{escape(cell_text)}</{cell_tag}>"
     )
-    row_lines = (
-        ["".join(format_cell("th", cell_text) for cell_text in header_cells)]
+    html_row_lines = (
+        ["".join(cell_formatter("th", cell_text) for cell_text in header_cells)]
         if header_cells
         else []
     )
-    row_lines += [
-        format_cell("th", row_label)
-        + "".join(format_cell("td", cell_text) for cell_text in row_cells)
+    html_row_lines += [
+        cell_formatter("th", row_label)
+        + "".join(cell_formatter("td", cell_text) for cell_text in row_cells)
         for row_label, *row_cells in text_rows
     ]
-    table_body = "".join(f"<tr>{row_line}</tr>" for row_line in row_lines)
-    return f"<table><caption>{escape(table_title)}</caption>{table_body}</table>"
+    html_rows = "".join(f"<tr>{html_row_line}</tr>" for html_row_line in html_row_lines)
+    return f"<table><caption>{escape(table_title)}</caption>{html_rows}</table>"
 
 
 def format_markdown_table(
     header_cells: Sequence[str], text_rows: Iterable[Sequence[str]]
 ) -> list[str]:
     """Return the lines of a Markdown table."""
-    format_cell = lambda cell_text: " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
-    format_line = lambda row_cells: "|" + "|".join(map(format_cell, row_cells)) + "|"
+    cell_formatter = lambda cell_text: " " + cell_text.replace("|", r"\|") + " " * bool(cell_text)
+    line_formatter = lambda row_cells: "|" + "|".join(map(cell_formatter, row_cells)) + "|"
     return [
-        format_line(header_cells),
+        line_formatter(header_cells),
         "|" + "---|" * len(header_cells),
-        *map(format_line, text_rows),
+        *map(line_formatter, text_rows),
     ]
 
 
@@ -153,21 +152,21 @@ def format_mathtext(symbol_text: str) -> str:
 
 
 def _format_symbol_token(token_match: re.Match[str]) -> str:
-    """Return the mathtext of one match of `_SYMBOL_TOKEN_PATTERN`."""
+    """Return the mathtext of one token of a symbol, found by `_SYMBOL_TOKEN_PATTERN`."""
     token_kind = token_match.lastgroup or ""
     token_text = token_match[token_kind]
-    is_roman_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
-    token_body = _MATHTEXT_BY_SYMBOL.get(
-        token_text, f"\\mathrm{{{token_text}}}" if is_roman_text else token_text
+    is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
+    token_mathtext = _MATHTEXT_BY_SYMBOL.get(
+        token_text, f"\\mathrm{{{token_text}}}" if is_upright_text else token_text
     )
     return {
-        "below": f"_{{{token_body}}}",
-        "dotted": f"\\dot{{{token_body}}}",
-        "twice": f"\\ddot{{{token_body}}}",
-        "index": f"_{token_body}",
-    }.get(token_kind, token_body)
+        "below": f"_{{{token_mathtext}}}",
+        "dotted": f"\\dot{{{token_mathtext}}}",
+        "twice": f"\\ddot{{{token_mathtext}}}",
+        "index": f"_{token_mathtext}",
+    }.get(token_kind, token_mathtext)
 
 
-def format_numbers(number_values: object) -> str:
+def format_numbers(printed_numbers: object) -> str:
     """Return numbers as text, separated by commas."""
-    return ", ".join(f"{number:.5g}" for number in np.ravel(np.asarray(number_values)))
+    return ", ".join(f"{number:.5g}" for number in np.ravel(np.asarray(printed_numbers)))

@@ -7,7 +7,7 @@ import numpy as np
 
 from vrw_jax.batches import step_batch
 from vrw_jax.branches import Branch
-from vrw_jax.measures import measure_attrs
+from vrw_jax.measures import make_measure_attributes
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
 from vrw_jax.robustness.basin_share import StartBox, compute_basin_share, parse_start_box
@@ -116,7 +116,7 @@ def measure_basins(
     parameter_name = branch.parameter
     branch_coordinates = {
         parameter_name: xr.Variable(
-            "point", branch.values[point_indices], measure_attrs(parameter_name)
+            "point", branch.values[point_indices], make_measure_attributes(parameter_name)
         )
     }
     title_attr = {"title": f"Basins of the gaits along {parameter_name}"}

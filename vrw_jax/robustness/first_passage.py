@@ -14,14 +14,19 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.cycles import limit_cycle, resolve_model
 from vrw_jax.models import PassageMethod
-from vrw_jax.numerics import Scalar, StatusCode, StepOptions, zero_tangent
-from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_ending
+from vrw_jax.numerics import Scalar, StatusCode, StepOptions, make_zero_tangent
+from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
-from vrw_jax.validation import check_int, check_not_traced, check_positive, is_traced
+from vrw_jax.validation import (
+    check_int,
+    check_positive,
+    has_traced_leaf,
+    require_untraced_arguments,
+)
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
 
 MAX_QUADRATURE_NODES = 3200
@@ -101,7 +106,7 @@ class FirstPassage(AbstractPrintable):
     @property
     def ending(self) -> str:
         """Return a sentence about whether the error is within the tolerance."""
-        return describe_ending(self.status, PassageStatus)
+        return describe_step_ending(self.status, PassageStatus)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for means, probability, outcomes and status."""
@@ -181,7 +186,7 @@ def first_passage(
         ('TOUCHDOWN_BEFORE_STOPPER',)
     """
     check_single_wheel(params, "take one after the other")
-    if not is_traced(slope_sd):
+    if not has_traced_leaf(slope_sd):
         slope_sd = check_positive("slope_sd", slope_sd)
     seed, n_nodes = check_int("seed", seed, 0), check_int("n_nodes", n_nodes, 8)
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
@@ -191,7 +196,9 @@ def first_passage(
         return _solve_passage_by_quadrature(
             params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
         )
-    check_not_traced("vrw.first_passage", "differentiate by the wheel only", resolved_model)
+    require_untraced_arguments(
+        "vrw.first_passage", "differentiate by the wheel only", resolved_model
+    )
     if options is None:
         options = StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
     estimate_passage = functools.partial(
@@ -203,7 +210,7 @@ def first_passage(
         relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
-    if not is_traced(params, slope_sd):
+    if not has_traced_leaf(params, slope_sd):
         return estimate_passage(params, float(slope_sd))[0]
     return _estimate_differentiable_passage(estimate_passage, params, slope_sd)
 
@@ -218,7 +225,7 @@ def _estimate_differentiable_passage(
 
     Raise TypeError if the numbers of the wheel are unknown, as inside `jit` and `vmap`.
     """
-    check_not_traced("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     return estimate_passage(params, float(slope_sd))[0]
 
 
@@ -230,7 +237,7 @@ def _differentiate_passage(
 ) -> tuple[FirstPassage, FirstPassage]:
     """Return sampled first-passage times and their tangents."""
     params, slope_sd = primals
-    check_not_traced("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
     params_tangent, slope_sd_tangent = tangents
     tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
     tangent_by_name["slope_sd"] = slope_sd_tangent
@@ -245,7 +252,7 @@ def _differentiate_passage(
     relative_tangent = sum(gradient[name] * tangent for name, tangent in tangent_by_name.items())
     passage_tangent = eqx.tree_at(
         lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
-        zero_tangent(passage),
+        make_zero_tangent(passage),
         (
             passage.mean_steps * relative_tangent,
             passage.mean_steps_from_gait * relative_tangent,
@@ -269,7 +276,7 @@ def _solve_passage_by_quadrature(
             "give vrw.RigidWheel(stop_at_lift_off=False)."
         )
     if (
-        not is_traced(params)
+        not has_traced_leaf(params)
         and not float(model.make_vertical_rate_map(params).compute_fixed_point(params.slope)) > 0
     ):
         raise ValueError(
@@ -288,7 +295,7 @@ def _solve_passage_by_quadrature(
         )
         is_within_tolerance = mean_steps_error <= relative_tolerance * mean_steps_estimates[1]
         if (
-            is_traced(params, slope_sd)
+            has_traced_leaf(params, slope_sd)
             or bool(is_within_tolerance)
             or n_nodes >= MAX_QUADRATURE_NODES
         ):

@@ -13,7 +13,7 @@ from vrw_jax.cycles import AbstractCycle, limit_cycle
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions
 from vrw_jax.simulation import ModelLike, check_model, check_single_wheel, check_step_options
-from vrw_jax.validation import check_not_traced, check_type
+from vrw_jax.validation import check_type, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
 
@@ -55,7 +55,9 @@ class StableGait(NamedTuple):
         Raise TypeError or ValueError if an argument is invalid or the gait is not stable. Messages
         contain `caller_name`, the name of the public function.
         """
-        check_not_traced(caller_name, "map vrw.walk over the starts", params, options, cycle)
+        require_untraced_arguments(
+            caller_name, "map vrw.walk over the starts", params, options, cycle
+        )
         check_single_wheel(params, f"call {caller_name} for one wheel after the other")
         checked_model = check_model(model).fallback_model  # valid for any start
         checked_options = check_step_options(options)

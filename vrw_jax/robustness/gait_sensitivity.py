@@ -19,10 +19,10 @@ from vrw_jax.cycles import (
 )
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
 from vrw_jax.numerics import Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_ending
+from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_known_name, check_names, is_traced
+from vrw_jax.validation import check_names, has_traced_leaf, require_known_name
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -61,7 +61,7 @@ class GaitSensitivity(AbstractPrintable):
     def ending(self) -> str:
         """Return a sentence about whether the norms are finite, with the reason."""
         if self.outcome != Outcome.STEPPED:
-            return describe_ending(self.outcome, Outcome)
+            return describe_step_ending(self.outcome, Outcome)
         if self.spectral_radius < 1.0:
             return "The gait is stable, and the norms are finite."
         return "The gait is not stable: deviations grow from step to step, and no norm is finite."
@@ -81,7 +81,7 @@ class GaitSensitivity(AbstractPrintable):
             )
             text_rows.append(
                 (
-                    measure.label,
+                    measure.label_with_symbol,
                     f"{float(self.norm[measure_index]):.6g} {sensitivity_unit} ({norm_parts_text})",
                 )
             )
@@ -139,13 +139,16 @@ def gait_sensitivity(
         if measure_name in step_measures
     )
     for measure_name in measure_names or ("nothing",):
-        check_known_name(
+        require_known_name(
             measure_name,
             known_measure_names,
             f"measure of a step of {cycle_finder.model.model_name} wheels",
         )
     limit_cycle_result: Any = limit_cycle(params, guess=guess, model=model, options=options)
-    if not is_traced(limit_cycle_result) and int(limit_cycle_result.outcome) != Outcome.STEPPED:
+    if (
+        not has_traced_leaf(limit_cycle_result)
+        and int(limit_cycle_result.outcome) != Outcome.STEPPED
+    ):
         raise ValueError(
             "this wheel has no gait whose sensitivity could be computed: "
             f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."

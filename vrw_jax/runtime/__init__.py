@@ -1,11 +1,11 @@
-"""Start of a process, lazily imported libraries, disk cache and compiled programs."""
+"""Process start, lazily imported libraries, disk cache and compiled programs."""
 
 from vrw_jax.runtime import disk_cache
 from vrw_jax.runtime.cached_programs import (
+    call_through_saved_trace,
     compile_cached_lane_function,
     compile_cached_lane_program,
-    compile_exported_trace,
-    wrap_with_saved_trace,
+    compile_exported_function,
 )
 from vrw_jax.runtime.disk_cache import compute_source_digest
 from vrw_jax.runtime.lazy_import import lazy_import, xarray

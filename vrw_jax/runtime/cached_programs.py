@@ -1,10 +1,10 @@
 """Traced functions saved beside JAX's compilation cache, so that later processes need not trace
-again.
+them.
 
-JAX's persistent cache avoids compilation but not tracing, which for a limit cycle with derivatives
-takes longer than a scan of thousands of samples. If that cache is on, its folder also contains
-traces. The key of a trace contains everything on which the trace depends, including the library's
-source.
+JAX's persistent cache avoids compilation but not tracing. Tracing a limit cycle with derivatives
+takes longer than a scan of thousands of samples. If the persistent cache is on, its folder also
+contains traces. The key of a trace contains everything on which the trace depends, including the
+library's source.
 """
 
 import hashlib
@@ -23,20 +23,20 @@ from vrw_jax.runtime import disk_cache as store
 from vrw_jax.runtime.start import make_fusion_emitter_options
 
 
-def compile_exported_trace(
+def compile_exported_function(
     traced_function: Callable,
     example_arguments: tuple,
-    cache_settings: object,
+    trace_key_settings: object,
     target_device: jax.Device,
 ) -> Callable:
     """Return `traced_function`, compiled on `target_device` for arguments with the shapes of
     `example_arguments`.
 
-    The `repr` of `cache_settings` identifies the values in the function's closure. The program is
-    always compiled from the exported trace, saved or not, so that all runs compile the same
+    The `repr` of `trace_key_settings` identifies the values in the function's closure. The program
+    is always compiled from the exported trace, saved or not, so that all runs compile the same
     program.
     """
-    exported_trace = _load_or_export_trace(traced_function, example_arguments, cache_settings)
+    exported_trace = _load_or_export_trace(traced_function, example_arguments, trace_key_settings)
     device_sharding = SingleDeviceSharding(target_device)
     argument_shapes = [
         jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device_sharding)
@@ -50,22 +50,22 @@ def compile_exported_trace(
     return lambda *example_arguments: compiled_program(*jax.tree.leaves(example_arguments))
 
 
-def wrap_with_saved_trace(traced_function: Callable, cache_settings: object) -> Callable:
+def call_through_saved_trace(traced_function: Callable, trace_key_settings: object) -> Callable:
     """Return a function that calls `traced_function` through its saved trace if there is one.
 
-    The result is called while a program is traced. `traced_function` must not be mapped or
-    differentiated from outside. As with `compile_exported_trace`, first and later runs use the
-    exported trace.
+    The returned function is called while a program is traced. `traced_function` must not be mapped
+    or differentiated from outside. As with `compile_exported_function`, first and later runs use
+    the exported trace.
     """
 
-    def call_saved_trace(*arguments: Any) -> Any:
+    def evaluate_saved_trace(*arguments: Any) -> Any:
         if _is_exporting_trace.get() or not store.find_cache_folder():
             return traced_function(*arguments)
-        return _load_or_export_trace(traced_function, arguments, cache_settings).call(
+        return _load_or_export_trace(traced_function, arguments, trace_key_settings).call(
             *jax.tree.leaves(arguments)
         )
 
-    return call_saved_trace
+    return evaluate_saved_trace
 
 
 def compile_cached_lane_program(
@@ -73,14 +73,14 @@ def compile_cached_lane_program(
     scalar_dtypes: Sequence[np.dtype],
     n_lane_arrays: int,
     lane_dtype: np.dtype,
-    cache_settings: Any,
+    trace_key_settings: Any,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return `simd.compile_lane_program` of a function of this library, with a record on disk.
+    """Return `simd.compile_lane_program` of a function of this library, saved in the disk cache.
 
-    `cache_settings` is as for `compile_exported_trace`.
+    `trace_key_settings` has the same meaning as for `compile_exported_function`.
     """
-    trace_key = (cache_settings, store.describe_trace_environment())
+    trace_key = (trace_key_settings, store.describe_trace_environment())
     return simd.compile_lane_program(
         lane_function, scalar_dtypes, n_lane_arrays, lane_dtype, trace_key, store, register_limits
     )
@@ -89,26 +89,28 @@ def compile_cached_lane_program(
 def compile_cached_lane_function(
     lane_function: Callable,
     result_shape_function: Callable,
-    cache_settings: object,
+    trace_key_settings: object,
     register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
 ) -> Callable:
-    """Return `simd.compile_lane_function` of a function of this library, with a record on disk."""
+    """Return `simd.compile_lane_function` of a function of this library, saved in the disk
+    cache.
+    """
     return simd.compile_lane_function(
         lane_function,
         result_shape_function,
-        (cache_settings, store.describe_trace_environment()),
+        (trace_key_settings, store.describe_trace_environment()),
         store,
         register_limits,
     )
 
 
 def _load_or_export_trace(
-    traced_function: Callable, example_arguments: tuple, cache_settings: object
+    traced_function: Callable, example_arguments: tuple, trace_key_settings: object
 ) -> export.Exported:
-    """Return the exported trace of a function as a function of the flat arguments.
+    """Return the exported trace of a function, as a function of the flat arguments.
 
-    The trace is loaded from disk if a record exists, and otherwise made for the shapes of
-    `example_arguments`.
+    The trace is loaded from disk if a record exists. Otherwise the function is traced for the
+    shapes of `example_arguments`.
     """
     argument_leaves, argument_structure = jax.tree.flatten(example_arguments)
     argument_shapes = [
@@ -120,7 +122,7 @@ def _load_or_export_trace(
         simd.describe_processor() if simd.is_machine_code_available() else None,
     )
     key_parts = (
-        cache_settings,
+        trace_key_settings,
         str(argument_structure),
         argument_shapes,
         device_platform,
@@ -129,13 +131,13 @@ def _load_or_export_trace(
     record_name = f"vrw_trace_{hashlib.sha256(repr(key_parts).encode()).hexdigest()}"
     record_content = store.load_bytes(record_name)
     if record_content is not None:
-        code_names_bytes, _, serialized_trace = record_content.partition(b"\n")
+        machine_code_names_bytes, _, serialized_trace = record_content.partition(b"\n")
         try:
-            if simd.load_saved_machine_code(code_names_bytes.decode().split(), store):
+            if simd.load_saved_machine_code(machine_code_names_bytes.decode().split(), store):
                 return export.deserialize(bytearray(serialized_trace))
         except Exception:  # JAX documents no type of error for bytes that are no trace.
             store.warn_of_unusable_record(f"{record_name} is no trace")
-    flat_function = jax.jit(
+    flattened_function = jax.jit(
         lambda *argument_leaves: traced_function(
             *jax.tree.unflatten(argument_structure, argument_leaves)
         )
@@ -144,34 +146,38 @@ def _load_or_export_trace(
     context_token = _is_exporting_trace.set(True)
     try:
         # The export below finds this trace in JAX's cache.
-        code_names = sorted(_find_machine_code_names(flat_function.trace(*argument_shapes).jaxpr))
-        allowed_checks = [
-            export.DisabledSafetyCheck.custom_call(record_name) for record_name in code_names
+        machine_code_names = sorted(
+            _find_machine_code_names(flattened_function.trace(*argument_shapes).jaxpr)
+        )
+        disabled_export_checks = [
+            export.DisabledSafetyCheck.custom_call(record_name)
+            for record_name in machine_code_names
         ]
-        exported_trace = export.export(flat_function, disabled_checks=allowed_checks)(
+        exported_trace = export.export(flattened_function, disabled_checks=disabled_export_checks)(
             *argument_shapes
         )
     finally:
         _is_exporting_trace.reset(context_token)
     store.save_bytes(
-        record_name, " ".join(code_names).encode() + b"\n" + bytes(exported_trace.serialize())
+        record_name,
+        " ".join(machine_code_names).encode() + b"\n" + bytes(exported_trace.serialize()),
     )
     return exported_trace
 
 
 def _find_machine_code_names(traced_program: Any) -> set[str]:
-    """Return the names of the machine code that a trace calls."""
+    """Return the names of the machine code that a traced program calls."""
     traced_program = getattr(traced_program, "jaxpr", traced_program)
-    code_names = {
+    machine_code_names = {
         inner_equation.params["code"].code_name
         for inner_equation in traced_program.eqns
         if inner_equation.primitive is simd.MACHINE_CODE_PRIMITIVE
     }
     for equation in traced_program.eqns:
-        for leaf in jax.tree.leaves(list(equation.params.values())):
-            if hasattr(getattr(leaf, "jaxpr", leaf), "eqns"):
-                code_names |= _find_machine_code_names(leaf)
-    return code_names
+        for parameter_leaf in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(getattr(parameter_leaf, "jaxpr", parameter_leaf), "eqns"):
+                machine_code_names |= _find_machine_code_names(parameter_leaf)
+    return machine_code_names
 
 
 _is_exporting_trace: ContextVar[bool] = ContextVar("_exporting", default=False)

@@ -2,7 +2,7 @@
 
 A record is one file, which begins with a digest of its name and its content. The name identifies
 everything on which the content depends. The content is executed, so records are used only from a
-folder that no other user can write. The user may also declare trust in those who can write there.
+folder that no other user can write, unless the user has declared the folder trusted.
 """
 
 import contextlib
@@ -40,12 +40,12 @@ def compute_source_digest() -> str:
 
     A change of source or tableaus may change digits of results.
     """
-    source_hash = hashlib.sha256()
+    source_hasher = hashlib.sha256()
     package_folder = Path(__file__).parents[1]
     for source_path in sorted((*package_folder.rglob("*.py"), *package_folder.rglob("*.json"))):
-        source_hash.update(source_path.relative_to(package_folder).as_posix().encode())
-        source_hash.update(source_path.read_bytes())
-    return source_hash.hexdigest()
+        source_hasher.update(source_path.relative_to(package_folder).as_posix().encode())
+        source_hasher.update(source_path.read_bytes())
+    return source_hasher.hexdigest()
 
 
 @functools.cache
@@ -59,7 +59,7 @@ def _list_library_versions() -> tuple[str, ...]:
 
 
 def describe_trace_environment() -> tuple[object, ...]:
-    """Return everything on which every trace depends: source, versions and number formats."""
+    """Return the settings on which every trace depends: source, versions and number formats."""
     jax_config: Any = jax.config
     return (
         compute_source_digest(),
@@ -71,13 +71,12 @@ def describe_trace_environment() -> tuple[object, ...]:
 
 
 def find_cache_folder() -> Any:
-    """Return the folder of JAX's compilation cache, or None if no folder is set or the folder is
-    not trusted."""
+    """Return the folder of JAX's compilation cache, or None if no trusted folder is set."""
     jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     # Only JAX can read a storage bucket.
     if not jax_cache_folder or "://" in str(jax_cache_folder):
         return None
-    distrust_reason = describe_untrusted_folder(Path(jax_cache_folder))
+    distrust_reason = explain_folder_distrust(Path(jax_cache_folder))
     if distrust_reason:
         _warn_once(
             "folder", f"{distrust_reason}; until then no machine code or trace is kept or used."
@@ -86,11 +85,13 @@ def find_cache_folder() -> Any:
     return jax_cache_folder
 
 
-def describe_untrusted_folder(code_folder: Path) -> str:
-    """Return the reason why code in a folder is not executed, with a remedy, or "" if it is
-    executed."""
+def explain_folder_distrust(code_folder: Path) -> str:
+    """Return the reason why code in a folder is not executed, with a remedy.
+
+    The text is empty if the code is executed.
+    """
     try:
-        distrust_reason = _describe_file_distrust(code_folder.stat())
+        distrust_reason = _explain_file_distrust(code_folder.stat())
     except OSError:
         return ""  # The folder does not exist or cannot be read, so nothing in it is executed.
     if not distrust_reason:
@@ -103,17 +104,19 @@ def describe_untrusted_folder(code_folder: Path) -> str:
     )
 
 
-def trusts_shared_caches() -> bool:
-    """Return whether the user trusts all who can write the cache."""
+def has_shared_cache_trust() -> bool:
+    """Return whether the user trusts everybody who can write the cache."""
     return os.environ.get(TRUST_SHARED_CACHE_VARIABLE, "") not in ("", "0")
 
 
-def make_cache_folder(code_folder: Path) -> None:
-    """Create a folder for code and its parents. Only the user can access them, unless caches are
-    shared."""
+def create_cache_folder(code_folder: Path) -> None:
+    """Create a folder for code, and its parents.
+
+    Only the user can access the folder, unless caches are shared.
+    """
     for missing_folder in reversed([code_folder, *code_folder.parents]):
         if not missing_folder.exists():
-            missing_folder.mkdir(mode=0o777 if trusts_shared_caches() else 0o700, exist_ok=True)
+            missing_folder.mkdir(mode=0o777 if has_shared_cache_trust() else 0o700, exist_ok=True)
 
 
 def load_bytes(record_name: str) -> bytes | None:
@@ -123,23 +126,23 @@ def load_bytes(record_name: str) -> bytes | None:
         return None
     record_path = Path(cache_folder) / f"{record_name}{CACHE_RECORD_SUFFIX}"
     # Without this flag the call would block if the file were a pipe.
-    open_without_blocking = lambda record_path, flags: os.open(
+    nonblocking_opener = lambda record_path, flags: os.open(
         record_path, flags | getattr(os, "O_NONBLOCK", 0)
     )
     try:
-        with open(record_path, "rb", opener=open_without_blocking) as record_file:
-            file_status = os.fstat(record_file.fileno())
-            is_regular_file = stat.S_ISREG(file_status.st_mode)
+        with open(record_path, "rb", opener=nonblocking_opener) as record_file:
+            file_stat_result = os.fstat(record_file.fileno())
+            is_regular_file = stat.S_ISREG(file_stat_result.st_mode)
             distrust_reason = (
-                _describe_file_distrust(file_status) if is_regular_file else "is no file"
+                _explain_file_distrust(file_stat_result) if is_regular_file else "is no file"
             )
-            file_bytes = b"" if distrust_reason else record_file.read()
+            record_bytes = b"" if distrust_reason else record_file.read()
     except FileNotFoundError:
         return None
     except OSError as read_error:
-        distrust_reason, file_bytes = f"can't be read ({read_error.strerror})", b""
+        distrust_reason, record_bytes = f"can't be read ({read_error.strerror})", b""
     n_digest_bytes = hashlib.sha256().digest_size
-    stored_digest, record_content = file_bytes[:n_digest_bytes], file_bytes[n_digest_bytes:]
+    stored_digest, record_content = record_bytes[:n_digest_bytes], record_bytes[n_digest_bytes:]
     if not distrust_reason and _compute_record_digest(record_name, record_content) != stored_digest:
         distrust_reason = "is damaged"
     if distrust_reason:
@@ -149,7 +152,7 @@ def load_bytes(record_name: str) -> bytes | None:
 
 
 def warn_of_unusable_record(record_description: str) -> None:
-    """Issue a warning, once per process, that a record of the cache is not used."""
+    """Issue a warning, once per process, that a record of the cache cannot be used."""
     _warn_once(
         "record",
         f"the cached code {record_description}: it is compiled again, as is any other such file.",
@@ -157,9 +160,9 @@ def warn_of_unusable_record(record_description: str) -> None:
 
 
 def save_bytes(record_name: str, record_content: bytes) -> None:
-    """Write a record atomically: to a temporary file, which is synced and renamed.
+    """Write a record atomically: into a temporary file, which is synchronized and renamed.
 
-    No error is raised if the cache cannot be written.
+    If the cache cannot be written, no error is raised.
     """
     if not find_cache_folder():
         return
@@ -168,7 +171,7 @@ def save_bytes(record_name: str, record_content: bytes) -> None:
         None,
     )
     try:
-        make_cache_folder(record_path.parent)
+        create_cache_folder(record_path.parent)
         file_descriptor, temporary_path = tempfile.mkstemp(
             dir=record_path.parent, prefix="unfinished_"
         )
@@ -176,7 +179,7 @@ def save_bytes(record_name: str, record_content: bytes) -> None:
             record_file.write(_compute_record_digest(record_name, record_content) + record_content)
             record_file.flush()
             os.fsync(record_file.fileno())
-        if trusts_shared_caches():  # Otherwise only the user can read it.
+        if has_shared_cache_trust():  # Otherwise only the user can read it.
             os.chmod(temporary_path, 0o644)
         os.replace(temporary_path, record_path)
     except OSError:
@@ -185,21 +188,22 @@ def save_bytes(record_name: str, record_content: bytes) -> None:
 
 
 def _compute_record_digest(record_name: str, record_content: bytes) -> bytes:
-    """Return the digest of a record's name and content."""
+    """Return the digest of the name and the content of a record."""
     return hashlib.sha256(record_name.encode() + b"\n" + record_content).digest()
 
 
-def _describe_file_distrust(file_status: os.stat_result) -> str:
-    """Return the reason why another user may have written a file, or "" if that is impossible or
-    all users are trusted."""
-    if os.name != "posix" or trusts_shared_caches():
+def _explain_file_distrust(file_stat_result: os.stat_result) -> str:
+    """Return the reason why another user may have written a file.
+
+    The text is empty if no other user can have written the file, or if all users are trusted.
+    """
+    if os.name != "posix" or has_shared_cache_trust():
         return ""
-    if file_status.st_uid != os.geteuid():
+    if file_stat_result.st_uid != os.geteuid():
         return "belongs to another user"
-    if file_status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return (
-            f"can be written by other users (its mode is {stat.S_IMODE(file_status.st_mode):04o})"
-        )
+    if file_stat_result.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        file_mode = stat.S_IMODE(file_stat_result.st_mode)
+        return f"can be written by other users (its mode is {file_mode:04o})"
     return ""
 
 

@@ -1,11 +1,11 @@
-"""Libraries imported on first use, because importing all of them takes a second of every start."""
+"""Lazy import of libraries, because importing all of them would add a second to every start."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 
 class _LazyLibrary:
-    """A library that is imported on the first access to one of its attributes."""
+    """Library that is imported when one of its attributes is first read."""
 
     def __init__(self, library_name: str) -> None:
         self._library_name = library_name
@@ -15,7 +15,7 @@ class _LazyLibrary:
 
 
 def lazy_import(library_name: str) -> Any:
-    """Return a library that is imported on the first access to one of its attributes."""
+    """Return a library that is imported when one of its attributes is first read."""
     return _LazyLibrary(library_name)
 
 

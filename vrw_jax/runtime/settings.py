@@ -1,4 +1,4 @@
-"""Default settings of JAX for this library, if the caller has set others."""
+"""Default settings of JAX for this library, for callers that have changed them."""
 
 import functools
 from collections.abc import Callable
@@ -10,8 +10,7 @@ FunctionType = TypeVar("FunctionType", bound=Callable[..., Any])
 
 
 def with_default_jax_settings(function: FunctionType) -> FunctionType:
-    """Return `function` computed with the default settings of JAX, if the process has other
-    settings.
+    """Return `function` computed with JAX's default settings, if the process has other settings.
 
     `jax_disable_jit` and strict promotion of ranks and dtypes help to find faults in the caller's
     code. But this library calls machine code from compiled programs only, and its formulas accept
@@ -22,12 +21,12 @@ def with_default_jax_settings(function: FunctionType) -> FunctionType:
     @functools.wraps(function)
     def call_with_default_settings(*args: Any, **keywords: Any) -> Any:
         jax_config: Any = jax.config
-        has_default_settings = (
+        is_jax_config_default = (
             not jax_config.jax_disable_jit
             and jax_config.jax_numpy_rank_promotion == "allow"
             and jax_config.jax_numpy_dtype_promotion == "standard"
         )
-        if has_default_settings:
+        if is_jax_config_default:
             return function(*args, **keywords)
         with (
             jax.disable_jit(False),

@@ -14,9 +14,9 @@ from vrw_jax.validation import check_bool, check_type
 def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) -> None:
     """Set 64-bit numbers, a cache of compiled code, and XLA's faster compilation on CPUs.
 
-    Call it before the first array is created. The library works without it, but with it processes
-    start in a fraction of the time. Without `cache` it uses the folder in
-    JAX_COMPILATION_CACHE_DIR, or else one in the user's cache folder.
+    Call this function before the first array is created. The library works without this call, but
+    with it processes start in a fraction of the time. The default of `cache` is the folder in
+    JAX_COMPILATION_CACHE_DIR, or else a folder in the user's cache folder.
 
     Args:
         cache: folder of compiled code; `~` is the user's home folder.
@@ -58,40 +58,44 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
 
 
 def _require_private_cache_folder() -> None:
-    """Create the cache folder for the user alone. Raise an error if other users can write it."""
+    """Create the cache folder for the user alone, and raise an error if other users can write
+    it.
+    """
     jax_cache_folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not jax_cache_folder or "://" in jax_cache_folder:
         return
-    distrust_reason = store.describe_untrusted_folder(Path(jax_cache_folder))
+    distrust_reason = store.explain_folder_distrust(Path(jax_cache_folder))
     if distrust_reason:
         jax.config.update("jax_compilation_cache_dir", None)
         raise PermissionError(f"{distrust_reason}.")
     with contextlib.suppress(OSError):  # Without the folder nothing is cached.
-        store.make_cache_folder(Path(jax_cache_folder))
+        store.create_cache_folder(Path(jax_cache_folder))
 
 
-def make_fusion_emitter_options(is_enabled: bool) -> dict[str, str | bool]:
+def make_fusion_emitter_options(are_emitters_enabled: bool) -> dict[str, str | bool]:
     """Return the options of `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
 
     Without fusion emitters, XLA compiles in half to two thirds of the time. The code is as fast or,
     for events with unilateral contact, slower by a seventh. Programs whose digits must not depend
     on the process always set the option.
     """
-    has_emitters = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
-    return {_FUSION_EMITTERS_FLAG: is_enabled} if has_emitters else {}
+    emitters_flag = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
+    return {_FUSION_EMITTERS_FLAG: are_emitters_enabled} if emitters_flag else {}
 
 
 _FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
 
 
 def _accepts_fusion_emitters_flag() -> bool:
-    """Return whether this version of XLA accepts the flag of fusion emitters. Other versions may
-    abort the process."""
+    """Return whether this version of XLA accepts the flag of fusion emitters.
+
+    Other versions may abort the process.
+    """
     return jax.__version_info__[:2] in ((0, 9), (0, 10))
 
 
 def _find_user_cache_folder() -> Path:
-    """Return the folder in which this operating system keeps the user's caches."""
+    """Return the folder in which this operating system stores the user's caches."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     if sys.platform == "darwin":

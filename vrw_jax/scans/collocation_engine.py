@@ -21,9 +21,9 @@ from vrw_jax.cycles import AbstractCycle, CycleOptions, confirm_outcome_by_step,
 from vrw_jax.measures import MARGIN_MEASURES
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
-from vrw_jax.runtime import compile_exported_trace, with_default_jax_settings
+from vrw_jax.runtime import compile_exported_function, with_default_jax_settings
 from vrw_jax.scans.measure_catalog import DIFFERENTIABLE_MEASURES, parse_derivative
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
 """Outcome of a gait, its section state, and its measures by name."""
@@ -122,7 +122,8 @@ class CollocationScanEngine:
 
         def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
             """Return the outcome, the section state and the measures of the limit cycle of one
-            wheel."""
+            wheel.
+            """
             limit_cycle, derivative_values = find_cycle_with_derivatives(parameter_values)
             cycle_measure_names = (
                 *(
@@ -142,9 +143,10 @@ class CollocationScanEngine:
             parameter_values: Array, section_state: Array, step_options: StepOptions
         ) -> GaitOutputs:
             """Return the outcome, the section state and the measures of one step from the limit
-            cycle."""
+            cycle.
+            """
             step_result = wheel_model.take_step(
-                wheel_from_parameters(parameter_values, base_wheel.n_legs),
+                make_wheel_from_parameters(parameter_values, base_wheel.n_legs),
                 section_state,
                 step_options,
             )
@@ -173,7 +175,8 @@ class CollocationScanEngine:
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample."""
+        each swept parameter, one per sample.
+        """
         parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
         with self._compilation_lock:
             if not self._n_workers:
@@ -222,7 +225,8 @@ class CollocationScanEngine:
 
     def _compile_programs(self) -> None:
         """Compile both functions in parallel for each device. All cores of a CPU use the same
-        programs."""
+        programs.
+        """
         local_devices = jax.local_devices()
         parameter_dtype = np.dtype(self._base_wheel.damping.dtype)
         parameter_rows_shape = jax.ShapeDtypeStruct(
@@ -233,7 +237,7 @@ class CollocationScanEngine:
         )
         cache_key = self._cache_key
         # Threads have separate settings.
-        compile_with_defaults = with_default_jax_settings(compile_exported_trace)
+        compile_with_defaults = with_default_jax_settings(compile_exported_function)
         with ThreadPoolExecutor(2) as thread_pool:
             step_arguments = (parameter_rows_shape, section_states_shape, self._step_options)
             step_programs = [
@@ -308,7 +312,8 @@ def mask_failed_samples(
     outcome: np.ndarray, measures_by_name: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
     """Return outcome and measures by name. In samples without a gait, a measure is NaN, or -1 if it
-    is an integer."""
+    is an integer.
+    """
     masked_measures = {
         variable_name: np.array(variable_values)
         for variable_name, variable_values in measures_by_name.items()

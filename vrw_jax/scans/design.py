@@ -11,10 +11,10 @@ import numpy as np
 from vrw_jax.printing import format_quantity
 from vrw_jax.validation import (
     check_int,
-    check_not_traced,
     check_range,
     check_type,
     format_value,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
 
@@ -71,12 +71,14 @@ class AbstractSampleDesign(abc.ABC):
     @abc.abstractmethod
     def select_samples(self, region: tuple[slice, ...]) -> SampleColumns:
         """Return the samples of a rectangular region by parameter, flattened with the last axis
-        varying fastest."""
+        varying fastest.
+        """
 
     @abc.abstractmethod
     def make_result_coordinates(self) -> dict[str, tuple[str, np.ndarray]]:
         """Return the coordinates of a labeled result. For each name they give the axis and the
-        values."""
+        values.
+        """
 
     def describe_design(self) -> dict[str, object]:
         """Return the identity of the design: kind, names, shape and a digest of all numbers."""
@@ -168,7 +170,8 @@ def _require_mapping_or_keywords(
     function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
 ) -> Mapping:
     """Return the parameters of a design, given as one mapping or as keywords. Raise a TypeError if
-    both are given."""
+    both are given.
+    """
     if parameter_mapping is not None and parameter_keywords:
         raise TypeError(
             f"{function_name} has a mapping and the keywords {', '.join(parameter_keywords)}: "
@@ -404,7 +407,8 @@ def _scale_unit_points_to_box(
     design_kind: str,
 ) -> SampleListDesign:
     """Return the design of points of the unit cube, shape (samples, parameters), scaled to the box
-    between the bounds."""
+    between the bounds.
+    """
     scaled_points = lower_bounds + (upper_bounds - lower_bounds) * unit_points
     return SampleListDesign(
         dict(zip(parameter_names, np.ascontiguousarray(scaled_points.T), strict=True)), design_kind
@@ -436,7 +440,8 @@ def _parse_sampling_box(
 
 def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> Mapping:
     """Return `values_by_parameter`; raise a ValueError if it is empty or has a name that cannot be
-    swept."""
+    swept.
+    """
     check_type("the design", values_by_parameter, Mapping, "write {'damping': (100.0, 200.0)}")
     if not values_by_parameter:
         raise ValueError(
@@ -450,8 +455,9 @@ def _require_sweepable_parameters(values_by_parameter: Mapping[str, object]) -> 
 
 def _to_value_column(parameter_name: str, parameter_values: object) -> np.ndarray:
     """Return the values of one parameter as a vector of floats; raise an error if they are not
-    numbers."""
-    check_not_traced("a design", "use jax.vmap", parameter_values)
+    numbers.
+    """
+    require_untraced_arguments("a design", "use jax.vmap", parameter_values)
     try:
         value_column = np.atleast_1d(np.asarray(parameter_values))
     # Lists may have different lengths, and the conversion of a foreign object may raise any error.

@@ -39,7 +39,7 @@ from vrw_jax.scans.collocation_engine import (
 from vrw_jax.scans.measure_catalog import make_error_variable_name, parse_derivative
 from vrw_jax.selection import MODEL_SELECTION_MARGINS, ModelCode, find_selection_reason
 from vrw_jax.tolerance import ModelIndex, measure_to_tolerance
-from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, wheel_from_parameters
+from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, Outcome, make_wheel_from_parameters
 
 SampleColumnMapping = Mapping[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -90,7 +90,8 @@ class UnilateralScanEngine:
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
         """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample."""
+        each swept parameter, one per sample.
+        """
         parameter_rows = stack_parameter_rows(sample_columns, self._wheel_model, self._base_wheel)
         parameter_row_parts = np.array_split(
             parameter_rows,
@@ -134,7 +135,8 @@ class UnilateralScanEngine:
 
     def _evaluate_gaits(self, parameter_rows: np.ndarray) -> VariableColumns:
         """Return outcome, measures and derivatives of the gaits of some wheels by name, shape
-        (wheels,)."""
+        (wheels,).
+        """
         slow_gaits = find_slow_gaits(self._gait_finder, parameter_rows)
         gait_results = map_in_batches(
             lambda gait_batch: _read_gait_measures(self._measure_reader, gait_batch),
@@ -258,7 +260,8 @@ class ModelSelectionScanEngine:
         self, paper_results: VariableColumns, sample_friction: np.ndarray
     ) -> np.ndarray:
         """Return `ModelChoice.reason_code` of each sample, from the margins of its gait with the
-        paper's model."""
+        paper's model.
+        """
         variable_names = (*MODEL_SELECTION_MARGINS, "outcome")
         selection_reasons = map_in_numpy_batches(
             _find_selection_reasons,
@@ -289,11 +292,12 @@ class ToleranceScanEngine:
 
     def __call__(self, sample_columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample."""
+        each swept parameter, one per sample.
+        """
         *wheel_columns, sample_friction = stack_parameter_rows(
             sample_columns, self._wheel_model, self._base_wheel
         ).T
-        params = wheel_from_parameters(
+        params = make_wheel_from_parameters(
             tuple(map(jnp.asarray, wheel_columns)), self._base_wheel.n_legs
         )
         stoppers = self._wheel_model.stoppers
@@ -337,7 +341,8 @@ class PassageScanEngine:
 
     def __call__(self, sample_columns: SampleColumnMapping) -> VariableColumns:
         """Return the results of all samples by variable. `sample_columns` contains the values of
-        each swept parameter, one per sample."""
+        each swept parameter, one per sample.
+        """
         sample_results: VariableColumns = dict(self._gait_engine(sample_columns))
         gait_outcomes = sample_results["outcome"]
         passage_measures = np.full(
@@ -359,7 +364,8 @@ class PassageScanEngine:
 
     def _measure_sample_passage(self, swept_values: Mapping[str, float]) -> list[float]:
         """Return the passage measures of one sample; they are NaN if hardly any step of the walks
-        succeeds."""
+        succeeds.
+        """
         wheel_model, params = self._wheel_model, self._base_wheel
         for parameter_name, parameter_value in swept_values.items():
             wheel_model, params = wheel_model.with_parameter(

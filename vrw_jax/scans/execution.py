@@ -39,7 +39,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_callable, check_path, raise_for_renamed_arguments
+from vrw_jax.validation import check_callable, check_path, with_renamed_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -57,7 +57,7 @@ class ScanProgress:
 
 
 @with_default_jax_settings
-@raise_for_renamed_arguments(report="on_progress")
+@with_renamed_arguments(report="on_progress")
 def scan(
     design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,
@@ -139,7 +139,8 @@ def scan(
 
 def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
     """Return the context of an executor on a dask cluster, or a context of None if this process
-    computes."""
+    computes.
+    """
     if dask is None:
         return contextlib.nullcontext()
     from vrw_jax.scans.dask import connect_dask_workers
@@ -243,7 +244,8 @@ def _compute_chunks_in_process(
     scan_plan: ScanPlan, missing_chunks: Sequence[int]
 ) -> Iterator[ChunkResult]:
     """Yield the index and the results of each missing chunk, computed one after another in this
-    process."""
+    process.
+    """
     scan_engine = scan_plan.build_scan_engine()
     for chunk_index in missing_chunks:
         yield (
@@ -258,7 +260,8 @@ def _compute_chunks_in_process(
 
 def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
     """Return the store at `store_path`, created if there is none. Raise a ValueError if the store
-    contains another scan."""
+    contains another scan.
+    """
     zarr_store = find_matching_store(scan_plan, store_path)
     if zarr_store is None:
         create_empty_store(store_path, scan_plan.result_layout, scan_plan.store_attributes)
@@ -289,7 +292,8 @@ def find_matching_store(
     scan_plan: ScanPlan, store_path: Path, verifies_files: bool = True
 ) -> ZarrResultStore | None:
     """Return the store at `store_path`, or None if there is none. Raise a ValueError if the store
-    contains another scan."""
+    contains another scan.
+    """
     stored_manifest = read_stored_manifest(store_path)
     if stored_manifest is None:
         return None

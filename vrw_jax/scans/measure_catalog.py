@@ -11,12 +11,12 @@ from vrw_jax.measures import (
     PASSAGE_MEASURES,
     STEP_MEASURES,
     UNILATERAL_DIFFERENTIABLE_NAMES,
-    measure_attrs,
+    make_measure_attributes,
 )
 from vrw_jax.models import AbstractWheel, GaitMethod
 from vrw_jax.selection import MODEL_SELECTION_ATTRIBUTES
 from vrw_jax.tolerance import MEASURE_FUNCTIONS
-from vrw_jax.validation import suggest_name
+from vrw_jax.validation import format_name_suggestion
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 
 ALWAYS_INCLUDED_VARIABLES = ("outcome", "spectral_radius", *MARGIN_MEASURES)
@@ -125,7 +125,8 @@ def select_measure_catalog(
 
 def add_passage_measures(measure_catalog: MeasureCatalog) -> MeasureCatalog:
     """Return a catalog extended by measures of walks over random slopes, which take a second per
-    sample."""
+    sample.
+    """
     return measure_catalog._replace(
         requestable_measures=(*measure_catalog.requestable_measures, *PASSAGE_MEASURES),
         default_measures=tuple(PASSAGE_MEASURES),
@@ -179,7 +180,8 @@ def parse_derivative(variable_name: str) -> MeasureDerivative | None:
 
 def canonicalize_variable_name(measure_name: str) -> str:
     """Return the name of the variable that contains the requested measure. The name is valid as a
-    file name."""
+    file name.
+    """
     requested_derivative = parse_derivative(measure_name)
     return (
         measure_name.strip() if requested_derivative is None else requested_derivative.variable_name
@@ -211,7 +213,7 @@ def check_measure_names(
             if measure_name not in known_names:
                 raise ValueError(
                     f"{measure_name!r} is no measure of a "
-                    f"scan{suggest_name(measure_name, known_names)}: "
+                    f"scan{format_name_suggestion(measure_name, known_names)}: "
                     f"choose from {', '.join(measure_catalog.requestable_measures)}, or a "
                     f"derivative such as "
                     "'d dls_fraction / d damping'."
@@ -226,11 +228,11 @@ def check_measure_names(
                 "drop it, or scan without tol."
             )
         differentiable_measures = measure_catalog.differentiable_measures
-        if requested_derivative.measure_name not in differentiable_measures:
+        differentiated_name = requested_derivative.measure_name
+        if differentiated_name not in differentiable_measures:
             raise ValueError(
-                f"{measure_name!r} asks for a derivative of {requested_derivative.measure_name!r}"
-                f"{suggest_name(requested_derivative.measure_name, differentiable_measures)}, but "
-                "a "
+                f"{measure_name!r} asks for a derivative of {differentiated_name!r}"
+                f"{format_name_suggestion(differentiated_name, differentiable_measures)}, but a "
                 f"scan differentiates only {', '.join(differentiable_measures)}: choose one of "
                 "these."
             )
@@ -239,7 +241,8 @@ def check_measure_names(
         if parameter_name not in differentiation_parameters:
             raise ValueError(
                 f"{measure_name!r} asks for a derivative by {parameter_name!r}"
-                f"{suggest_name(parameter_name, differentiation_parameters)}, but it must be by a "
+                f"{format_name_suggestion(parameter_name, differentiation_parameters)}, but it "
+                "must be by a "
                 f"parameter: choose from {', '.join(differentiation_parameters)}."
             )
         checked_names[requested_derivative.variable_name] = None
@@ -260,7 +263,7 @@ def get_variable_attributes(variable_name: str) -> dict[str, object]:
         }
     measure_derivative = parse_derivative(variable_name)
     return (
-        measure_attrs(variable_name)
+        make_measure_attributes(variable_name)
         if measure_derivative is None
         else measure_derivative.variable_attributes
     )

@@ -13,7 +13,12 @@ import numpy as np
 
 from vrw_jax import simd
 from vrw_jax.cycles import CycleOptions, make_finder
-from vrw_jax.measures import MARGIN_MEASURES, locked_leg_coordinate, measure_attrs, provenance
+from vrw_jax.measures import (
+    MARGIN_MEASURES,
+    collect_provenance_attributes,
+    make_locked_leg_coordinate,
+    make_measure_attributes,
+)
 from vrw_jax.models import AbstractWheel, ModelCapabilities, ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, batch_sizes
 from vrw_jax.runtime import compute_source_digest
@@ -182,7 +187,7 @@ def plan_scan(
         )
     base = WheelParams() if base is None else base
     check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
-    base.require_single("give numbers, and what varies in the design")
+    base.require_single_wheel("give numbers, and what varies in the design")
     options, model = check_step_options(options), check_model(model)
     options.check_tolerances(np.dtype(base.damping.dtype))
     gait_finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
@@ -259,7 +264,9 @@ def _check_tolerance_of_model(wheel_model: AbstractWheel, error_tolerance: float
 
 def describe_computing_environment() -> dict[str, object]:
     """Return the digest of the source, the versions and the device of this process."""
-    provenance_record = provenance(WheelParams(), ViscoelasticWheel(), StepOptions())
+    provenance_record = collect_provenance_attributes(
+        WheelParams(), ViscoelasticWheel(), StepOptions()
+    )
     processor_features = simd.describe_processor()[2].split(",")
     instruction_sets = [
         instruction_set
@@ -300,9 +307,10 @@ def _make_result_layout(
     chunk_size: int,
 ) -> ResultLayout:
     """Return the layout of the variables of a result over a design, in chunks of at most
-    `chunk_size` samples."""
+    `chunk_size` samples.
+    """
     parameter_dtype = str(base_wheel.damping.dtype)
-    locked_legs = locked_leg_coordinate(base_wheel.n_legs)
+    locked_legs = make_locked_leg_coordinate(base_wheel.n_legs)
 
     def make_variable_layout(variable_name: str) -> VariableLayout:
         """Return type, missing value and attributes of one variable."""
@@ -311,7 +319,7 @@ def _make_result_layout(
             return VariableLayout(variable_name, "int8", -1, variable_attributes)
         if variable_name == "solver_steps":
             return VariableLayout(variable_name, "int32", -1, variable_attributes)
-        if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].dimension:
+        if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].leg_dimension:
             return VariableLayout(
                 variable_name,
                 parameter_dtype,
@@ -326,7 +334,7 @@ def _make_result_layout(
         coordinate_name: (
             dimension_name,
             coordinate_values,
-            measure_attrs(coordinate_name)
+            make_measure_attributes(coordinate_name)
             if coordinate_name in (*PARAMETER_NAMES, FRICTION_NAME)
             else {},
         )

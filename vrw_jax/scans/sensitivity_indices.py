@@ -16,7 +16,7 @@ import numpy as np
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.scans.design import SALTELLI_DESIGN_KIND
 from vrw_jax.scans.integrity import read_scan_manifest
-from vrw_jax.validation import check_names, check_type, suggest_name
+from vrw_jax.validation import check_names, check_type, format_name_suggestion
 from vrw_jax.wheel import Outcome
 
 
@@ -87,7 +87,7 @@ def sobol_indices(
         if measure_name not in scan or scan[measure_name].dims != ("sample",):
             raise ValueError(
                 f"{measure_name!r} is no measure of this "
-                f"scan{suggest_name(measure_name, map(str, scan))}: "
+                f"scan{format_name_suggestion(measure_name, map(str, scan))}: "
                 "ask for one that was scanned."
             )
     sobol_options = SobolOptions()
@@ -178,7 +178,8 @@ class _SobolIndexEstimator:
 
     def __call__(self, row_indices: np.ndarray) -> np.ndarray:
         """Return the indices from the rows with `row_indices`, shape (2, measures, parameters).
-        Indices of constant measures are 0."""
+        Indices of constant measures are 0.
+        """
         from scipy.stats import sobol_indices as compute_sobol_indices
 
         resampled_values = self.measure_values[..., row_indices]

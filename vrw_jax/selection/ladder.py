@@ -39,7 +39,7 @@ from vrw_jax.models import (
     replace_invalid_inputs,
 )
 from vrw_jax.numerics import Elementwise, RealInput, Scalar, StepOptions
-from vrw_jax.printing import AbstractPrintable, LabelAndText, describe_elements
+from vrw_jax.printing import AbstractPrintable, LabelAndText, map_text_of_elements
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_NAMES,
@@ -59,7 +59,7 @@ class ModelCode(enum.IntEnum):
 
 
 MODEL_SELECTION_MARGINS: dict[str, str] = {
-    name: MARGIN_MEASURES[name].violation
+    name: MARGIN_MEASURES[name].violation_text
     for name in (
         "fore_foot_force",
         "clearance_sls1",
@@ -133,7 +133,10 @@ class ModelChoice(AbstractPrintable):
             ]
         named_margins = zip(MODEL_SELECTION_MARGINS, np.asarray(self.margins), strict=True)
         margin_rows = [
-            (MARGIN_MEASURES[n].label, MARGIN_MEASURES[n].format_with_unit(margin_value))
+            (
+                MARGIN_MEASURES[n].label_with_symbol,
+                MARGIN_MEASURES[n].format_with_unit(margin_value),
+            )
             for n, margin_value in named_margins
         ]
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_rows]
@@ -152,7 +155,7 @@ class ModelChoice(AbstractPrintable):
     @property
     def why(self) -> Any:
         """Return the reason of the selection as one sentence; a batch has an array of sentences."""
-        return describe_elements(describe_selection_reason, self.reason_code)
+        return map_text_of_elements(describe_selection_reason, self.reason_code)
 
 
 def describe_selection_reason(reason_code: int) -> str:

@@ -22,7 +22,7 @@ from vrw_jax.contact import (
     walk_batch,
 )
 from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows
+from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
 from vrw_jax.simulation.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -62,7 +62,8 @@ def _walk_round_of_block(
     model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
 ) -> tuple[Array, Array]:
     """Return section states and outcomes of one round of steps from a block of starts, shape
-    (starts, steps, ...)."""
+    (starts, steps, ...).
+    """
     walk_one_round = lambda params, x: walk(params, x, n_steps, model=model, options=options)
     batch_walks = jax.vmap(walk_one_round)(params, x)
     return batch_walks.steps.section_state, batch_walks.steps.outcome
@@ -128,7 +129,7 @@ def walk_until_periodic(
     for k in range(n_rounds):
         round_slice = slice(1 + k * n_round_steps, 1 + (k + 1) * n_round_steps)
         round_arguments = (
-            take_rows(repeated_wheels, unsettled_walks),
+            select_tree_rows(repeated_wheels, unsettled_walks),
             state_history[unsettled_walks, k * n_round_steps],
         )
         round_states, step_outcomes = map(np.asarray, walk_one_round(*round_arguments))

@@ -1,5 +1,6 @@
 """Basins of attraction: for each start of a grid, the gait that a walk reaches, or the outcome of
-its failure."""
+its failure.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from vrw_jax.measures import (
     MEASURES,
     POST_LANDING_COMPONENT_NAMES,
     PRE_TOUCHDOWN_COMPONENT_NAMES,
-    measure_attrs,
-    provenance,
+    collect_provenance_attributes,
+    make_measure_attributes,
 )
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import EngineName, StepOptions
@@ -35,10 +36,10 @@ from vrw_jax.simulation.stepping import (
 )
 from vrw_jax.validation import (
     check_int,
-    check_not_traced,
     check_reals,
     check_type,
-    raise_for_renamed_arguments,
+    require_untraced_arguments,
+    with_renamed_arguments,
 )
 from vrw_jax.wheel import Outcome, WheelParams, transitions
 
@@ -47,7 +48,7 @@ StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 
 
 @with_default_jax_settings
-@raise_for_renamed_arguments(most_steps="max_steps", longest_period="max_period")
+@with_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,
     grid: StartGrid,
@@ -96,7 +97,7 @@ def basin(
         >>> basins.attractor.values.tolist()
         [0, 0]
     """
-    check_not_traced("vrw.basin", "map vrw.walk over the starts", params, options)
+    require_untraced_arguments("vrw.basin", "map vrw.walk over the starts", params, options)
     check_single_wheel(params, "compute one basin after the other")
     model = check_model(model).fallback_model  # The fallback model is valid for any start.
     options = check_step_options(options)
@@ -131,7 +132,9 @@ def basin(
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
         "outcome": xr.Variable(
-            grid_axis_names, walk_ends.outcome.reshape(grid_shape), measure_attrs("outcome")
+            grid_axis_names,
+            walk_ends.outcome.reshape(grid_shape),
+            make_measure_attributes("outcome"),
         ),
         "steps": xr.Variable(
             grid_axis_names,
@@ -145,7 +148,7 @@ def basin(
             component_values[component_name]
             if component_name in grid_axis_names
             else component_values[component_name][0],
-            dict(MEASURES[component_name].attrs),
+            dict(MEASURES[component_name].variable_attributes),
         )
         for component_name in component_names
     }
@@ -162,7 +165,7 @@ def basin(
     return xr.Dataset(
         walk_variables | orbit_variables,
         start_coordinates,
-        dataset_attributes | provenance(params, model, options),
+        dataset_attributes | collect_provenance_attributes(params, model, options),
     )
 
 
@@ -210,11 +213,11 @@ def invert_landing_map(params: WheelParams, post_landing_states: np.ndarray) -> 
 
     def invert_for_one_state(post_landing_state: jax.Array) -> jax.Array:
         touchdown_angle, post_landing_rate = post_landing_state[0] + s.alpha, post_landing_state[1]
-        unit_rate_landing = transitions.land(
+        unit_rate_landing = transitions.resolve_landing(
             s, touchdown_angle, jnp.ones_like(post_landing_rate), jnp.zeros_like(post_landing_rate)
         )
-        touchdown_rate = post_landing_rate / unit_rate_landing.motion.dtheta
-        is_admissible = unit_rate_landing.keeps_rear_foot & (touchdown_rate > 0.0)
+        touchdown_rate = post_landing_rate / unit_rate_landing.motion_after.dtheta
+        is_admissible = unit_rate_landing.is_rear_foot_planted & (touchdown_rate > 0.0)
         return jnp.where(
             is_admissible,
             jnp.stack([touchdown_angle, touchdown_rate, 0.0 * touchdown_rate]),
@@ -232,7 +235,8 @@ def _make_orbit_variables(
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
     """Return the dataset variables of the orbits: states, periods, DLS fractions and minimum
-    margins."""
+    margins.
+    """
     n_orbits = len(orbit_states)
     padded_orbit_states = np.full((n_orbits, max_period, model.section_size(params)), np.nan)
     margin_names = MARGIN_MEASURES if model.section_size(params) == 3 else ()
@@ -258,11 +262,13 @@ def _make_orbit_variables(
             {"units": "1", "long_name": "steps until the orbit repeats"},
         ),
         "orbit_dls_fraction": xr.Variable(
-            "attractor_index", dls_fractions, dict(MEASURES["dls_fraction"].attrs)
+            "attractor_index", dls_fractions, dict(MEASURES["dls_fraction"].variable_attributes)
         ),
         **{
             f"orbit_{margin_name}": xr.Variable(
-                "attractor_index", orbit_margins, dict(MARGIN_MEASURES[margin_name].attrs)
+                "attractor_index",
+                orbit_margins,
+                dict(MARGIN_MEASURES[margin_name].variable_attributes),
             )
             for margin_name, orbit_margins in min_margins.items()
         },
@@ -271,7 +277,8 @@ def _make_orbit_variables(
 
 def compute_walk_end_fractions(basins: xr.Dataset) -> dict[str, float]:
     """Return the fraction of starts for each kind of end: "attractor 0", ..., "unsettled", or the
-    name of an outcome."""
+    name of an outcome.
+    """
     attractor_indices = basins.attractor.values.ravel()
     outcome_codes = basins.outcome.values.ravel()
     end_names = [

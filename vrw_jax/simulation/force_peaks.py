@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.measures import FORCE_PEAK_MEASURES, measure_attrs
+from vrw_jax.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.validation import check_type
 
@@ -108,7 +108,7 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         measure_name: (
             "step",
             np.array([step_measures[measure_name] for step_measures in measures_by_step]),
-            measure_attrs(measure_name),
+            make_measure_attributes(measure_name),
         )
         for measure_name in SAMPLED_FORCE_PEAK_MEASURES
     }
@@ -118,9 +118,9 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
         step_indices, [len(step_extrema.time) for step_extrema in fore_extrema]
     )
     dataset_variables |= {
-        "force": ("extremum", all_extrema.force, measure_attrs("lambda_2")),
-        "force_time": ("extremum", all_extrema.time, measure_attrs("time")),
-        "force_step": ("extremum", extremum_steps, measure_attrs("step")),
+        "force": ("extremum", all_extrema.force, make_measure_attributes("lambda_2")),
+        "force_time": ("extremum", all_extrema.time, make_measure_attributes("time")),
+        "force_step": ("extremum", extremum_steps, make_measure_attributes("step")),
         "is_maximum": ("extremum", all_extrema.is_maximum, {"long_name": "whether a maximum"}),
     }
     return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
@@ -209,7 +209,8 @@ def _summarize_force_extrema(
     fore_extrema: _ForceExtrema, total_extrema: _ForceExtrema
 ) -> dict[str, Any]:
     """Return the force measures of one step, from the extrema of its fore force and its total
-    force."""
+    force.
+    """
     trough_depth = 0.0
     for i in np.flatnonzero(~fore_extrema.is_maximum):
         earlier_peak_forces, later_peak_forces = (

@@ -29,7 +29,7 @@ from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_ending,
+    describe_step_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
@@ -92,7 +92,7 @@ def check_single_wheel(params: Any, remedy: str) -> None:
     - `remedy`: end of the error message.
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    WheelParams.require_single(params, remedy)  # An unbound call is much faster.
+    WheelParams.require_single_wheel(params, remedy)  # An unbound call is much faster.
 
 
 def check_step_options(options: StepOptions | None) -> StepOptions:
@@ -104,14 +104,17 @@ def check_step_options(options: StepOptions | None) -> StepOptions:
         check_type(
             "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
         )
-        StepOptions.require_scalars(options)  # An unbound call is faster: binding takes 0.1 ms.
+        StepOptions.require_scalar_options(
+            options
+        )  # An unbound call is faster: binding takes 0.1 ms.
     return _make_default_step_options(jnp.result_type(float)) if options is None else options
 
 
 @functools.cache
 def _make_default_step_options(dtype: np.dtype) -> StepOptions:
     """Return the default options for a floating type. They are made once, and are concrete even
-    inside `jit`."""
+    inside `jit`.
+    """
     with jax.ensure_compile_time_eval():
         return StepOptions()
 
@@ -120,7 +123,8 @@ def check_section_state(
     x: Any, argument_description: str = "the section state", convert_state: Callable = check_reals
 ) -> Any:
     """Return the section state, converted by `convert_state`. Raise an error if the argument is no
-    section state."""
+    section state.
+    """
     return convert_state(
         argument_description,
         x,
@@ -324,7 +328,7 @@ class Walk(AbstractPrintable):
     @property
     def ending(self) -> Any:
         """Return how the walk ended, as a sentence; a batch has an array of sentences."""
-        return describe_ending(self.outcome, Outcome)
+        return describe_step_ending(self.outcome, Outcome)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts of outcome, steps, start, last state and time."""
@@ -354,7 +358,8 @@ def _walk_by_scan(
 
     def advance_one_step(state_and_outcome: tuple, step_ground: StepGroundValues | None) -> tuple:
         """Return the state and the outcome after one step, and the results of this step. No step is
-        taken after a failure."""
+        taken after a failure.
+        """
         x, outcome = state_and_outcome
         is_unfinished = outcome == Outcome.STEPPED
         model_and_params = (

@@ -27,7 +27,12 @@ from vrw_jax.contact import (
     potential_energy,
     unpack_state,
 )
-from vrw_jax.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_variables, provenance
+from vrw_jax.measures import (
+    CONTACT_MEASURES,
+    TRAJECTORY_MEASURES,
+    collect_provenance_attributes,
+    make_labeled_variables,
+)
 from vrw_jax.models import AbstractWheel, Trajectory, complete_line_slopes, split_slopes
 from vrw_jax.numerics import EngineName, StepOptions
 from vrw_jax.runtime import with_default_jax_settings
@@ -40,15 +45,15 @@ from vrw_jax.simulation.stepping import (
     split_stepwise_ground,
     validate_arguments,
 )
-from vrw_jax.validation import check_int, check_not_traced
+from vrw_jax.validation import check_int, require_untraced_arguments
 from vrw_jax.wheel import (
     Motion,
     Outcome,
     Symbols,
     WheelParams,
-    damping_power,
-    landing_direction,
-    rear_direction,
+    compute_damping_power,
+    rotate_to_landing_leg,
+    rotate_to_rear_leg,
 )
 
 
@@ -97,7 +102,7 @@ def simulate(
         >>> walk.lambda_2.attrs["units"], walk.attrs["outcome"]
         ('N', 'STEPPED')
     """
-    check_not_traced("vrw.simulate", "use vrw.walk", params, x)
+    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     params_with_all_slopes = params
     checked_model, params, stepwise_ground = split_stepwise_ground(params, model, n_steps)
@@ -130,7 +135,7 @@ def simulate(
         trajectory_spec, x, n_steps, float(s.Mt * s.g * s.sin_phi), ground_lines
     )
     sampled_columns = sampled_walk.sampled_columns
-    dataset_variables = make_variables(
+    dataset_variables = make_labeled_variables(
         {
             variable_name: sampled_columns[variable_name]
             for variable_name in trajectory_spec.variable_names
@@ -148,7 +153,9 @@ def simulate(
         "outcome_meaning": sampled_walk.outcome.meaning,
         "start": np.asarray(x).tolist(),
     }
-    provenance_attributes = trajectory_spec.dataset_attributes | provenance(params, model, options)
+    provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
+        params, model, options
+    )
     if ground_lines is not None:
         provenance_attributes |= {
             "frame": UNEVEN_GROUND_FRAME_TEXT,
@@ -181,7 +188,8 @@ class SampledStep(NamedTuple):
 
 class TrajectorySpecification(NamedTuple):
     """Description of how a trajectory is sampled: the sampling function of a model, and the
-    variables."""
+    variables.
+    """
 
     sample_step: Callable[[Array, int], SampledStep]  # of a section state and a step index
     variable_names: tuple[str, ...]  # names of the measures over time
@@ -319,7 +327,8 @@ def _compile_step_sampler(
     model: AbstractWheel, argument_structure: Any, n_samples: int
 ) -> Callable[..., Trajectory]:
     """Return the compiled function that samples a step. Its arguments are the section state and the
-    leaves of wheel and options."""
+    leaves of wheel and options.
+    """
 
     def sample_paper_step(x: Array, *leaves: Array) -> Trajectory:
         params, options = jax.tree.unflatten(argument_structure, leaves)
@@ -340,9 +349,13 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
     )
     foot_forces = np.moveaxis(np.asarray(trajectory.forces), -1, 0)
     wheel_motion = Motion.from_angle(theta, L1, L2, dtheta, dL1, dL2)
-    rear_leg_direction = rear_direction(s, wheel_motion.sin, wheel_motion.cos)
-    hub_x, hub_z, zeros = L1 * wheel_motion.sin, L1 * wheel_motion.cos, np.zeros_like(L1)
-    landing_leg_direction = landing_direction(s, wheel_motion.sin, wheel_motion.cos)
+    rear_leg_direction = rotate_to_rear_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
+    hub_x, hub_z, zeros = (
+        L1 * wheel_motion.sin_theta,
+        L1 * wheel_motion.cos_theta,
+        np.zeros_like(L1),
+    )
+    landing_leg_direction = rotate_to_landing_leg(s, wheel_motion.sin_theta, wheel_motion.cos_theta)
     return {
         "time": np.array(trajectory.time),
         "x": zeros,
@@ -360,7 +373,7 @@ def _make_phase_columns(s: Symbols, trajectory: Trajectory) -> dict[str, np.ndar
         "gravitational_energy": gravitational_energy,
         "elastic_energy": elastic_energy,
         "total_energy": kinetic_energy + gravitational_energy + elastic_energy,
-        "damping_power": damping_power(s, wheel_motion),
+        "damping_power": compute_damping_power(s, wheel_motion),
         "foot_1_x": zeros,
         "foot_1_z": zeros,
         "foot_2_x": hub_x - L2 * rear_leg_direction.sin,
@@ -444,7 +457,8 @@ def _compute_contact_columns(
     model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
 ) -> tuple[UnilateralTrajectory, dict[str, Array]]:
     """Return the trajectory of a step with unilateral contact, and its columns, shape (phase,
-    sample[, leg])."""
+    sample[, leg]).
+    """
     s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
     def compute_state_quantities(y: PackedState) -> dict[str, Array]:

@@ -12,7 +12,13 @@ from vrw_jax.batches import step_batch
 from vrw_jax.contact import UnilateralWheel
 from vrw_jax.cycles import make_finder, retry_from_walks
 from vrw_jax.models import RigidWheel, ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, take_rows, value_and_jacobian
+from vrw_jax.numerics import (
+    StepOptions,
+    batch_sizes,
+    evaluate_with_jacobian,
+    map_in_batches,
+    select_tree_rows,
+)
 from vrw_jax.tolerance.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -92,7 +98,8 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
         unsolved_indices
     ):  # One mesh for all elements makes the digits independent of the batch.
         limit_cycles = retry_from_walks(
-            cycle_finder, *jax.device_put(take_rows((params, limit_cycles), unsolved_indices))
+            cycle_finder,
+            *jax.device_put(select_tree_rows((params, limit_cycles), unsolved_indices)),
         )
         section_states[unsolved_indices] = limit_cycles.section_state
         search_outcomes[unsolved_indices] = limit_cycles.outcome
@@ -101,7 +108,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     (found_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)
     if not len(found_indices):
         return all_gaits
-    found_params = jax.device_put(take_rows(params, found_indices))
+    found_params = jax.device_put(select_tree_rows(params, found_indices))
     gait_step = step_batch(
         found_params,
         section_states[found_indices],
@@ -248,7 +255,7 @@ def _compute_rigid_gaits(params: WheelParams) -> tuple:
         (
             (next_section_state, step_length, step_duration),
             (return_map_jacobian, _, duration_jacobian),
-        ) = value_and_jacobian(take_rigid_step, section_state)
+        ) = evaluate_with_jacobian(take_rigid_step, section_state)
         return (
             section_state,
             next_section_state,

@@ -11,9 +11,9 @@ from vrw_jax.numerics import StatusCode
 from vrw_jax.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_elements,
-    describe_ending,
+    describe_step_ending,
     format_outcome_counts,
+    map_text_of_elements,
 )
 from vrw_jax.tolerance.lower_fidelity import MODEL_NAMES
 from vrw_jax.wheel import Outcome
@@ -139,12 +139,12 @@ class MeasureResult(AbstractPrintable):
         """Return how the search for the gait ended, as a sentence; for a batch, an array of
         sentences.
         """
-        return describe_ending(self.outcomes, Outcome)
+        return describe_step_ending(self.outcomes, Outcome)
 
     @property
     def why(self) -> Any:
         """Return why the model was selected, as a sentence; for a batch, an array of sentences."""
-        return describe_elements(
+        return map_text_of_elements(
             _describe_selection,
             self.models,
             self.statuses,
@@ -154,7 +154,7 @@ class MeasureResult(AbstractPrintable):
         )
 
     @property
-    def title(self) -> str:
+    def printed_heading(self) -> str:
         if self.models.ndim:
             milliseconds = _format_rounded_number(1e3 * self.seconds)
             return f"MeasureResult, {self.models.size} wheels, {milliseconds} ms"

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from vrw_jax.measures import MEASURES
-from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.numerics import StepOptions, select_tree_rows
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch
@@ -31,10 +31,10 @@ from vrw_jax.tolerance.tolerance_request import broadcast_params_and_friction, m
 from vrw_jax.validation import (
     check_choice,
     check_int,
-    check_known_name,
-    check_not_traced,
     check_positive,
     check_type,
+    require_known_name,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import WheelParams, convert_friction
 
@@ -177,11 +177,11 @@ def multifidelity_mean(
         >>> bool(mean.error < 1.1e-2)
         True
     """
-    check_not_traced(
+    require_untraced_arguments(
         "vrw.multifidelity_mean", "it on numbers, and give wheels as arrays", params, friction
     )
     check_type("measure", measure, str, "give the name of one, 'speed', say")
-    check_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     sampling_options, min_pilot_gaits = SAMPLING_OPTIONS, SAMPLING_OPTIONS.min_pilot_gaits
     tol = check_positive("tol", tol)
@@ -279,7 +279,7 @@ class _MeasuredWheels(NamedTuple):
 
     def take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
         """Return the wheels at these indices."""
-        return jax.device_put(take_rows(self.params, wheel_indices))
+        return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
     def measure_selected_wheels(
         self, wheel_indices: np.ndarray, measure_tolerance: float

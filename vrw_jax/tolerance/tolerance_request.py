@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
-from vrw_jax.numerics import StepOptions, take_rows
+from vrw_jax.numerics import StepOptions, select_tree_rows
 from vrw_jax.runtime import with_default_jax_settings
 from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch
 from vrw_jax.tolerance.lower_fidelity import (
@@ -36,11 +36,11 @@ from vrw_jax.tolerance.step_quantities import MEASURE_FUNCTIONS, evaluate_measur
 from vrw_jax.validation import (
     check_bool,
     check_choice,
-    check_known_name,
     check_names,
-    check_not_traced,
     check_positive,
     check_type,
+    require_known_name,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
@@ -117,12 +117,12 @@ def measure_to_tolerance(
         1.02 m/s True
     """
     start_seconds = time.perf_counter()
-    check_not_traced(
+    require_untraced_arguments(
         "vrw.measure_to_tolerance", "it on numbers, and give a batch as arrays", params, friction
     )
     measure_names = check_names("measures", measures)
     for measure_name in measure_names:
-        check_known_name(measure_name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+        require_known_name(measure_name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     if not measure_names:
         raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
     tol, relative = check_positive("tol", tol), check_bool("relative", relative)
@@ -318,7 +318,7 @@ class _MeasureRequest:
 
     def _take_wheels(self, wheel_indices: np.ndarray) -> WheelParams:
         """Return the wheels at these indices."""
-        return jax.device_put(take_rows(self.params, wheel_indices))
+        return jax.device_put(select_tree_rows(self.params, wheel_indices))
 
     def _correct_lower_gaits(self, wheel_indices: np.ndarray, continues_iteration: bool) -> None:
         """Take one step with unilateral contact from each lower gait, and record the accepted

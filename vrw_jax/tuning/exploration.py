@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.cycles import is_same_branch
-from vrw_jax.numerics import take_rows
+from vrw_jax.numerics import select_tree_rows
 from vrw_jax.runtime import lazy_import
 from vrw_jax.tuning.objective import GaitEvaluation, compute_max_violation, compute_slack_scales
 from vrw_jax.wheel import Outcome
@@ -63,7 +63,8 @@ class ExplorationResult(NamedTuple):
     @property
     def best_start_index(self) -> int:
         """Return the index of the start with the highest penalized objective, from which the
-        maximization continues."""
+        maximization continues.
+        """
         return int(np.nanargmax(self.penalized_objectives))
 
 
@@ -190,7 +191,8 @@ def _find_finite_evaluations(
     gait_evaluation: GaitEvaluation, free_indices: list[int]
 ) -> np.ndarray:
     """Return whether all values of each start, and their derivatives by the free parameters, are
-    finite."""
+    finite.
+    """
     free_jacobian = np.asarray(gait_evaluation.jacobian)[:, free_indices]
     return np.isfinite(gait_evaluation.values).all(-1) & np.isfinite(free_jacobian).all((-1, -2))
 
@@ -209,7 +211,8 @@ def _compute_slacks_and_jacobians(
     min_constraint_values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the slacks (starts, constraints), and their derivatives by the normalized parameters
-    (starts, constraints, free)."""
+    (starts, constraints, free).
+    """
     slack_jacobians = (
         np.swapaxes(np.asarray(gait_evaluation.jacobian)[:, free_indices, 1:], 1, 2) * bound_widths
     )
@@ -227,7 +230,10 @@ def _find_trials_on_branch(
         trial_evaluation.gait.branch_point,
     )
     point_pairs = (
-        (*take_rows((previous_points, trial_points), start_index), parameter_changes_of_start)
+        (
+            *select_tree_rows((previous_points, trial_points), start_index),
+            parameter_changes_of_start,
+        )
         for start_index, parameter_changes_of_start in enumerate(parameter_changes)
     )
     return np.array([is_same_branch(*point_pair) for point_pair in point_pairs])

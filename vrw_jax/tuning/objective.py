@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from vrw_jax.cycles import AbstractCycle, AbstractGaitFinder, Gait, default_margins
 from vrw_jax.models import AbstractStep
-from vrw_jax.validation import check_known_name, check_names, check_range, check_real, check_reals
+from vrw_jax.validation import check_names, check_range, check_real, check_reals, require_known_name
 from vrw_jax.wheel import WheelParams
 
 ObjectiveFunction = Callable[[AbstractCycle, AbstractStep], Array]
@@ -110,7 +110,7 @@ def parse_constraint_margins(
         # The take-off acceleration has a nonzero derivative if the clearance has none.
         constraint_margins.setdefault("takeoff_acceleration", 0.0)
     for measure_name in constraint_margins:
-        check_known_name(
+        require_known_name(
             measure_name.removeprefix(UPPER_BOUND_PREFIX),
             gait_finder.readable_measures,
             "measure for a constraint",
@@ -148,13 +148,15 @@ def _parse_constraint_bound(
 
 def restore_bound_sign(constraint_name: str, lower_bound: float) -> float:
     """Return a bound with the sign of its measure. A bound of a name with the upper-bound prefix
-    has the opposite sign."""
+    has the opposite sign.
+    """
     return float(-lower_bound if constraint_name.startswith(UPPER_BOUND_PREFIX) else lower_bound)
 
 
 def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
     """Return the scale of each slack, which is the change of the slack over one width of the
-    bounds."""
+    bounds.
+    """
     return np.maximum(
         np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks) + 1e-12
     )

@@ -32,10 +32,10 @@ from vrw_jax.cycles import (
 from vrw_jax.measures import (
     MARGIN_MEASURES,
     MEASURES,
-    flag_attrs,
+    collect_provenance_attributes,
     get_measure,
-    measure_attrs,
-    provenance,
+    make_flag_attributes,
+    make_measure_attributes,
 )
 from vrw_jax.numerics import StepOptions
 from vrw_jax.runtime import with_default_jax_settings
@@ -66,14 +66,14 @@ from vrw_jax.tuning.objective import (
 from vrw_jax.tuning.tune_result import ActiveConstraint, TuneResult, WalkValidation
 from vrw_jax.validation import (
     check_int,
-    check_known_name,
     check_names,
-    check_not_traced,
     check_positive,
     check_range,
     check_real,
     check_type,
     format_value,
+    require_known_name,
+    require_untraced_arguments,
 )
 from vrw_jax.wheel import (
     PARAMETER_DOMAINS,
@@ -164,7 +164,7 @@ def tune(
         >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
         CONVERGED 0.534 ['damping']
     """
-    check_not_traced("vrw.tune", "maximize by your own loop over vrw.limit_cycle", params)
+    require_untraced_arguments("vrw.tune", "maximize by your own loop over vrw.limit_cycle", params)
     max_evaluations = check_int("max_evaluations", max_evaluations)
     n_starts = check_int("n_starts", n_starts)
     tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
@@ -225,10 +225,11 @@ class TuneProblem:
     @property
     def constraint_names(self) -> tuple[str, ...]:
         """Return the name of each constrained number. A margin of the locked legs has one number
-        per leg."""
+        per leg.
+        """
         constraint_names: list[str] = []
         for measure_name in self.margins:
-            if get_measure(measure_name).dimension:
+            if get_measure(measure_name).leg_dimension:
                 constraint_names += [
                     f"{measure_name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)
                 ]
@@ -239,7 +240,8 @@ class TuneProblem:
     @property
     def min_constraint_values(self) -> np.ndarray:
         """Return the smallest allowed values of the constraints, in the order of
-        `constraint_names`."""
+        `constraint_names`.
+        """
         return np.array(
             [
                 self.margins[constraint_name.partition("[")[0]]
@@ -249,7 +251,8 @@ class TuneProblem:
 
     def denormalize_parameters(self, normalized_parameters: np.ndarray) -> np.ndarray:
         """Return the values of all float parameters. The free ones are given in widths of the
-        bounds above the lower bounds."""
+        bounds above the lower bounds.
+        """
         parameter_values = np.array(self.gait_finder.model.parameter_values(self.params))
         parameter_values[self.free_parameter_indices] = (
             self.lower_bounds + normalized_parameters * self.bound_widths
@@ -272,7 +275,8 @@ class TuneProblem:
 
     def evaluate_start(self, u: np.ndarray) -> EvaluatedTrial:
         """Return the trial at the normalized parameters `u`. Raise a ValueError if the trial is
-        unusable."""
+        unusable.
+        """
         start_trial = self.evaluate_trial(u, None)
         if not start_trial.has_gait_on_branch:
             raise ValueError(
@@ -295,7 +299,8 @@ class TuneProblem:
         self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
     ) -> EvaluatedTrial:
         """Return the trial at the normalized parameters. The search begins at the gait of
-        `neighbor_trial`, if given."""
+        `neighbor_trial`, if given.
+        """
         parameter_values = jnp.asarray(self.denormalize_parameters(normalized_parameters))
         neighbor_evaluation = None if neighbor_trial is None else neighbor_trial.gait_evaluation
         initial_guess = (
@@ -355,7 +360,8 @@ class TuneProblem:
 
     def explore_starts(self, n_starts: int, seed: int) -> ExplorationResult:
         """Return the ends of first-order steps from this wheel and from random wheels, all in one
-        batch."""
+        batch.
+        """
         random_starts = np.random.default_rng(seed).uniform(
             size=(n_starts - 1, len(self.free_parameters))
         )
@@ -388,7 +394,8 @@ class TuneProblem:
         self, normalized_parameters: np.ndarray, neighbor_evaluation: GaitEvaluation | None
     ) -> GaitEvaluation:
         """Return the gaits at rows of normalized parameters. The search begins at the gaits of
-        `neighbor_evaluation`, if given."""
+        `neighbor_evaluation`, if given.
+        """
         parameter_values = jnp.asarray(
             [self.denormalize_parameters(parameter_row) for parameter_row in normalized_parameters]
         )
@@ -548,7 +555,7 @@ class TuneProblem:
             parameter_name: (
                 evaluation_dimension,
                 parameter_values[:, parameter_index],
-                measure_attrs(parameter_name),
+                make_measure_attributes(parameter_name),
             )
             for parameter_index, parameter_name in enumerate(self.free_parameters)
         }
@@ -576,12 +583,12 @@ class TuneProblem:
             "kind": (
                 evaluation_dimension,
                 np.array(maximization_result.trial_kinds, int),
-                flag_attrs(trial_kind.name for trial_kind in TrialKind),
+                make_flag_attributes(trial_kind.name for trial_kind in TrialKind),
             ),
             "outcome": (
                 evaluation_dimension,
                 np.array(trial_outcomes, int),
-                measure_attrs("outcome"),
+                make_measure_attributes("outcome"),
             ),
             "on_branch": (
                 evaluation_dimension,
@@ -606,7 +613,7 @@ class TuneProblem:
             "upper": [float(parameter_bound) for parameter_bound in self.upper_bounds],
             "ending": maximization_result.status.name,
         }
-        provenance_attributes = provenance(
+        provenance_attributes = collect_provenance_attributes(
             self.params, self.gait_finder.model, self.gait_finder.step_options
         )
         return xr.Dataset(path_variables, path_coordinates, path_attributes | provenance_attributes)
@@ -703,9 +710,9 @@ def _parse_objective_function(
             'give a measure such as "dls_fraction".'
         )
     for measure_name, measure_weight in measure_weights.items():
-        check_known_name(measure_name, gait_finder.readable_measures, "measure for objective")
+        require_known_name(measure_name, gait_finder.readable_measures, "measure for objective")
         check_real(f"the weight of {measure_name}", measure_weight)
-        if MEASURES[measure_name].dimension:
+        if MEASURES[measure_name].leg_dimension:
             raise ValueError(
                 f"{measure_name} has one value for each locked leg, but an objective is one "
                 "number: "
@@ -749,7 +756,7 @@ def _check_parameter_bounds(
             f"the range of {parameter_name}", bounds[parameter_name]
         )
         for bound_value in (lower_bound, upper_bound):
-            if not PARAMETER_DOMAINS[parameter_name].contains(bound_value):
+            if not PARAMETER_DOMAINS[parameter_name].contains_value(bound_value):
                 raise ValueError(
                     f"the bounds of {parameter_name} reach {bound_value:g}, but "
                     f"{PARAMETER_DOMAINS[parameter_name].description} must lie "

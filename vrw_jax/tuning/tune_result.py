@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from vrw_jax.measures import MEASURES, get_measure
-from vrw_jax.printing import format_html_table, format_text
+from vrw_jax.printing import format_heading_and_rows, format_html_table
 from vrw_jax.runtime import xarray as xr
 from vrw_jax.tuning.exploration import ExplorationResult
 from vrw_jax.tuning.maximization import TuneStatus
@@ -137,7 +137,7 @@ class TuneResult:
         }
 
     def __repr__(self) -> str:
-        return format_text("TuneResult", self.describe().items())
+        return format_heading_and_rows("TuneResult", self.describe().items())
 
     def _repr_html_(self) -> str:
         return format_html_table("Tuned gait", self.describe().items())

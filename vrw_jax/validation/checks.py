@@ -20,22 +20,22 @@ from jaxtyping import Array
 MAX_INT64 = np.iinfo(np.int64).max
 """Largest accepted integer, chosen because arrays use 64-bit indices."""
 
-_fork_state = {"is_forked": False}
+_process_fork_state = {"is_forked": False}
 """Flag that states whether this process was forked after JAX had made an array."""
 
 
-def _record_process_fork() -> None:
-    """Record in a child process made by fork whether JAX's threads are missing."""
-    _fork_state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
+def _mark_process_as_forked() -> None:
+    """Record in a child process, made by fork, whether JAX's threads are missing."""
+    _process_fork_state["is_forked"] |= bool(xla_bridge.backends_are_initialized())
 
 
 if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    os.register_at_fork(after_in_child=_record_process_fork)
+    os.register_at_fork(after_in_child=_mark_process_as_forked)
 
 
 def raise_if_process_forked() -> None:
     """Raise a RuntimeError in a forked process, in which JAX would wait for missing threads."""
-    if _fork_state["is_forked"]:
+    if _process_fork_state["is_forked"]:
         raise RuntimeError(
             "this process was forked after JAX had made an array, and JAX's threads are not copied,"
             " so that it would wait for ever: start processes with "
@@ -43,25 +43,27 @@ def raise_if_process_forked() -> None:
         )
 
 
-def suggest_name(given_name: object, allowed_names: Iterable[str]) -> str:
-    """Return ' (did you mean ...?)' if a similar name is allowed, otherwise an empty text."""
-    close_matches = difflib.get_close_matches(str(given_name), list(allowed_names), n=1, cutoff=0.5)
-    return f" (did you mean '{close_matches[0]}'?)" if close_matches else ""
+def format_name_suggestion(given_name: object, allowed_names: Iterable[str]) -> str:
+    """Return ' (did you mean ...?)' if an allowed name is similar to the given one, otherwise
+    ''.
+    """
+    similar_names = difflib.get_close_matches(str(given_name), list(allowed_names), n=1, cutoff=0.5)
+    return f" (did you mean '{similar_names[0]}'?)" if similar_names else ""
 
 
-def check_known_name(given_name: Any, allowed_names: Sequence[str], name_kind: str) -> None:
-    """Raise a ValueError unless a name is among the allowed ones."""
+def require_known_name(given_name: Any, allowed_names: Sequence[str], name_kind: str) -> None:
+    """Raise a ValueError if a name is not among the allowed names."""
     if not isinstance(given_name, str) or given_name not in allowed_names:
-        allowed_text = ", ".join(allowed_names)
+        allowed_names_text = ", ".join(allowed_names)
         raise ValueError(
             f"{format_value(given_name)} is no "
-            f"{name_kind}{suggest_name(given_name, allowed_names)}: "
-            f"choose from {allowed_text}."
+            f"{name_kind}{format_name_suggestion(given_name, allowed_names)}: "
+            f"choose from {allowed_names_text}."
         )
 
 
 def format_value(given_value: object) -> str:
-    """Return a value as text for a message: its repr if that is short, otherwise its type."""
+    """Return the text of a value for a message: its repr if that is short, otherwise its type."""
     if isinstance(given_value, jax.Array | np.ndarray) and np.ndim(given_value):
         return f"an array of shape {np.shape(given_value)}"
     try:
@@ -79,7 +81,7 @@ def format_value(given_value: object) -> str:
 
 
 def _is_single_number(given_value: object) -> bool:
-    """Return whether a value is one real number. True and False are not numbers here."""
+    """Return whether a value is one real number. True and False do not count as numbers."""
     if isinstance(given_value, int) and not isinstance(given_value, bool):
         return True
     dtype_kind = (
@@ -96,8 +98,10 @@ def _is_single_number(given_value: object) -> bool:
 def check_int(
     argument_name: str, given_value: Any, min_value: int = 1, limit_reason: str = ""
 ) -> int:
-    """Return an integer of at least `min_value`. The clause `limit_reason` explains this limit in
-    the message."""
+    """Return an integer of at least `min_value`, or raise an error.
+
+    The clause `limit_reason` explains the limit in the message.
+    """
     raise_if_process_forked()
     is_single_number = _is_single_number(given_value) and not isinstance(
         given_value, jax.core.Tracer
@@ -122,7 +126,7 @@ def check_int(
 
 
 def check_real(argument_name: str, given_value: Any) -> float:
-    """Return one finite number as a float. Raise an error if the value is not one finite number."""
+    """Return one finite number as a float, or raise an error for any other value."""
     raise_if_process_forked()
     if not _is_single_number(given_value) or isinstance(given_value, jax.core.Tracer):
         raise TypeError(
@@ -141,9 +145,7 @@ def check_real(argument_name: str, given_value: Any) -> float:
 
 
 def check_positive(argument_name: str, given_value: Any) -> float:
-    """Return one positive number as a float. Raise an error if the value is not a positive
-    number.
-    """
+    """Return one positive number as a float, or raise an error for any other value."""
     if not check_real(argument_name, given_value) > 0.0:
         raise ValueError(
             f"{argument_name} is {float(given_value):g}, but it must be positive: give a number "
@@ -153,8 +155,9 @@ def check_positive(argument_name: str, given_value: Any) -> float:
 
 
 def check_range(argument_name: str, given_bounds: Any) -> tuple[float, float]:
-    """Return a lower and an upper bound as floats. Raise an error if the value does not have this
-    form."""
+    """Return a lower and an upper bound as floats, or raise an error if the value is no such
+    pair.
+    """
     try:
         lower_bound, upper_bound = given_bounds
     except (TypeError, ValueError):
@@ -178,9 +181,9 @@ def check_range(argument_name: str, given_bounds: Any) -> tuple[float, float]:
 def check_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> Array:
-    """Return real numbers of any shape as a strongly typed JAX array.
+    """Return real numbers of any shape as a strongly typed JAX array, or raise an error.
 
-    Python's numbers get JAX's default type.
+    Python numbers get JAX's default type.
     """
     raise_if_process_forked()
     try:
@@ -199,9 +202,10 @@ def check_reals(
             jax.devices()
         # A plugin raises an AssertionError if its device is missing.
         except (RuntimeError, AssertionError) as device_error:
-            requested_platforms = os.environ.get("JAX_PLATFORMS")
+            requested_jax_platforms = os.environ.get("JAX_PLATFORMS")
             raise OSError(
-                f"JAX_PLATFORMS is {requested_platforms!r}, but JAX finds no device of that kind: "
+                f"JAX_PLATFORMS is {requested_jax_platforms!r}, but JAX finds no device of that "
+                "kind: "
                 "unset it, or set it to cpu, before Python starts."
             ) from device_error
         real_array = None
@@ -221,7 +225,9 @@ def check_reals(
 def check_numpy_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """Return real numbers as a NumPy array. A valid NumPy array is returned unchanged."""
+    """Return real numbers as a NumPy array, or raise an error. A valid NumPy array is returned
+    unchanged.
+    """
     raise_if_process_forked()
     if isinstance(given_value, np.ndarray) and given_value.dtype == jax.dtypes.canonicalize_dtype(
         float
@@ -231,7 +237,7 @@ def check_numpy_reals(
 
 
 def check_bool(argument_name: str, given_value: Any) -> bool:
-    """Return a Python bool. Raise a TypeError if the value is not a bool."""
+    """Return a Python bool, or raise a TypeError for any other value."""
     raise_if_process_forked()
     if not isinstance(given_value, bool | np.bool_):
         raise TypeError(
@@ -242,7 +248,7 @@ def check_bool(argument_name: str, given_value: Any) -> bool:
 
 
 def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[str]) -> str:
-    """Return one of the allowed names. Raise an error if the value is not one of these."""
+    """Return a name that is one of `allowed_names`, or raise an error for any other value."""
     raise_if_process_forked()
     if not isinstance(given_value, str):
         raise TypeError(
@@ -251,7 +257,8 @@ def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[s
         )
     if given_value not in allowed_names:
         raise ValueError(
-            f"{argument_name} is {given_value!r}{suggest_name(given_value, allowed_names)}, but it "
+            f"{argument_name} is "
+            f"{given_value!r}{format_name_suggestion(given_value, allowed_names)}, but it "
             "must be one of "
             f"{', '.join(map(repr, allowed_names))}: choose among these."
         )
@@ -261,7 +268,9 @@ def check_choice(argument_name: str, given_value: Any, allowed_names: Sequence[s
 def check_names(
     argument_name: str, given_value: Any, example_text: str = '"dls_fraction"'
 ) -> tuple[str, ...]:
-    """Return several names as a tuple. A single name may be given as a string."""
+    """Return several names as a tuple, or raise an error. A single name may be given as a
+    string.
+    """
     raise_if_process_forked()
     try:
         given_names = (given_value,) if isinstance(given_value, str) else tuple(given_value)
@@ -276,23 +285,23 @@ def check_names(
 
 
 def check_type(
-    argument_name: str, given_value: Any, expected_type: type | tuple[type, ...], remedy_text: str
+    argument_name: str, given_value: Any, expected_types: type | tuple[type, ...], remedy_text: str
 ) -> None:
-    """Raise a TypeError unless a value has the expected type."""
+    """Raise a TypeError if a value does not have the expected type."""
     raise_if_process_forked()
-    if not isinstance(given_value, expected_type):
-        type_name = (
-            expected_type[0] if isinstance(expected_type, tuple) else expected_type
+    if not isinstance(given_value, expected_types):
+        expected_type_name = (
+            expected_types[0] if isinstance(expected_types, tuple) else expected_types
         ).__name__
-        article = "an" if type_name[0] in "AEIOU" else "a"
+        indefinite_article = "an" if expected_type_name[0] in "AEIOU" else "a"
         raise TypeError(
-            f"{argument_name} is {format_value(given_value)}, but it must be {article} "
-            f"{type_name}: {remedy_text}."
+            f"{argument_name} is {format_value(given_value)}, but it must be {indefinite_article} "
+            f"{expected_type_name}: {remedy_text}."
         )
 
 
 def check_path(argument_name: str, given_value: Any, remedy_text: str) -> None:
-    """Raise an error unless a value is a path that the file system can encode."""
+    """Raise an error if a value is not a path that the file system can encode."""
     check_type(argument_name, given_value, (str, Path), remedy_text)
     try:
         os.fsencode(given_value)
@@ -304,7 +313,7 @@ def check_path(argument_name: str, given_value: Any, remedy_text: str) -> None:
 
 
 def check_callable(argument_name: str, given_value: Any, function_description: str) -> None:
-    """Raise a TypeError unless a value is callable."""
+    """Raise a TypeError if a value is not callable."""
     if not callable(given_value):
         raise TypeError(
             f"{argument_name} is {format_value(given_value)}, but it must be a function: give one "
@@ -312,16 +321,24 @@ def check_callable(argument_name: str, given_value: Any, function_description: s
         )
 
 
-def is_traced(*argument_trees: Any) -> bool:
-    """Return whether any leaf is a tracer, as inside `jit`, `vmap` or `grad`."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(argument_trees))
+def has_traced_leaf(*argument_trees: Any) -> bool:
+    """Return whether any leaf of the trees is a tracer, as inside `jit`, `vmap` or `grad`."""
+    return any(
+        isinstance(argument_leaf, jax.core.Tracer)
+        for argument_leaf in jax.tree.leaves(argument_trees)
+    )
 
 
-def check_not_traced(function_name: str, alternative_text: str, *argument_trees: Any) -> None:
-    """Raise a TypeError inside `jit`, `vmap` or `grad`, on behalf of a function that needs concrete
-    values."""
+def require_untraced_arguments(
+    function_name: str, alternative_text: str, *argument_trees: Any
+) -> None:
+    """Raise a TypeError if an argument of the function `function_name` is traced.
+
+    The function needs concrete values, which `jit`, `vmap` and `grad` do not provide.
+    `alternative_text` states what to use instead.
+    """
     raise_if_process_forked()
-    if is_traced(*argument_trees):
+    if has_traced_leaf(*argument_trees):
         raise TypeError(
             f"{function_name} is called inside jit, vmap or grad, but it runs on known numbers: "
             "call it "

@@ -1,12 +1,10 @@
-"""Public names of version 0.1. The use of such a name raises an error that states the present
-name.
-"""
+"""Public names of version 0.1. Each raises an error that states the present name."""
 
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-RENAMED_PACKAGE_NAMES = {
+PRESENT_PACKAGE_NAME_BY_OLD_NAME = {
     "Answer": "MeasureResult",
     "Average": "MultifidelityMean",
     "Border": "SpecialPoint",
@@ -25,7 +23,7 @@ RENAMED_PACKAGE_NAMES = {
 }
 """Present names in `vrw_jax` by old name."""
 
-RENAMED_NUMERICS_NAMES = {
+PRESENT_NUMERICS_NAME_BY_OLD_NAME = {
     "AbstractFollowed": "vrw_jax.continuation.AbstractContinuationProblem",
     "Answers": "vrw_jax.hybrid.LCPStatus",
     "Guard": "vrw_jax.hybrid.Guard",
@@ -48,11 +46,13 @@ RENAMED_NUMERICS_NAMES = {
 
 
 def raise_for_missing_numerics_name(missing_name: str) -> Any:
-    """Raise the AttributeError for a name that `vrw_jax.numerics` does not have, with the present
-    name if it was renamed."""
+    """Raise the AttributeError for a name that `vrw_jax.numerics` does not have.
+
+    If the name was renamed, the message states the present name.
+    """
     renaming_hint = (
-        f": it is called {RENAMED_NUMERICS_NAMES[missing_name]} now"
-        if missing_name in RENAMED_NUMERICS_NAMES
+        f": it is called {PRESENT_NUMERICS_NAME_BY_OLD_NAME[missing_name]} now"
+        if missing_name in PRESENT_NUMERICS_NAME_BY_OLD_NAME
         else ""
     )
     raise AttributeError(f"vrw_jax.numerics has no {missing_name!r}{renaming_hint}.")
@@ -62,48 +62,50 @@ FunctionType = TypeVar("FunctionType", bound=Callable)
 
 
 def describe_renamed_attribute(
-    module_name: str, attribute_name: str, new_name_by_old: Mapping[str, str]
+    module_name: str, attribute_name: str, present_name_by_old_name: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence with the present name of a renamed attribute, or None if it was not
-    renamed."""
-    if attribute_name not in new_name_by_old:
+    """Return a sentence that states the present name of a renamed attribute, or None for other
+    names.
+    """
+    if attribute_name not in present_name_by_old_name:
         return None
-    present_name = new_name_by_old[attribute_name]
+    present_name = present_name_by_old_name[attribute_name]
     return f"{module_name} has no {attribute_name!r}: it is called {present_name} now."
 
 
-def raise_for_renamed_arguments(
-    **new_name_by_old_name: str,
+def with_renamed_arguments(
+    **present_name_by_old_name: str,
 ) -> Callable[[FunctionType], FunctionType]:
     """Return a decorator with which old keyword arguments of a function or class raise a TypeError.
 
-    `new_name_by_old_name` maps old names to the present ones. The message states the present name.
+    `present_name_by_old_name` maps old names to the present ones. The message states the present
+    name.
     """
 
-    def reject_renamed_keywords(owner_name: str, given_keywords: Mapping[str, Any]) -> None:
-        for old_name in new_name_by_old_name.keys() & given_keywords.keys():
+    def reject_renamed_keywords(callable_name: str, given_keywords: Mapping[str, Any]) -> None:
+        for old_name in present_name_by_old_name.keys() & given_keywords.keys():
             raise TypeError(
-                f"{owner_name} has no argument {old_name!r}: it is called "
-                f"{new_name_by_old_name[old_name]} now."
+                f"{callable_name} has no argument {old_name!r}: it is called "
+                f"{present_name_by_old_name[old_name]} now."
             )
 
-    def decorate_with_check(decorated_object: Any) -> Any:
+    def reject_old_names_of(decorated_object: Any) -> Any:
         if isinstance(decorated_object, type):
-            original_init = decorated_object.__init__  # type: ignore[misc]
+            undecorated_init = decorated_object.__init__  # type: ignore[misc]
 
-            @functools.wraps(original_init)
-            def initialize_checked(self: Any, *args: Any, **keywords: Any) -> None:
+            @functools.wraps(undecorated_init)
+            def initialize_with_present_names(self: Any, *args: Any, **keywords: Any) -> None:
                 reject_renamed_keywords(decorated_object.__name__, keywords)
-                original_init(self, *args, **keywords)
+                undecorated_init(self, *args, **keywords)
 
-            decorated_object.__init__ = initialize_checked  # type: ignore[misc]
+            decorated_object.__init__ = initialize_with_present_names  # type: ignore[misc]
             return decorated_object
 
         @functools.wraps(decorated_object)
-        def call_checked(*args: Any, **keywords: Any) -> Any:
+        def call_with_present_names(*args: Any, **keywords: Any) -> Any:
             reject_renamed_keywords(decorated_object.__name__, keywords)
             return decorated_object(*args, **keywords)
 
-        return call_checked
+        return call_with_present_names
 
-    return decorate_with_check
+    return reject_old_names_of

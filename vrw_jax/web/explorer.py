@@ -10,9 +10,9 @@ from vrw_jax.selection import list_model_config_names
 from vrw_jax.validation import (
     check_choice,
     check_int,
-    check_not_traced,
     check_type,
-    raise_for_renamed_arguments,
+    require_untraced_arguments,
+    with_renamed_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
 
@@ -90,7 +90,7 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
     return find_wheel_page().as_uri() + (f"#{urlencode(changed_values)}" if changed_values else "")
 
 
-@raise_for_renamed_arguments(rung="model_name")
+@with_renamed_arguments(rung="model_name")
 def explore(
     params: WheelParams | None = None,
     *,
@@ -129,8 +129,8 @@ def explore(
     """
     params = WheelParams() if params is None else params
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    check_not_traced("vrw.explore", "it shows one known wheel", params)
-    params.require_single("show one after the other")
+    require_untraced_arguments("vrw.explore", "it shows one known wheel", params)
+    params.require_single_wheel("show one after the other")
     page_map = {} if dataset is None else _make_page_map(dataset)
     return _make_widget_class()(
         page=find_wheel_page().read_text(encoding="utf-8"),

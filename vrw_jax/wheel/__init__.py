@@ -1,14 +1,14 @@
 """Wheel parameters, geometry, dynamics, phases, transitions and outcomes."""
 
 from vrw_jax.wheel import dynamics, geometry, transitions
-from vrw_jax.wheel.dynamics import damping_power, mass_matrix, momentum
+from vrw_jax.wheel.dynamics import compute_damping_power, compute_mass_matrix, compute_momentum
 from vrw_jax.wheel.geometry import (
     Motion,
-    landing_direction,
-    landing_foot_height,
-    length_at_touchdown,
-    rear_direction,
-    rear_foot_height,
+    compute_landing_foot_height,
+    compute_length_at_touchdown,
+    compute_rear_foot_height,
+    rotate_to_landing_leg,
+    rotate_to_rear_leg,
 )
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
@@ -23,10 +23,10 @@ from vrw_jax.wheel.params import (
     check_parameter_name,
     compute_symbols,
     convert_friction,
-    refuse_symbol,
+    make_wheel_from_parameters,
+    raise_for_parameter_symbol,
     require_known_friction,
     stack_parameters,
-    wheel_from_parameters,
 )
 from vrw_jax.wheel.phases import (
     PAPER_PHASES,
@@ -36,7 +36,7 @@ from vrw_jax.wheel.phases import (
     PhaseMargins,
     make_phases,
 )
-from vrw_jax.wheel.rest import is_at_rest, is_still, replace_rest_outcome
+from vrw_jax.wheel.rest import are_coordinates_at_rest, are_rates_negligible, replace_rest_outcome
 from vrw_jax.wheel.transitions import Landing
 from vrw_jax.wheel.units import (
     WheelUnits,

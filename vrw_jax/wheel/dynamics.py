@@ -1,11 +1,11 @@
 """Accelerations of the wheel in each phase, and the forces of ground and stoppers.
 
 With the foot of Leg 1 at rest the wheel has the coordinates (theta, L1, L2). Written with the hub's
-velocity in the frame of Leg 1, the mass matrix does not depend on theta. Every phase follows from
-one set of `equation_terms`. Double support restricts these equations to the circle of the hub, with
-one degree of freedom. Single support I solves all three equations. Single support II drops L2 and
-has two degrees of freedom. The constraints of eq. (2) hold by construction. The page
-docs/explanation/physics.md derives every line.
+velocity in the frame of Leg 1, the mass matrix does not depend on theta. The equations of motion of
+every phase follow from `compute_equation_terms`. Double support restricts these equations to the
+circle of the hub, with one degree of freedom. Single support I solves all three equations. Single
+support II drops L2 and has two degrees of freedom. The constraints of eq. (2) hold by construction.
+The page docs/explanation/physics.md contains the derivations.
 """
 
 from typing import NamedTuple
@@ -18,14 +18,14 @@ from vrw_jax.numerics import Elementwise, Vector
 from vrw_jax.wheel.geometry import (
     DoubleSupportCircle,
     Motion,
-    double_support_circle,
-    rear_direction,
+    compute_double_support_circle,
+    rotate_to_rear_leg,
 )
 from vrw_jax.wheel.params import Symbols
 
 
 class Acceleration(NamedTuple):
-    """Second derivatives of (theta, L1, L2)."""
+    """Second time derivatives of (theta, L1, L2)."""
 
     ddtheta: Elementwise  # rad/s^2
     ddL1: Elementwise  # m/s^2
@@ -33,7 +33,7 @@ class Acceleration(NamedTuple):
 
 
 class MassMatrix(NamedTuple):
-    """Symmetric mass matrix over (theta, L1, L2); M22, M33 and M23 are constants."""
+    """Symmetric mass matrix over (theta, L1, L2), of which M22, M33 and M23 are constants."""
 
     M11: Elementwise  # kg m^2
     M12: Elementwise  # kg m
@@ -42,8 +42,10 @@ class MassMatrix(NamedTuple):
     M23: Elementwise  # kg
     M33: Elementwise  # kg
 
-    def multiply(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
-        """Return the product of the mass matrix and the vector x."""
+    def multiply_vector(self, x: tuple[Elementwise, Elementwise, Elementwise]) -> Vector:
+        """Return the product of the mass matrix and a vector with components along theta, L1 and
+        L2.
+        """
         return (
             self.M11 * x[0] + self.M12 * x[1] + self.M13 * x[2],
             self.M12 * x[0] + self.M22 * x[1] + self.M23 * x[2],
@@ -52,21 +54,21 @@ class MassMatrix(NamedTuple):
 
 
 class EquationTerms(NamedTuple):
-    """Mass matrix and the applied forces f of M q'' = f + constraint forces (eq. 1)."""
+    """Mass matrix M and applied forces f of the equation M q'' = f + constraint forces (eq. 1)."""
 
-    mass: MassMatrix
-    f1: Elementwise  # N m, along theta
-    f2: Elementwise  # N, along L1
-    f3: Elementwise  # N, along L2
+    mass_matrix: MassMatrix
+    applied_moment_theta: Elementwise  # N m, along theta
+    applied_force_L1: Elementwise  # N, along L1
+    applied_force_L2: Elementwise  # N, along L2
 
 
-def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
+def compute_mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
     """Return the mass matrix M(q) of eq. (1), restricted to a planted Leg 1."""
-    b, coupling_moment = L2 - s.a, _coupling_moment(s, L2)
+    b, hub_fixed_mass_moment = L2 - s.a, _compute_hub_fixed_mass_moment(s, L2)
     # This sum is grouped first, because it depends on parameters only.
     constant_inertia = s.m * (s.a * s.a + (s.n - 2) * s.c0 * s.c0)
     return MassMatrix(
-        M11=L1 * (s.Mh * L1 + 2.0 * coupling_moment) + (constant_inertia + s.m * b * b),
+        M11=L1 * (s.Mh * L1 + 2.0 * hub_fixed_mass_moment) + (constant_inertia + s.m * b * b),
         M12=s.m * s.sin_alpha * (L2 - s.L0),
         M13=-s.m * s.sin_alpha * L1,
         M22=s.Mh,
@@ -75,26 +77,26 @@ def mass_matrix(s: Symbols, L1: Elementwise, L2: Elementwise) -> MassMatrix:
     )
 
 
-def _coupling_moment(s: Symbols, L2: Elementwise) -> Elementwise:
-    """Return the moment of mass that turns with the hub, kg m."""
+def _compute_hub_fixed_mass_moment(s: Symbols, L2: Elementwise) -> Elementwise:
+    """Return the first moment of the mass that turns with the hub, kg m."""
     return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
-def equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
+def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     """Return the mass matrix and the applied forces at a motion.
 
-    The forces are gravity, springs and dampers (eq. 3) and the inertial forces.
+    The applied forces are gravity, springs and dampers (eq. 3) and the inertial forces.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
-    mass = mass_matrix(s, L1, L2)
-    sin_from_vertical = sin * s.cos_phi + cos * s.sin_phi  # angle theta + phi
-    cos_from_vertical = cos * s.cos_phi - sin * s.sin_phi
-    rear_sin_from_vertical = (
-        sin_from_vertical * s.cos_alpha + cos_from_vertical * s.sin_alpha
+    mass = compute_mass_matrix(s, L1, L2)
+    sin_theta_plus_phi = sin * s.cos_phi + cos * s.sin_phi  # angle theta + phi
+    cos_theta_plus_phi = cos * s.cos_phi - sin * s.sin_phi
+    sin_rear_leg_plus_phi = (
+        sin_theta_plus_phi * s.cos_alpha + cos_theta_plus_phi * s.sin_alpha
     )  # angle theta + alpha + phi
-    rear_cos_from_vertical = cos_from_vertical * s.cos_alpha - sin_from_vertical * s.sin_alpha
-    P1 = s.Mh * L1 + _coupling_moment(s, L2)  # half dM11/dL1
-    P2 = s.m * (L2 - s.a) - s.m * s.cos_alpha * L1  # half dM11/dL2
+    cos_rear_leg_plus_phi = cos_theta_plus_phi * s.cos_alpha - sin_theta_plus_phi * s.sin_alpha
+    half_dM11_dL1 = s.Mh * L1 + _compute_hub_fixed_mass_moment(s, L2)  # half dM11/dL1
+    half_dM11_dL2 = s.m * (L2 - s.a) - s.m * s.cos_alpha * L1  # half dM11/dL2
     coriolis_factor = 2.0 * s.m * s.sin_alpha * dtheta
     fore_gravity_moment, rear_gravity_moment = (
         s.g * s.m * s.L0 + s.g * s.Mh * L1,
@@ -102,33 +104,33 @@ def equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     )
     spring_preload = s.k * s.Ls
     return EquationTerms(
-        mass=mass,
-        f1=fore_gravity_moment * sin_from_vertical
-        + rear_gravity_moment * rear_sin_from_vertical
-        - 2.0 * (P1 * dL1 + P2 * dL2) * dtheta,
-        f2=(spring_preload - s.k * L1)
+        mass_matrix=mass,
+        applied_moment_theta=fore_gravity_moment * sin_theta_plus_phi
+        + rear_gravity_moment * sin_rear_leg_plus_phi
+        - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta,
+        applied_force_L1=(spring_preload - s.k * L1)
         - s.c * dL1
-        + P1 * dtheta * dtheta
+        + half_dM11_dL1 * dtheta * dtheta
         - coriolis_factor * dL2
-        - s.g * s.Mh * cos_from_vertical,
-        f3=(spring_preload - s.k * L2)
+        - s.g * s.Mh * cos_theta_plus_phi,
+        applied_force_L2=(spring_preload - s.k * L2)
         - s.c * dL2
-        + P2 * dtheta * dtheta
+        + half_dM11_dL2 * dtheta * dtheta
         + coriolis_factor * dL1
-        + s.g * s.m * rear_cos_from_vertical,
+        + s.g * s.m * cos_rear_leg_plus_phi,
     )
 
 
-def single_support_1_acceleration(s: Symbols, motion: Motion) -> Acceleration:
-    """Return the accelerations in SLS-I (Section 3.3.2), with three degrees of freedom.
+def solve_single_support_1(s: Symbols, motion: Motion) -> Acceleration:
+    """Return the accelerations in SLS-I, which has three degrees of freedom (Section 3.3.2).
 
-    The foot of Leg 2 is in the air, and its length is free.
+    The foot of Leg 2 is in the air, and the length of Leg 2 is free.
     """
-    return free_acceleration(s, motion.L1, equation_terms(s, motion))
+    return solve_unconstrained_dynamics(s, motion.L1, compute_equation_terms(s, motion))
 
 
-def free_acceleration(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acceleration:
-    """Return the accelerations due to the applied forces alone, M q'' = f, with foot 1 at rest."""
+def solve_unconstrained_dynamics(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acceleration:
+    """Return the accelerations q'' with M q'' = f, for which only foot 1 is held."""
     M, f1, f2, f3 = terms
     q = s.sin_alpha * L1  # L2 is eliminated: its row of M is m (-q, -cos alpha, 1).
     A11 = M.M11 + M.M13 * q
@@ -143,106 +145,118 @@ def free_acceleration(s: Symbols, L1: Elementwise, terms: EquationTerms) -> Acce
     return Acceleration(ddtheta, ddL1, f3 * inverse_leg_mass + q * ddtheta + s.cos_alpha * ddL1)
 
 
-def takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
+def compute_takeoff_acceleration(s: Symbols, motion: Motion) -> Elementwise:
     """Return the normal acceleration of foot 2 at the start `motion` of SLS-I, m/s^2.
 
-    Foot 2 is at rest on the ground at that instant. The foot rises if the value is positive and
-    scuffs if the value is negative. The jump from zero is the effect of the lost tangential force
-    of the ground. The value is smooth at the boundary of scuffing. The clearance is the lowest
-    later height, which is not smooth. On one side, the clearance vanishes with the cube of the
-    distance to the boundary. On the other side, the clearance jumps.
+    Foot 2 is at rest on the ground at that instant. The foot rises if the acceleration is positive
+    and scuffs if the acceleration is negative. The acceleration jumps from zero because the
+    tangential force of the ground vanishes. It is smooth at the boundary of scuffing. The
+    clearance, which is the smallest later height of the foot, is not smooth there. On one side of
+    the boundary, the clearance vanishes with the cube of the distance to the boundary. On the other
+    side, the clearance jumps.
     """
     L1, L2, dtheta = motion.L1, motion.L2, motion.dtheta
-    ddtheta, ddL1, ddL2 = single_support_1_acceleration(s, motion)
-    rear_leg = rear_direction(s, motion.sin, motion.cos)
-    radial_difference = (ddL1 - L1 * dtheta**2) * motion.cos - (
+    ddtheta, ddL1, ddL2 = solve_single_support_1(s, motion)
+    rear_leg = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
+    radial_acceleration_difference = (ddL1 - L1 * dtheta**2) * motion.cos_theta - (
         ddL2 - L2 * dtheta**2
     ) * rear_leg.cos
     tangential_acceleration_1 = 2.0 * motion.dL1 * dtheta + L1 * ddtheta
     tangential_acceleration_2 = 2.0 * motion.dL2 * dtheta + L2 * ddtheta
     return (
-        radial_difference
-        - tangential_acceleration_1 * motion.sin
+        radial_acceleration_difference
+        - tangential_acceleration_1 * motion.sin_theta
         + tangential_acceleration_2 * rear_leg.sin
     )
 
 
-def single_support_2_acceleration(s: Symbols, motion: Motion) -> Acceleration:
-    """Return the accelerations in SLS-II (Section 3.3.3), with two degrees of freedom.
+def solve_single_support_2(s: Symbols, motion: Motion) -> Acceleration:
+    """Return the accelerations in SLS-II, which has two degrees of freedom (Section 3.3.3).
 
     Leg 2 is on its stopper, and M12 = 0.
     """
-    M, f1, f2, _ = equation_terms(s, motion)
+    M, f1, f2, _ = compute_equation_terms(s, motion)
     inverse_mass = 1.0 / M.M22
     return Acceleration(f1 / M.M11, f2 * inverse_mass, 0.0 * f1)
 
 
 class SingleDofEquation(NamedTuple):
-    """Equation of motion of a single degree of freedom: inertia * ddtheta = force."""
+    """Equation of motion with one degree of freedom: inertia_factor * ddtheta =
+    generalized_force.
+    """
 
-    inertia: Elementwise  # kg m^2
-    force: Elementwise  # N m
+    inertia_factor: Elementwise  # kg m^2
+    generalized_force: Elementwise  # N m
 
 
-def double_support_equation(s: Symbols, distance: Elementwise, motion: Motion) -> SingleDofEquation:
+def compute_double_support_equation(
+    s: Symbols, foot_distance: Elementwise, motion: Motion
+) -> SingleDofEquation:
     """Return the equation of motion in DLS, where the hub moves on a circle (Section 3.3.1).
 
-    The equation is that of `equation_terms` restricted to the circle. The bisector of both legs has
-    a sine and cosine proportional to the sums of those of the legs. As a function of the bisector,
-    every term is a trigonometric polynomial whose coefficients depend on the wheel only. This
-    halves the work of the restriction.
+    The equation is that of `compute_equation_terms`, restricted to the circle. The sine and cosine
+    of the bisector of both legs are proportional to the sums of the legs' sines and cosines. As a
+    function of the bisector, every term is a trigonometric polynomial with coefficients that depend
+    only on the wheel. This form halves the cost of the restriction.
     """
-    # `diameter` is the diameter of the circle.
-    diameter, bisector_factor = distance / s.sin_alpha, 1.0 / (1.0 + s.cos_alpha)
-    weight_factor, swing_inertia = s.g * (s.Mh - s.m) * diameter, s.m * s.c0 * diameter
+    hub_circle_diameter, squared_bisector_factor = (
+        foot_distance / s.sin_alpha,
+        1.0 / (1.0 + s.cos_alpha),
+    )
+    weight_factor, sin_squared_rate_coefficient = (
+        s.g * (s.Mh - s.m) * hub_circle_diameter,
+        s.m * s.c0 * hub_circle_diameter,
+    )
     leg_weight_moment, spring_factor, damping_factor = (
         s.g * s.m * s.L0,
-        s.k * diameter,
-        s.c * diameter * diameter,
+        s.k * hub_circle_diameter,
+        s.c * hub_circle_diameter * hub_circle_diameter,
     )
-    constant_inertia = diameter * diameter * (s.Mh - s.m) + s.m * (
+    constant_inertia = hub_circle_diameter * hub_circle_diameter * (s.Mh - s.m) + s.m * (
         2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0
     )
     sin_coefficient = leg_weight_moment * s.cos_phi - s.Ls * spring_factor
-    sin_cos_coefficient = bisector_factor * (
-        s.cos_alpha * diameter * spring_factor + weight_factor * s.cos_phi
+    sin_cos_coefficient = squared_bisector_factor * (
+        s.cos_alpha * hub_circle_diameter * spring_factor + weight_factor * s.cos_phi
     )
-    sin_squared_coefficient = -bisector_factor * weight_factor * s.sin_phi
+    sin_squared_coefficient = -squared_bisector_factor * weight_factor * s.sin_phi
 
-    rear_leg, dtheta = rear_direction(s, motion.sin, motion.cos), motion.dtheta
-    sin, cos = motion.sin + rear_leg.sin, motion.cos + rear_leg.cos
-    sin_torque = (
+    rear_leg, dtheta = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta), motion.dtheta
+    sin, cos = motion.sin_theta + rear_leg.sin, motion.cos_theta + rear_leg.cos
+    sin_torque_factor = (
         sin_coefficient
         + sin_cos_coefficient * cos
         + sin_squared_coefficient * sin
-        + swing_inertia * dtheta * dtheta
+        + sin_squared_rate_coefficient * dtheta * dtheta
     )
     slope_torque = weight_factor * s.sin_phi + leg_weight_moment * s.sin_phi * cos
     damping_coefficient = (
         1.0 - s.cos_alpha
-    ) * damping_factor + bisector_factor * s.cos_alpha * damping_factor * (sin * sin)
+    ) * damping_factor + squared_bisector_factor * s.cos_alpha * damping_factor * (sin * sin)
     return SingleDofEquation(
-        constant_inertia + 2.0 * swing_inertia * cos,
-        slope_torque + sin * sin_torque - damping_coefficient * dtheta,
+        constant_inertia + 2.0 * sin_squared_rate_coefficient * cos,
+        slope_torque + sin * sin_torque_factor - damping_coefficient * dtheta,
     )
 
 
-def double_support_acceleration(s: Symbols, distance: Elementwise, motion: Motion) -> Acceleration:
-    """Return all accelerations in DLS, from `double_support_equation`."""
-    inertia, force = double_support_equation(s, distance, motion)
-    circle = double_support_circle(s, distance, motion.sin, motion.cos)
-    return accelerations_on_circle(circle, motion.dtheta, force / inertia)
+def solve_double_support(s: Symbols, foot_distance: Elementwise, motion: Motion) -> Acceleration:
+    """Return the accelerations of (theta, L1, L2) in DLS, from
+    `compute_double_support_equation`.
+    """
+    inertia, force = compute_double_support_equation(s, foot_distance, motion)
+    hub_circle = compute_double_support_circle(s, foot_distance, motion.sin_theta, motion.cos_theta)
+    return complete_accelerations_on_hub_circle(hub_circle, motion.dtheta, force / inertia)
 
 
-def accelerations_on_circle(
-    circle: DoubleSupportCircle, dtheta: Elementwise, ddtheta: Elementwise
+def complete_accelerations_on_hub_circle(
+    hub_circle: DoubleSupportCircle, dtheta: Elementwise, ddtheta: Elementwise
 ) -> Acceleration:
-    """Return all accelerations in double support, where only theta is free."""
+    """Return the accelerations of (theta, L1, L2) in double support, from that of theta."""
     squared_rate = dtheta * dtheta
     return Acceleration(
         ddtheta,
-        circle.G1 * ddtheta - circle.L1 * squared_rate,
-        circle.G2 * ddtheta - circle.L2 * squared_rate,
+        hub_circle.dL1_dtheta * ddtheta - hub_circle.L1 * squared_rate,
+        hub_circle.dL2_dtheta * ddtheta - hub_circle.L2 * squared_rate,
     )
 
 
@@ -253,42 +267,44 @@ class FootForce(NamedTuple):
     normal: Elementwise  # pushing positive: lambda_2 (fore) or lambda_4 (rear)
 
 
-def required_friction(force: FootForce) -> Elementwise:
-    """Return the ratio of tangential to normal force; 0 for a foot without positive normal
-    force.
-    """
-    is_loaded = force.normal > 0.0
-    friction_ratio = jnp.abs(force.tangential) / jnp.where(is_loaded, force.normal, 1.0)
-    return jnp.where(is_loaded, friction_ratio, 0.0)
+def compute_required_friction(force: FootForce) -> Elementwise:
+    """Return the ratio of tangential to normal force, or 0 if the normal force is not positive."""
+    is_foot_loaded = force.normal > 0.0
+    friction_ratio = jnp.abs(force.tangential) / jnp.where(is_foot_loaded, force.normal, 1.0)
+    return jnp.where(is_foot_loaded, friction_ratio, 0.0)
 
 
-def foot_force_from_residual(
+def compute_rear_force_from_residual(
     s: Symbols, motion: Motion, residual_L1: Elementwise, residual_L2: Elementwise
 ) -> FootForce:
-    """Return the force of the ground on the rear foot, from its generalized forces along L1 and L2
+    """Return the force of the ground on the rear foot from its generalized forces along L1 and L2
     (eq. 1).
     """
-    rear_leg = rear_direction(s, motion.sin, motion.cos)
+    rear_leg = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
     return FootForce(
-        -(rear_leg.cos * residual_L1 + motion.cos * residual_L2) / s.sin_alpha,
-        (rear_leg.sin * residual_L1 + motion.sin * residual_L2) / s.sin_alpha,
+        -(rear_leg.cos * residual_L1 + motion.cos_theta * residual_L2) / s.sin_alpha,
+        (rear_leg.sin * residual_L1 + motion.sin_theta * residual_L2) / s.sin_alpha,
     )
 
 
-def rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> FootForce:
-    """Return (lambda_3, lambda_4) in double support, N: the part of M q'' that applied forces do
-    not supply.
+def compute_rear_foot_force(s: Symbols, motion: Motion, acceleration: Acceleration) -> FootForce:
+    """Return (lambda_3, lambda_4) in double support, N.
+
+    The force is the part of M q'' that the applied forces do not supply.
     """
-    M, _, f2, f3 = equation_terms(s, motion)
-    total_force = M.multiply(acceleration)
-    return foot_force_from_residual(s, motion, total_force[1] - f2, total_force[2] - f3)
+    M, _, f2, f3 = compute_equation_terms(s, motion)
+    inertial_force = M.multiply_vector(acceleration)
+    return compute_rear_force_from_residual(
+        s, motion, inertial_force[1] - f2, inertial_force[2] - f3
+    )
 
 
-def fore_foot_force(
+def compute_fore_foot_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, rear_force: FootForce | None = None
 ) -> FootForce:
-    """Return (lambda_1, lambda_2), N: the rate of total momentum minus weight and rear-foot
-    force.
+    """Return (lambda_1, lambda_2), N.
+
+    The force is the rate of the total momentum minus the weight and the force on the rear foot.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     ddtheta, ddL1, ddL2 = acceleration
@@ -298,7 +314,7 @@ def fore_foot_force(
     tangential_force_1 = 2.0 * dA * dtheta + A * ddtheta
     radial_force_2 = ddB - B * dtheta * dtheta
     tangential_force_2 = 2.0 * dB * dtheta + B * ddtheta
-    rear_leg = rear_direction(s, sin, cos)
+    rear_leg = rotate_to_rear_leg(s, sin, cos)
     x = (
         radial_force_1 * sin
         + tangential_force_1 * cos
@@ -318,10 +334,10 @@ def fore_foot_force(
     return FootForce(tangential - rear_force.tangential, normal - rear_force.normal)
 
 
-def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Return the total linear momentum along (x, z) with the foot of Leg 1 at rest, kg m/s."""
+def compute_momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
+    """Return the total linear momentum along (x, z), kg m/s, with the foot of Leg 1 at rest."""
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
-    rear_leg = rear_direction(s, sin, cos)
+    rear_leg = rotate_to_rear_leg(s, sin, cos)
     radial_momentum_1, tangential_momentum_1 = s.Mh * dL1, (s.Mh * L1 + s.m * s.L0) * dtheta
     radial_momentum_2, tangential_momentum_2 = -s.m * dL2, s.m * (s.L0 - L2) * dtheta
     return (
@@ -336,66 +352,71 @@ def momentum(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
     )
 
 
-def stopper_force(
+def compute_stopper_force(
     s: Symbols, motion: Motion, acceleration: Acceleration, leg_numbers: range
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the force of the stopper that keeps each of `leg_numbers` at L0, N.
+    """Return the force of the stopper that holds each of `leg_numbers` at the length L0, N.
 
     The force is negative if the leg would leave its stopper. The spring presses with k (L* - L0).
     The weight and the acceleration of the leg's mass reduce the force.
     """
     leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
-    radial_acceleration = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
-    tangential_acceleration = 2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
+    radial_hub_acceleration = acceleration.ddL1 - motion.L1 * motion.dtheta * motion.dtheta
+    tangential_hub_acceleration = (
+        2.0 * motion.dL1 * motion.dtheta + motion.L1 * acceleration.ddtheta
+    )
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.
-    radial_acceleration = radial_acceleration + s.g * (
-        motion.cos * s.cos_phi - motion.sin * s.sin_phi
+    radial_hub_acceleration = radial_hub_acceleration + s.g * (
+        motion.cos_theta * s.cos_phi - motion.sin_theta * s.sin_phi
     )
-    tangential_acceleration = tangential_acceleration - s.g * (
-        motion.sin * s.cos_phi + motion.cos * s.sin_phi
+    tangential_hub_acceleration = tangential_hub_acceleration - s.g * (
+        motion.sin_theta * s.cos_phi + motion.cos_theta * s.sin_phi
     )
-    leg_acceleration = radial_acceleration * np.cos(leg_angles) + tangential_acceleration * np.sin(
+    leg_acceleration = radial_hub_acceleration * np.cos(
         leg_angles
-    )
+    ) + tangential_hub_acceleration * np.sin(leg_angles)
     centrifugal_acceleration = s.c0 * motion.dtheta * motion.dtheta
     return s.k * (s.Ls - s.L0) + s.m * centrifugal_acceleration + s.m * leg_acceleration
 
 
 class Energy(NamedTuple):
-    """Mechanical energy, J. The gravitational part is zero at the present foot of Leg 1 (Section
-    3.5).
+    """Mechanical energy, J.
+
+    The gravitational energy is zero at the present foot of Leg 1 (Section 3.5).
     """
 
-    kinetic: Elementwise
-    gravitational: Elementwise
-    elastic: Elementwise
+    kinetic_energy: Elementwise
+    gravitational_energy: Elementwise
+    elastic_energy: Elementwise
 
     @property
-    def total(self) -> Elementwise:
+    def total_energy(self) -> Elementwise:
         """Return the total energy E of eq. (26), J."""
-        return self.kinetic + self.gravitational + self.elastic
+        return self.kinetic_energy + self.gravitational_energy + self.elastic_energy
 
 
-def kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
+def compute_kinetic_energy(s: Symbols, motion: Motion) -> Elementwise:
     """Return the kinetic energy, half of q' M q', J."""
-    rates = (motion.dtheta, motion.dL1, motion.dL2)
-    p = mass_matrix(s, motion.L1, motion.L2).multiply(rates)
-    return 0.5 * (p[0] * rates[0] + p[1] * rates[1] + p[2] * rates[2])
+    coordinate_rates = (motion.dtheta, motion.dL1, motion.dL2)
+    p = compute_mass_matrix(s, motion.L1, motion.L2).multiply_vector(coordinate_rates)
+    return 0.5 * (
+        p[0] * coordinate_rates[0] + p[1] * coordinate_rates[1] + p[2] * coordinate_rates[2]
+    )
 
 
-def mechanical_energy(s: Symbols, motion: Motion) -> Energy:
+def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
     """Return the kinetic, gravitational and elastic energy (eqs 26, 27), J."""
-    sin_from_vertical = motion.sin * s.cos_phi + motion.cos * s.sin_phi
-    cos_from_vertical = motion.cos * s.cos_phi - motion.sin * s.sin_phi
-    rear_cos_from_vertical = cos_from_vertical * s.cos_alpha - sin_from_vertical * s.sin_alpha
-    mass_moment = (s.Mh * motion.L1 + s.m * s.L0) * cos_from_vertical + s.m * (
+    sin_theta_plus_phi = motion.sin_theta * s.cos_phi + motion.cos_theta * s.sin_phi
+    cos_theta_plus_phi = motion.cos_theta * s.cos_phi - motion.sin_theta * s.sin_phi
+    cos_rear_leg_plus_phi = cos_theta_plus_phi * s.cos_alpha - sin_theta_plus_phi * s.sin_alpha
+    mass_height_moment = (s.Mh * motion.L1 + s.m * s.L0) * cos_theta_plus_phi + s.m * (
         s.L0 - motion.L2
-    ) * rear_cos_from_vertical
+    ) * cos_rear_leg_plus_phi
     stretch_1, stretch_2, locked_stretch = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
     elastic_energy = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked_stretch**2)
-    return Energy(kinetic_energy(s, motion), s.g * mass_moment, elastic_energy)
+    return Energy(compute_kinetic_energy(s, motion), s.g * mass_height_moment, elastic_energy)
 
 
-def damping_power(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the power lost in the dampers, c (dL1^2 + dL2^2), W (eq. 29)."""
+def compute_damping_power(s: Symbols, motion: Motion) -> Elementwise:
+    """Return the power c (dL1^2 + dL2^2) that the dampers dissipate, W (eq. 29)."""
     return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)

@@ -9,15 +9,15 @@ through its sine and cosine.
 
 from typing import NamedTuple
 
-from vrw_jax.numerics import Elementwise, sine_cosine
+from vrw_jax.numerics import Elementwise, compute_sine_cosine
 from vrw_jax.wheel.params import Symbols
 
 
 class Motion(NamedTuple):
     """Posture and rates in the coordinates (theta, L1, L2), with the foot of Leg 1 at rest."""
 
-    sin: Elementwise  # of theta
-    cos: Elementwise  # of theta
+    sin_theta: Elementwise  # of theta
+    cos_theta: Elementwise  # of theta
     L1: Elementwise  # m
     L2: Elementwise  # m
     dtheta: Elementwise  # rad/s
@@ -35,62 +35,77 @@ class Motion(NamedTuple):
         dL2: Elementwise,
     ) -> "Motion":
         """Return the motion at the angle theta (rad) with these lengths (m) and rates."""
-        return cls(*sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
+        return cls(*compute_sine_cosine(theta), L1, L2, dtheta, dL1, dL2)
 
 
 class SineCosine(NamedTuple):
-    """Sine and cosine of an angle."""
+    """Sine and cosine of one angle."""
 
     sin: Elementwise
     cos: Elementwise
 
 
-def rear_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> SineCosine:
+def rotate_to_rear_leg(s: Symbols, sin_theta: Elementwise, cos_theta: Elementwise) -> SineCosine:
     """Return the sine and cosine of theta + alpha, the angle of Leg 2."""
-    return SineCosine(sin * s.cos_alpha + cos * s.sin_alpha, cos * s.cos_alpha - sin * s.sin_alpha)
+    return SineCosine(
+        sin_theta * s.cos_alpha + cos_theta * s.sin_alpha,
+        cos_theta * s.cos_alpha - sin_theta * s.sin_alpha,
+    )
 
 
-def landing_direction(s: Symbols, sin: Elementwise, cos: Elementwise) -> SineCosine:
+def rotate_to_landing_leg(s: Symbols, sin_theta: Elementwise, cos_theta: Elementwise) -> SineCosine:
     """Return the sine and cosine of theta - alpha, the angle of the leg that lands next."""
-    return SineCosine(sin * s.cos_alpha - cos * s.sin_alpha, cos * s.cos_alpha + sin * s.sin_alpha)
+    return SineCosine(
+        sin_theta * s.cos_alpha - cos_theta * s.sin_alpha,
+        cos_theta * s.cos_alpha + sin_theta * s.sin_alpha,
+    )
 
 
-def rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the height of foot 2 above the slope, m; negative if the foot scuffs (Section
+def compute_rear_foot_height(s: Symbols, motion: Motion) -> Elementwise:
+    """Return the height of foot 2 above the slope, m. It is negative if the foot scuffs (Section
     3.3.1).
     """
-    return motion.L1 * motion.cos - motion.L2 * rear_direction(s, motion.sin, motion.cos).cos
+    return (
+        motion.L1 * motion.cos_theta
+        - motion.L2 * rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta).cos
+    )
 
 
-def landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the height of the next leg's foot above the slope, m; zero at touchdown."""
-    return motion.L1 * motion.cos - s.L0 * landing_direction(s, motion.sin, motion.cos).cos
+def compute_landing_foot_height(s: Symbols, motion: Motion) -> Elementwise:
+    """Return the height of the next leg's foot above the slope, m. It is zero at touchdown."""
+    return (
+        motion.L1 * motion.cos_theta
+        - s.L0 * rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta).cos
+    )
 
 
-def length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
+def compute_length_at_touchdown(s: Symbols, theta: Elementwise) -> Elementwise:
     """Return the length of Leg 1 if the next foot meets the ground at the angle theta, m."""
-    sin, cos = sine_cosine(theta)
-    return s.L0 * landing_direction(s, sin, cos).cos / cos
+    sin_theta, cos_theta = compute_sine_cosine(theta)
+    return s.L0 * rotate_to_landing_leg(s, sin_theta, cos_theta).cos / cos_theta
 
 
 class DoubleSupportCircle(NamedTuple):
-    """Leg lengths, and their derivatives by theta, with the hub on its circle in double support."""
+    """Leg lengths and their derivatives with respect to theta, with the hub on its circle."""
 
     L1: Elementwise  # m
     L2: Elementwise  # m
-    G1: Elementwise  # dL1/dtheta, m/rad; the second derivative is -L1
-    G2: Elementwise  # dL2/dtheta, m/rad; the second derivative is -L2
+    dL1_dtheta: Elementwise  # dL1/dtheta, m/rad; the second derivative is -L1
+    dL2_dtheta: Elementwise  # dL2/dtheta, m/rad; the second derivative is -L2
 
 
-def double_support_circle(
-    s: Symbols, distance: Elementwise, sin: Elementwise, cos: Elementwise
+def compute_double_support_circle(
+    s: Symbols, foot_distance: Elementwise, sin_theta: Elementwise, cos_theta: Elementwise
 ) -> DoubleSupportCircle:
-    """Return the leg lengths and their derivatives with both feet planted `distance` m apart.
+    """Return the leg lengths and their derivatives with both feet planted `foot_distance` m apart.
 
     The hub moves on a circle with the inscribed angle alpha (Section 2).
     """
-    diameter = distance / s.sin_alpha
-    rear_leg = rear_direction(s, sin, cos)
+    hub_circle_diameter = foot_distance / s.sin_alpha
+    rear_leg = rotate_to_rear_leg(s, sin_theta, cos_theta)
     return DoubleSupportCircle(
-        diameter * rear_leg.cos, diameter * cos, -diameter * rear_leg.sin, -diameter * sin
+        hub_circle_diameter * rear_leg.cos,
+        hub_circle_diameter * cos_theta,
+        -hub_circle_diameter * rear_leg.sin,
+        -hub_circle_diameter * sin_theta,
     )

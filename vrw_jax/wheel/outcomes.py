@@ -4,7 +4,8 @@ from vrw_jax.numerics import StatusCode
 
 
 class Outcome(StatusCode):
-    """Outcome of a step. Only STEPPED leaves a section state; every other code ends the walk.
+    """Outcome of a step. Only a step with the outcome STEPPED has a section state at its end. Every
+    other outcome ends the walk.
 
     Examples:
         >>> vrw.Outcome.FELL_BACK.meaning

@@ -12,7 +12,7 @@ class ParameterSet:
     1.
 
     - `values`: parameters that differ from Table 1 at slope 0.30 rad, in SI units;
-    - `description`: property of the wheel that the set demonstrates;
+    - `description`: property of the wheel that the set illustrates;
     - `source`: source of the numbers and of their confirmation.
 
     Examples:
@@ -27,7 +27,7 @@ class ParameterSet:
 
     @property
     def params(self) -> WheelParams:
-        """Return the wheel with these parameters."""
+        """Return the wheel with the parameters of this set."""
         return WheelParams(**self.values)  # type: ignore[arg-type]
 
 

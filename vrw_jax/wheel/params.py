@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, RealInput, Scalar, sine_cosine
+from vrw_jax.numerics import Elementwise, RealInput, Scalar, compute_sine_cosine
 from vrw_jax.printing import AbstractPrintable, LabelAndText, format_quantity
-from vrw_jax.validation import check_int, check_known_name, check_reals, format_value
+from vrw_jax.validation import check_int, check_reals, format_value, require_known_name
 
 
 class ParameterDomain(NamedTuple):
@@ -21,28 +21,30 @@ class ParameterDomain(NamedTuple):
 
     symbol: str
     unit: str
-    lower: float
-    upper: float
+    lower_bound: float
+    upper_bound: float
     lower_is_allowed: bool
     description: str
 
-    def contains(self, value: Any) -> Any:
-        """Return whether the value lies in the range; False for NaN."""
-        is_above_lower = value >= self.lower if self.lower_is_allowed else value > self.lower
-        return is_above_lower & (value < self.upper)
+    def contains_value(self, value: Any) -> Any:
+        """Return whether a value lies in the allowed range. NaN gives False."""
+        is_above_lower = (
+            value >= self.lower_bound if self.lower_is_allowed else value > self.lower_bound
+        )
+        return is_above_lower & (value < self.upper_bound)
 
-    def require_inside(self, name: str, value: float) -> None:
-        """Raise `ValueError` if the value lies outside the range."""
-        if not self.contains(value):
+    def require_value_in_domain(self, parameter_name: str, value: float) -> None:
+        """Raise a `ValueError` if the value of a parameter lies outside the allowed range."""
+        if not self.contains_value(value):
             raise ValueError(
-                f"{name} is {value:g}, but {self.description} must lie in {self}: "
+                f"{parameter_name} is {value:g}, but {self.description} must lie in {self}: "
                 "give a value in that range."
             )
 
     def __str__(self) -> str:
-        bracket = "[" if self.lower_is_allowed else "("
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{bracket}{self.lower:g}, {self.upper:g}){unit}"
+        opening_bracket = "[" if self.lower_is_allowed else "("
+        unit_suffix = f" {self.unit}" if self.unit else ""
+        return f"{opening_bracket}{self.lower_bound:g}, {self.upper_bound:g}){unit_suffix}"
 
 
 MIN_SI_VALUE = 1e-15
@@ -91,7 +93,7 @@ outputs."""
 
 
 class Symbols(NamedTuple):
-    """Symbols of the paper, and quantities that several formulas use."""
+    """Parameters by their symbols in the paper, and quantities that several formulas use."""
 
     m: Elementwise
     a: Elementwise
@@ -114,9 +116,11 @@ class Symbols(NamedTuple):
     alpha: float
 
 
-def _parameter_field(name: str, default_value: float) -> Any:
+def _make_parameter_field(parameter_name: str, default_value: float) -> Any:
     """Return the dataclass field of a float parameter."""
-    return eqx.field(converter=functools.partial(check_reals, name), default=default_value)
+    return eqx.field(
+        converter=functools.partial(check_reals, parameter_name), default=default_value
+    )
 
 
 _check_n_legs = functools.partial(
@@ -132,9 +136,10 @@ class WheelParams(AbstractPrintable):
     0.30.
 
     All fields except `n_legs` are pytree leaves in SI units and may be swept and differentiated.
-    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A plain scalar outside its domain
-    raises an error here; in a batch, such a value becomes `Outcome.BAD_INPUT`. In units of total
-    mass, locked length and gravity, natural length, stiffness and damping must be below 1e9.
+    The paper does not print g; 9.81 m/s^2 reproduces its numbers. A number outside its domain
+    raises an error here. In a batch, a wheel with such a number has `Outcome.BAD_INPUT`. In units
+    of total mass, locked length and gravity, natural length, stiffness and damping must be below
+    1e9.
 
     - `hub_mass`: m_H, mass of the body frame, in [0, 1e+60) kg;
     - `leg_mass`: m, mass of one leg frame, a point, in [1e-15, 1e+60) kg;
@@ -145,7 +150,7 @@ class WheelParams(AbstractPrintable):
     - `damping`: c, viscous damping of each leg, in [0, 1e+60) N s/m;
     - `slope`: phi, downhill slope, in (-1.5708, 1.5708) rad;
     - `gravity`: g, gravitational acceleration, in [1e-15, 1e+60) m/s^2;
-    - `n_legs`: 5 and more, a whole number; angles between legs are 2 pi / n_legs.
+    - `n_legs`: number of legs, at least 5; the angle between two legs is 2 pi / n_legs.
 
     Examples:
         >>> params = vrw.WheelParams(damping=150.0)
@@ -155,23 +160,23 @@ class WheelParams(AbstractPrintable):
         (3,)
     """
 
-    hub_mass: Scalar = _parameter_field("hub_mass", 10.0)
-    leg_mass: Scalar = _parameter_field("leg_mass", 1.0)
-    leg_com: Scalar = _parameter_field("leg_com", 0.3)
-    locked_length: Scalar = _parameter_field("locked_length", 1.0)
-    natural_length: Scalar = _parameter_field("natural_length", 1.02)
-    stiffness: Scalar = _parameter_field("stiffness", 500.0)
-    damping: Scalar = _parameter_field("damping", 200.0)
-    slope: Scalar = _parameter_field("slope", 0.30)
-    gravity: Scalar = _parameter_field("gravity", 9.81)
+    hub_mass: Scalar = _make_parameter_field("hub_mass", 10.0)
+    leg_mass: Scalar = _make_parameter_field("leg_mass", 1.0)
+    leg_com: Scalar = _make_parameter_field("leg_com", 0.3)
+    locked_length: Scalar = _make_parameter_field("locked_length", 1.0)
+    natural_length: Scalar = _make_parameter_field("natural_length", 1.02)
+    stiffness: Scalar = _make_parameter_field("stiffness", 500.0)
+    damping: Scalar = _make_parameter_field("damping", 200.0)
+    slope: Scalar = _make_parameter_field("slope", 0.30)
+    gravity: Scalar = _make_parameter_field("gravity", 9.81)
     n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
 
-    def __new__(cls, *_: Any, **named_values: Any) -> "WheelParams":
-        """Raise `TypeError` for names that no parameter has, before the wheel is made."""
-        for name in named_values:
+    def __new__(cls, *_: Any, **given_parameters: Any) -> "WheelParams":
+        """Raise a `TypeError` for keywords that are no parameters, before the wheel is made."""
+        for parameter_name in given_parameters:
             try:
                 check_parameter_name(
-                    name, tuple(cls.__dataclass_fields__), "parameter of the wheel"
+                    parameter_name, tuple(cls.__dataclass_fields__), "parameter of the wheel"
                 )
             except ValueError as error:
                 raise TypeError(str(error)) from None
@@ -194,28 +199,36 @@ class WheelParams(AbstractPrintable):
         ) -> None: ...
 
     def __check_init__(self) -> None:
-        concrete_values = {
-            name: float(value)
-            for name in PARAMETER_DOMAINS
-            if not isinstance(value := getattr(self, name), jax.core.Tracer) and value.ndim == 0
+        known_parameter_values = {
+            parameter_name: float(parameter_value)
+            for parameter_name in PARAMETER_DOMAINS
+            if not isinstance(parameter_value := getattr(self, parameter_name), jax.core.Tracer)
+            and parameter_value.ndim == 0
         }
-        for name, value in concrete_values.items():
-            PARAMETER_DOMAINS[name].require_inside(name, value)
-        if len(concrete_values) == len(PARAMETER_DOMAINS):
-            _check_relative_values(concrete_values, self.n_legs)
+        for parameter_name, parameter_value in known_parameter_values.items():
+            PARAMETER_DOMAINS[parameter_name].require_value_in_domain(
+                parameter_name, parameter_value
+            )
+        if len(known_parameter_values) == len(PARAMETER_DOMAINS):
+            _require_small_relative_values(known_parameter_values, self.n_legs)
         leg_com, locked_length = (
-            concrete_values.get(name) for name in ("leg_com", "locked_length")
+            known_parameter_values.get(parameter_name)
+            for parameter_name in ("leg_com", "locked_length")
         )
         if leg_com is not None and locked_length is not None and not leg_com < locked_length:
             raise ValueError(
                 f"leg_com is {leg_com:g} m and locked_length {locked_length:g} m, but a leg's mass "
                 "is between foot and hub: give leg_com < locked_length."
             )
-        shapes = {name: shape for name in PARAMETER_DOMAINS if (shape := getattr(self, name).shape)}
-        if len({shape[0] for shape in shapes.values()}) > 1:
+        parameter_shapes = {
+            parameter_name: parameter_shape
+            for parameter_name in PARAMETER_DOMAINS
+            if (parameter_shape := getattr(self, parameter_name).shape)
+        }
+        if len({parameter_shape[0] for parameter_shape in parameter_shapes.values()}) > 1:
             raise ValueError(
-                f"the parameters have shapes {shapes}, but a batch has one wheel for each entry "
-                "of its axis: give arrays of one length."
+                f"the parameters have shapes {parameter_shapes}, but a batch has one wheel for "
+                "each element of its axis: give arrays of one length."
             )
 
     @property
@@ -227,16 +240,17 @@ class WheelParams(AbstractPrintable):
         """
         return jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, self)
 
-    def require_single(self, remedy: str) -> None:
-        """Raise `ValueError` if any parameter has an axis, with `remedy` in the message."""
-        for name in PARAMETER_DOMAINS:
-            if shape := getattr(self, name).shape:
+    def require_single_wheel(self, remedy_text: str) -> None:
+        """Raise a `ValueError` if a parameter has an axis. The message ends with `remedy_text`."""
+        for parameter_name in PARAMETER_DOMAINS:
+            if parameter_shape := getattr(self, parameter_name).shape:
                 raise ValueError(
-                    f"{name} has shape {shape}, but this is about one wheel: {remedy}."
+                    f"{parameter_name} has shape {parameter_shape}, but this is about one wheel: "
+                    f"{remedy_text}."
                 )
 
     @property
-    def title(self) -> str:
+    def printed_heading(self) -> str:
         """Return the class name, with a note if a parameter is out of its domain."""
         title_suffix = (
             "" if np.all(self.is_in_domain()) else " out of its domain: a gradient or a difference"
@@ -244,21 +258,28 @@ class WheelParams(AbstractPrintable):
         return "WheelParams" + title_suffix
 
     def summary_rows(self) -> list[LabelAndText]:
-        """Return symbol, value and unit of each parameter; for a gradient, its denominators."""
-        parameter_numbers = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
+        """Return symbol, value and unit of each parameter. A gradient has rows "by" each
+        parameter.
+        """
+        value_by_parameter = {
+            parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
+        }
         if not np.all(self.is_in_domain()):
-            denominator_text = lambda domain: (
+            denominator_formatter = lambda domain: (
                 f"{domain.symbol}, {domain.unit}" if domain.unit else domain.symbol
             )
             return [
-                (f"by {n} {denominator_text(PARAMETER_DOMAINS[n])}", format_quantity(value, ""))
-                for n, value in parameter_numbers.items()
+                (
+                    f"by {n} {denominator_formatter(PARAMETER_DOMAINS[n])}",
+                    format_quantity(parameter_value, ""),
+                )
+                for n, parameter_value in value_by_parameter.items()
             ]
-        parameter_rows = [
+        printed_rows = [
             (f"{n} {PARAMETER_DOMAINS[n].symbol}", format_quantity(x, PARAMETER_DOMAINS[n].unit))
-            for n, x in parameter_numbers.items()
+            for n, x in value_by_parameter.items()
         ]
-        return [*parameter_rows, ("n_legs", str(self.n_legs))]
+        return [*printed_rows, ("n_legs", str(self.n_legs))]
 
     @property
     def leg_angle(self) -> float:
@@ -266,17 +287,25 @@ class WheelParams(AbstractPrintable):
         return 2.0 * math.pi / self.n_legs
 
     def is_in_domain(self) -> Bool[Array, "..."]:
-        """Return whether every parameter is finite and in its domain, elementwise.
+        """Return whether all parameters of each wheel are finite and in their domains.
 
-        Products of four parameters must be finite in their floating type too.
+        Products of four parameters must also be finite in their floating type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
-        values = {name: getattr(self, name) for name in PARAMETER_DOMAINS}
-        for name, domain in PARAMETER_DOMAINS.items():
-            largest_factor = float(jnp.finfo(jnp.result_type(values[name])).max) ** 0.25
-            is_in_all_domains &= domain.contains(values[name]) & (values[name] < largest_factor)
-        for square in _compute_relative_squares(values, self.n_legs).values():
-            is_in_all_domains &= square < MAX_RELATIVE_VALUE**2
+        value_by_parameter = {
+            parameter_name: getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS
+        }
+        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items():
+            max_value_of_dtype = (
+                float(jnp.finfo(jnp.result_type(value_by_parameter[parameter_name])).max) ** 0.25
+            )
+            is_in_all_domains &= parameter_domain.contains_value(
+                value_by_parameter[parameter_name]
+            ) & (value_by_parameter[parameter_name] < max_value_of_dtype)
+        for squared_relative_value in _square_relative_values(
+            value_by_parameter, self.n_legs
+        ).values():
+            is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
         return is_in_all_domains
 
     def scaled(
@@ -289,9 +318,9 @@ class WheelParams(AbstractPrintable):
         """Return the similar wheel whose masses, lengths and times are larger by the given factors.
 
         Similar wheels have the same gaits: a period grows by `time`, a speed by `length / time`, a
-        force by `mass * length / time**2`. Angles, fractions and multipliers stay. By Buckingham's
-        theorem the nine parameters form six groups without a unit. The same factors convert units:
-        `mass=1000, length=1000` expresses the wheel in grams and millimetres.
+            force by `mass * length / time**2`. Angles, fractions and multipliers stay the same. By
+            Buckingham's theorem the nine parameters form six dimensionless groups. The same factors
+            convert units: `mass=1000, length=1000` expresses the wheel in grams and millimetres.
 
         Args:
             mass: factor of masses, positive.
@@ -310,15 +339,16 @@ class WheelParams(AbstractPrintable):
             0.20 m, 9.81 m/s^2
         """
         factor_by_dimension = {"length": length, "time": time, "mass": mass}
-        for name, value in factor_by_dimension.items():
-            checked_factor = check_reals(name, value)
+        for dimension_name, given_factor in factor_by_dimension.items():
+            checked_factor = check_reals(dimension_name, given_factor)
             if not isinstance(checked_factor, jax.core.Tracer) and not np.all(checked_factor > 0.0):
                 raise ValueError(
-                    f"{name} is {format_value(value)}, but a factor of scale is positive: give 2, "
+                    f"{dimension_name} is {format_value(given_factor)}, but a factor of scale is "
+                    "positive: give 2, "
                     "say, for twice as much."
                 )
         scaled_values = {}
-        for name, domain in PARAMETER_DOMAINS.items():
+        for dimension_name, domain in PARAMETER_DOMAINS.items():
             unit_powers = UNIT_POWERS[domain.unit]
             scale_factor = math.prod(
                 checked_factor**unit_power
@@ -326,37 +356,48 @@ class WheelParams(AbstractPrintable):
                     factor_by_dimension.values(), unit_powers, strict=True
                 )
             )
-            scaled_values[name] = getattr(self, name) * scale_factor
+            scaled_values[dimension_name] = getattr(self, dimension_name) * scale_factor
         return WheelParams(**scaled_values, n_legs=self.n_legs)
 
     def symbols(self) -> Symbols:
-        """Return the symbols of the paper for this wheel, with shared quantities."""
-        return compute_symbols(self.n_legs, *(getattr(self, name) for name in PARAMETER_DOMAINS))
+        """Return the parameters of this wheel by their symbols, with quantities that formulas
+        share.
+        """
+        return compute_symbols(
+            self.n_legs, *(getattr(self, parameter_name) for parameter_name in PARAMETER_DOMAINS)
+        )
 
 
-def _compute_relative_squares(values: Mapping[str, Any], n_legs: int) -> dict[str, Any]:
-    """Return the squares of natural length, stiffness and damping in units of total mass, locked
-    length and gravity, by parameter name.
+def _square_relative_values(value_by_parameter: Mapping[str, Any], n_legs: int) -> dict[str, Any]:
+    """Return the squares of relative natural length, stiffness and damping, by parameter name.
 
-    - `values`: values of all parameters by name, in SI units.
+    The relative values are in units of total mass, locked length and gravity.
+
+    - `value_by_parameter`: values of all parameters in SI units.
     """
-    locked_length, gravity = values["locked_length"], values["gravity"]
-    total_mass = values["hub_mass"] + n_legs * values["leg_mass"]
-    relative_stiffness = values["stiffness"] * locked_length / (total_mass * gravity)
+    locked_length, gravity = value_by_parameter["locked_length"], value_by_parameter["gravity"]
+    total_mass = value_by_parameter["hub_mass"] + n_legs * value_by_parameter["leg_mass"]
+    relative_stiffness = value_by_parameter["stiffness"] * locked_length / (total_mass * gravity)
     return {
-        "natural_length": (values["natural_length"] / locked_length) ** 2,
+        "natural_length": (value_by_parameter["natural_length"] / locked_length) ** 2,
         "stiffness": relative_stiffness**2,
-        "damping": (values["damping"] / total_mass) ** 2 * locked_length / gravity,
+        "damping": (value_by_parameter["damping"] / total_mass) ** 2 * locked_length / gravity,
     }
 
 
-def _check_relative_values(values: Mapping[str, float], n_legs: int) -> None:
-    """Raise `ValueError` if a value is too large for the mass, length and gravity of its wheel."""
-    for name, square in _compute_relative_squares(values, n_legs).items():
-        if not square < MAX_RELATIVE_VALUE**2:
+def _require_small_relative_values(value_by_parameter: Mapping[str, float], n_legs: int) -> None:
+    """Raise a `ValueError` if a parameter is too large for the mass, length and gravity of its
+    wheel.
+    """
+    for parameter_name, squared_relative_value in _square_relative_values(
+        value_by_parameter, n_legs
+    ).items():
+        if not squared_relative_value < MAX_RELATIVE_VALUE**2:
             raise ValueError(
-                f"{name} is {values[name]:g} {PARAMETER_DOMAINS[name].unit}, which is "
-                f"{math.sqrt(square):.1e} in units of the wheel's mass, locked length and gravity, "
+                f"{parameter_name} is {value_by_parameter[parameter_name]:g} "
+                f"{PARAMETER_DOMAINS[parameter_name].unit}, which is "
+                f"{math.sqrt(squared_relative_value):.1e} in units of the wheel's mass, locked "
+                "length and gravity, "
                 f"but it must be below {MAX_RELATIVE_VALUE:g} in them: give a smaller value."
             )
 
@@ -373,9 +414,9 @@ def compute_symbols(
     slope: Elementwise,
     gravity: Elementwise,
 ) -> Symbols:
-    """Return the `Symbols` of plain numbers in SI units, which may be complex."""
+    """Return the `Symbols` of parameters in SI units, which may be complex numbers."""
     alpha = 2.0 * math.pi / n_legs
-    sin_phi, cos_phi = sine_cosine(slope)
+    sin_phi, cos_phi = compute_sine_cosine(slope)
     return Symbols(
         m=leg_mass,
         a=leg_com,
@@ -400,7 +441,7 @@ PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
 FRICTION_NAME = "friction"
 """Name of the ground's coefficient of friction, which designs and branches may also vary."""
 
-NAMES_OF_SYMBOLS: dict[str, str] = {
+PARAMETER_BY_SYMBOL: dict[str, str] = {
     **{domain.symbol: name for name, domain in PARAMETER_DOMAINS.items()},
     **{"mH": "hub_mass", "L0": "locked_length", "L_s": "natural_length", "Ls": "natural_length"},
     **{"φ": "slope", "n": "n_legs", "mu": FRICTION_NAME, "μ": FRICTION_NAME},
@@ -408,29 +449,29 @@ NAMES_OF_SYMBOLS: dict[str, str] = {
 """Name of the parameter of each symbol of the paper, in its usual spellings."""
 
 
-def refuse_symbol(name: Any, allowed_names: Iterable[str]) -> None:
-    """Raise `ValueError` if `name` is the symbol of a parameter whose name is allowed."""
+def raise_for_parameter_symbol(given_name: Any, allowed_names: Iterable[str]) -> None:
+    """Raise a `ValueError` if `given_name` is the symbol of a parameter whose name is allowed."""
     allowed_names = tuple(allowed_names)
-    parameter_name = NAMES_OF_SYMBOLS.get(name) if isinstance(name, str) else None
-    if name not in allowed_names and parameter_name in allowed_names:
-        raise ValueError(f"{name} is called {parameter_name}: write {parameter_name}.")
+    parameter_name = PARAMETER_BY_SYMBOL.get(given_name) if isinstance(given_name, str) else None
+    if given_name not in allowed_names and parameter_name in allowed_names:
+        raise ValueError(f"{given_name} is called {parameter_name}: write {parameter_name}.")
 
 
-def check_parameter_name(name: Any, allowed_names: Sequence[str], description: str) -> None:
-    """Raise `ValueError` for a name that is no allowed parameter.
+def check_parameter_name(given_name: Any, allowed_names: Sequence[str], name_kind: str) -> None:
+    """Raise a `ValueError` if `given_name` is not the name of an allowed parameter.
 
-    If the name is a symbol of the paper, the message gives the parameter's name.
+    If the given name is a symbol of the paper, the message states the name of the parameter.
     """
-    refuse_symbol(name, allowed_names)
-    check_known_name(name, allowed_names, description)
+    raise_for_parameter_symbol(given_name, allowed_names)
+    require_known_name(given_name, allowed_names, name_kind)
 
 
-def convert_friction(value: object) -> Array:
-    """Return a coefficient of friction, or an array of them, as a JAX array.
+def convert_friction(given_friction: object) -> Array:
+    """Return a coefficient of friction, or an array of such coefficients, as a JAX array.
 
-    Raises `ValueError` for a negative number or NaN.
+    Raise a `ValueError` for a negative number or NaN.
     """
-    friction_coefficient = check_reals(FRICTION_NAME, value)
+    friction_coefficient = check_reals(FRICTION_NAME, given_friction)
     is_concrete = (
         not isinstance(friction_coefficient, jax.core.Tracer) and friction_coefficient.ndim == 0
     )
@@ -442,34 +483,37 @@ def convert_friction(value: object) -> Array:
     return friction_coefficient
 
 
-def require_known_friction(value: Any) -> float:
-    """Return the coefficient of friction as a float, for models whose motion is independent of
+def require_known_friction(given_friction: Any) -> float:
+    """Return the coefficient of friction as a float, for models whose motion does not depend on
     friction.
 
-    Raises `TypeError` for an array with an axis or a traced value.
+    Raise a `TypeError` for an array with an axis or a traced value.
     """
-    if convert_friction(value).ndim or isinstance(value, jax.core.Tracer):
+    if convert_friction(given_friction).ndim or isinstance(given_friction, jax.core.Tracer):
         raise TypeError(
-            f"friction is {format_value(value)}, but one known number is needed here: give a "
+            f"friction is {format_value(given_friction)}, but one known number is needed here: "
+            "give a "
             "float, or take vrw.UnilateralWheel, whose friction may be an array or traced."
         )
-    return float(value)
+    return float(given_friction)
 
 
 def stack_parameters(params: WheelParams) -> Array:
-    """Return the float parameters as one array; the first axis follows `PARAMETER_NAMES`."""
-    return jnp.stack([getattr(params, name) for name in PARAMETER_NAMES])
-
-
-def wheel_from_parameters(
-    parameters: Array | tuple[Array, ...], n_legs: int, next_slope: Elementwise | None = None
-) -> WheelParams:
-    """Return the wheel with these float parameters, in the order of `PARAMETER_NAMES`.
-
-    - `next_slope`: slope of the next line on uneven ground, rad. Both slopes are then on a leading
-      axis of `slope`.
+    """Return the float parameters of a wheel as one array, whose first axis follows
+    `PARAMETER_NAMES`.
     """
-    wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameters, strict=True)), n_legs=n_legs)
+    return jnp.stack([getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES])
+
+
+def make_wheel_from_parameters(
+    parameter_values: Array | tuple[Array, ...], n_legs: int, next_slope: Elementwise | None = None
+) -> WheelParams:
+    """Return the wheel with float parameters in the order of `PARAMETER_NAMES`.
+
+    - `next_slope`: slope of the next line on uneven ground, rad. With it, the parameter `slope` has
+      both slopes on a leading axis.
+    """
+    wheel = WheelParams(**dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs)
     if next_slope is None:
         return wheel
     return eqx.tree_at(lambda wheel: wheel.slope, wheel, jnp.stack([wheel.slope, next_slope]))

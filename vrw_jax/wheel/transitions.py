@@ -1,4 +1,4 @@
-"""Collisions between the phases: landing of a foot, and Leg 2 at its stopper.
+"""Collisions between the phases: the landing of a foot, and Leg 2 at its stopper.
 
 The landing follows Section 3.4.1 of the paper with the procedure of Section 5.1. The collision with
 the stopper follows Section 3.4.2.
@@ -15,21 +15,21 @@ from vrw_jax.wheel.dynamics import (
     EquationTerms,
     FootForce,
     MassMatrix,
-    double_support_acceleration,
-    foot_force_from_residual,
-    fore_foot_force,
-    free_acceleration,
-    kinetic_energy,
-    mass_matrix,
-    momentum,
-    rear_foot_force,
+    compute_fore_foot_force,
+    compute_kinetic_energy,
+    compute_mass_matrix,
+    compute_momentum,
+    compute_rear_foot_force,
+    compute_rear_force_from_residual,
+    solve_double_support,
+    solve_unconstrained_dynamics,
 )
 from vrw_jax.wheel.geometry import (
     Motion,
-    double_support_circle,
-    landing_direction,
-    length_at_touchdown,
-    rear_direction,
+    compute_double_support_circle,
+    compute_length_at_touchdown,
+    rotate_to_landing_leg,
+    rotate_to_rear_leg,
 )
 from vrw_jax.wheel.params import Symbols
 
@@ -37,79 +37,91 @@ from vrw_jax.wheel.params import Symbols
 class Landing(NamedTuple):
     """Motion just after the landing of a foot, with impulses and energy loss."""
 
-    theta: Elementwise  # rad, in the leg labels of the starting step
-    motion: Motion  # just after the impact
-    distance: Elementwise  # D, between both feet, m
-    keeps_rear_foot: Bool[Array, "..."]  # whether lambda_I4 >= 0: (A4), else (A3)
+    theta_after: Elementwise  # rad, in the leg labels of the starting step
+    motion_after: Motion  # just after the impact
+    foot_distance: Elementwise  # D, between both feet, m
+    is_rear_foot_planted: Bool[Array, "..."]  # whether lambda_I4 >= 0: (A4), else (A3)
     fore_impulse: FootForce  # (lambda_I1, lambda_I2), N s, of the actual impact
     rear_impulse: FootForce  # (lambda_I3, lambda_I4), N s, with both feet held (A1)
-    energy_lost: Elementwise  # J
-    hub_jump: tuple[Elementwise, Elementwise]  # jump of the hub's velocity along (x, z), m/s
+    energy_loss: Elementwise  # J
+    hub_velocity_jump: tuple[
+        Elementwise, Elementwise
+    ]  # jump of the hub's velocity along (x, z), m/s
 
 
-def motion_before_landing(
+def compute_motion_before_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> Motion:
     """Return the motion just before a landing, from (theta-, dtheta-, dL1-).
 
-    Leg 2 is locked, and the next foot is on the ground.
+    Leg 2 is on its stopper, and the next foot is on the ground.
     """
-    L1 = length_at_touchdown(s, theta)
-    zero = 0.0 * (theta + s.L0)
-    return Motion.from_angle(theta, L1, s.L0 + zero, dtheta, dL1, zero)
+    L1 = compute_length_at_touchdown(s, theta)
+    zero_rate = 0.0 * (theta + s.L0)
+    return Motion.from_angle(theta, L1, s.L0 + zero_rate, dtheta, dL1, zero_rate)
 
 
 class _BothFeetLanding(NamedTuple):
-    """Landing that leaves both feet on the ground (A1), with intermediate results."""
+    """Landing after which both feet are on the ground (A1), with intermediate results."""
 
     motion_before: Motion
     motion_after: Motion
-    distance: Elementwise
-    foot_velocity: tuple[Elementwise, Elementwise]  # of the landing foot before the impact, m/s
-    mass: MassMatrix  # in the leg labels of the starting step
-    momentum: tuple[Elementwise, ...]  # generalized momentum about the new foot
-    circle_momentum: tuple[Elementwise, ...]  # mass matrix times the tangent of the hub's circle
+    foot_distance: Elementwise
+    landing_foot_velocity: tuple[
+        Elementwise, Elementwise
+    ]  # of the landing foot before the impact, m/s
+    mass_matrix: MassMatrix  # in the leg labels of the starting step
+    generalized_momentum: tuple[Elementwise, ...]  # generalized momentum about the new foot
+    momentum_per_circle_rate: tuple[
+        Elementwise, ...
+    ]  # mass matrix times the tangent of the hub's circle
 
 
 def _solve_both_feet_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> _BothFeetLanding:
     """Return the landing with both feet held on the ground (A1)."""
-    motion_before = motion_before_landing(s, theta, dtheta, dL1)
+    motion_before = compute_motion_before_landing(s, theta, dtheta, dL1)
     L1_before = motion_before.L1
     # The velocity of the landing foot follows eqs (16), (17) with the rate of L1 before the impact.
-    sin, cos = landing_direction(s, motion_before.sin, motion_before.cos)
+    sin, cos = rotate_to_landing_leg(s, motion_before.sin_theta, motion_before.cos_theta)
     foot_velocity_x = (
-        L1_before * motion_before.cos - s.L0 * cos
-    ) * dtheta + dL1 * motion_before.sin
+        L1_before * motion_before.cos_theta - s.L0 * cos
+    ) * dtheta + dL1 * motion_before.sin_theta
     foot_velocity_z = (
-        -(L1_before * motion_before.sin - s.L0 * sin) * dtheta + dL1 * motion_before.cos
+        -(L1_before * motion_before.sin_theta - s.L0 * sin) * dtheta + dL1 * motion_before.cos_theta
     )
 
-    rear_leg = rear_direction(s, sin, cos)
-    M = mass_matrix(s, s.L0, L1_before)
+    rear_leg = rotate_to_rear_leg(s, sin, cos)
+    M = compute_mass_matrix(s, s.L0, L1_before)
     # The generalized momentum of (theta, L1, L2) about the new foot includes the velocity of this
     # foot.
-    relative_momentum = M.multiply((dtheta, 0.0 * dtheta, dL1))
+    momentum_about_planted_foot = M.multiply_vector((dtheta, 0.0 * dtheta, dL1))
     A, B = s.Mh * s.L0 + s.m * s.L0, s.m * (s.L0 - L1_before)
     p1 = (
-        relative_momentum[0]
+        momentum_about_planted_foot[0]
         + (A * cos + B * rear_leg.cos) * foot_velocity_x
         - (A * sin + B * rear_leg.sin) * foot_velocity_z
     )
-    p2 = relative_momentum[1] + s.Mh * (sin * foot_velocity_x + cos * foot_velocity_z)
-    p3 = relative_momentum[2] - s.m * (
+    p2 = momentum_about_planted_foot[1] + s.Mh * (sin * foot_velocity_x + cos * foot_velocity_z)
+    p3 = momentum_about_planted_foot[2] - s.m * (
         rear_leg.sin * foot_velocity_x + rear_leg.cos * foot_velocity_z
     )
 
     # (A1) With both feet held, the hub can only move on its circle.
-    distance = s.L0 * s.sin_alpha / rear_leg.cos
-    circle = double_support_circle(s, distance, sin, cos)
-    circle_momentum = M.multiply((jnp.ones_like(circle.G1), circle.G1, circle.G2))
-    circle_inertia = (
-        circle_momentum[0] + circle.G1 * circle_momentum[1] + circle.G2 * circle_momentum[2]
+    foot_distance = s.L0 * s.sin_alpha / rear_leg.cos
+    hub_circle = compute_double_support_circle(s, foot_distance, sin, cos)
+    momentum_per_circle_rate = M.multiply_vector(
+        (jnp.ones_like(hub_circle.dL1_dtheta), hub_circle.dL1_dtheta, hub_circle.dL2_dtheta)
     )
-    dtheta_after = (p1 + circle.G1 * p2 + circle.G2 * p3) / circle_inertia
+    hub_circle_inertia = (
+        momentum_per_circle_rate[0]
+        + hub_circle.dL1_dtheta * momentum_per_circle_rate[1]
+        + hub_circle.dL2_dtheta * momentum_per_circle_rate[2]
+    )
+    dtheta_after = (
+        p1 + hub_circle.dL1_dtheta * p2 + hub_circle.dL2_dtheta * p3
+    ) / hub_circle_inertia
     locked_length = s.L0 + 0.0 * L1_before
     motion_after = Motion(
         sin,
@@ -117,29 +129,32 @@ def _solve_both_feet_landing(
         locked_length,
         L1_before,
         dtheta_after,
-        circle.G1 * dtheta_after,
-        circle.G2 * dtheta_after,
+        hub_circle.dL1_dtheta * dtheta_after,
+        hub_circle.dL2_dtheta * dtheta_after,
     )
     return _BothFeetLanding(
         motion_before,
         motion_after,
-        distance,
+        foot_distance,
         (foot_velocity_x, foot_velocity_z),
         M,
         (p1, p2, p3),
-        circle_momentum,
+        momentum_per_circle_rate,
     )
 
 
-def land_on_both_feet(
+def resolve_two_foot_landing(
     s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
 ) -> tuple[Elementwise, Elementwise]:
-    """Return (theta+, dtheta+) of a landing that leaves both feet on the ground, rad and rad/s."""
+    """Return (theta+, dtheta+) just after a landing with both feet on the ground, rad and rad/s."""
     return theta - s.alpha, _solve_both_feet_landing(s, theta, dtheta, dL1).motion_after.dtheta
 
 
-def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) -> Landing:
-    """Return the result of the exchange of legs and inelastic landing, eqs (15)-(21), (A1)-(A4).
+def resolve_landing(
+    s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise
+) -> Landing:
+    """Return the result of the exchange of legs and of the inelastic landing, eqs (15)-(21),
+    (A1)-(A4).
 
     The arguments theta, dtheta, dL1 are the section state just before touchdown, in the leg labels
     of the ending step. The result uses the leg labels of the starting step.
@@ -147,56 +162,64 @@ def land(s: Symbols, theta: Elementwise, dtheta: Elementwise, dL1: Elementwise) 
     (
         motion_before,
         motion_on_both_feet,
-        distance,
+        foot_distance,
         (foot_velocity_x, foot_velocity_z),
         M,
         (p1, p2, p3),
-        circle_momentum,
+        momentum_per_circle_rate,
     ) = _solve_both_feet_landing(s, theta, dtheta, dL1)
-    sin, cos, L1_before = motion_on_both_feet.sin, motion_on_both_feet.cos, motion_before.L1
+    sin_theta, cos_theta, L1_before = (
+        motion_on_both_feet.sin_theta,
+        motion_on_both_feet.cos_theta,
+        motion_before.L1,
+    )
     dtheta_both_feet = motion_on_both_feet.dtheta
-    rear_impulse = foot_force_from_residual(
+    rear_impulse = compute_rear_force_from_residual(
         s,
         motion_on_both_feet,
-        circle_momentum[1] * dtheta_both_feet - p2,
-        circle_momentum[2] * dtheta_both_feet - p3,
+        momentum_per_circle_rate[1] * dtheta_both_feet - p2,
+        momentum_per_circle_rate[2] * dtheta_both_feet - p3,
     )
-    keeps_rear_foot = rear_impulse.normal >= 0.0
+    is_rear_foot_planted = rear_impulse.normal >= 0.0
 
     # (A3) With only the landing foot held, M rates = p.
-    free_rates = free_acceleration(s, s.L0, EquationTerms(M, p1, p2, p3))
+    rates_without_rear_foot = solve_unconstrained_dynamics(s, s.L0, EquationTerms(M, p1, p2, p3))
     motion_after = motion_on_both_feet._replace(
-        dtheta=jnp.where(keeps_rear_foot, dtheta_both_feet, free_rates.ddtheta),
-        dL1=jnp.where(keeps_rear_foot, motion_on_both_feet.dL1, free_rates.ddL1),
-        dL2=jnp.where(keeps_rear_foot, motion_on_both_feet.dL2, free_rates.ddL2),
+        dtheta=jnp.where(is_rear_foot_planted, dtheta_both_feet, rates_without_rear_foot.ddtheta),
+        dL1=jnp.where(is_rear_foot_planted, motion_on_both_feet.dL1, rates_without_rear_foot.ddL1),
+        dL2=jnp.where(is_rear_foot_planted, motion_on_both_feet.dL2, rates_without_rear_foot.ddL2),
     )
     # The impulse at the fore foot is the jump of total momentum minus the impulse at the rear foot.
-    px, pz = momentum(s, motion_after)
-    relabeled_motion = Motion(sin, cos, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
-    momentum_before_x, momentum_before_z = momentum(s, relabeled_motion)
+    momentum_after_x, momentum_after_z = compute_momentum(s, motion_after)
+    relabeled_motion = Motion(sin_theta, cos_theta, s.L0, L1_before, dtheta, 0.0 * dtheta, dL1)
+    momentum_before_x, momentum_before_z = compute_momentum(s, relabeled_motion)
     applied_rear_impulse = FootForce(
-        jnp.where(keeps_rear_foot, rear_impulse.tangential, 0.0),
-        jnp.where(keeps_rear_foot, rear_impulse.normal, 0.0),
+        jnp.where(is_rear_foot_planted, rear_impulse.tangential, 0.0),
+        jnp.where(is_rear_foot_planted, rear_impulse.normal, 0.0),
     )
     fore_impulse = FootForce(
-        px - momentum_before_x - s.Mt * foot_velocity_x - applied_rear_impulse.tangential,
-        pz - momentum_before_z - s.Mt * foot_velocity_z - applied_rear_impulse.normal,
+        momentum_after_x
+        - momentum_before_x
+        - s.Mt * foot_velocity_x
+        - applied_rear_impulse.tangential,
+        momentum_after_z - momentum_before_z - s.Mt * foot_velocity_z - applied_rear_impulse.normal,
     )
     return Landing(
-        theta=theta - s.alpha,
-        motion=motion_after,
-        distance=distance,
-        keeps_rear_foot=keeps_rear_foot,
+        theta_after=theta - s.alpha,
+        motion_after=motion_after,
+        foot_distance=foot_distance,
+        is_rear_foot_planted=is_rear_foot_planted,
         fore_impulse=fore_impulse,
         rear_impulse=rear_impulse,
-        energy_lost=kinetic_energy(s, motion_before) - kinetic_energy(s, motion_after),
-        hub_jump=hub_velocity_jump(motion_before, motion_after),
+        energy_loss=compute_kinetic_energy(s, motion_before)
+        - compute_kinetic_energy(s, motion_after),
+        hub_velocity_jump=compute_hub_velocity_jump(motion_before, motion_after),
     )
 
 
-def stop_leg_2(s: Symbols, motion_before: Motion) -> Motion:
-    """Return the motion after Leg 2, at L2 = L0, has met its stopper."""
-    M = mass_matrix(s, motion_before.L1, motion_before.L2)
+def lock_leg_2(s: Symbols, motion_before: Motion) -> Motion:
+    """Return the motion after the collision of Leg 2, at L2 = L0, with its stopper."""
+    M = compute_mass_matrix(s, motion_before.L1, motion_before.L2)
     return motion_before._replace(
         dtheta=motion_before.dtheta + M.M13 * motion_before.dL2 / M.M11,
         dL1=motion_before.dL1 + M.M23 * motion_before.dL2 / M.M22,
@@ -204,86 +227,94 @@ def stop_leg_2(s: Symbols, motion_before: Motion) -> Motion:
     )
 
 
-class StopperHit(NamedTuple):
+class StopperCollision(NamedTuple):
     """Motion just after the collision of Leg 2 with its stopper, with impulses and energy loss."""
 
-    motion: Motion  # just after the impact, L2 = L0 exactly
+    motion_after: Motion  # just after the impact, L2 = L0 exactly
     stopper_impulse: Elementwise  # on the mass of Leg 2, towards the hub, N s
     foot_impulse: FootForce  # of the ground on the foot of Leg 1, N s
-    energy_lost: Elementwise  # J
-    hub_jump: tuple[Elementwise, Elementwise]  # m/s
+    energy_loss: Elementwise  # J
+    hub_velocity_jump: tuple[Elementwise, Elementwise]  # m/s
 
 
-def hit_stopper(s: Symbols, motion: Motion) -> StopperHit:
+def resolve_stopper_collision(s: Symbols, motion: Motion) -> StopperCollision:
     """Return the result of the inelastic collision of Leg 2 with its stopper at L2 = L0, eqs
     (22)-(25).
 
-    M12 vanishes there, so the impact needs only two divisions.
+    M12 vanishes at this length, so the impact needs only two divisions.
     """
     motion_before = motion._replace(L2=s.L0 + 0.0 * motion.L2)
-    motion_after = stop_leg_2(s, motion_before)
-    hub_jump = hub_velocity_jump(motion_before, motion_after)
-    rear_leg = rear_direction(s, motion_before.sin, motion_before.cos)
-    momentum_before_x, momentum_before_z = momentum(s, motion_before)
-    momentum_after_x, momentum_after_z = momentum(s, motion_after)
-    return StopperHit(
-        motion=motion_after,
+    motion_after = lock_leg_2(s, motion_before)
+    hub_jump = compute_hub_velocity_jump(motion_before, motion_after)
+    rear_leg = rotate_to_rear_leg(s, motion_before.sin_theta, motion_before.cos_theta)
+    momentum_before_x, momentum_before_z = compute_momentum(s, motion_before)
+    momentum_after_x, momentum_after_z = compute_momentum(s, motion_after)
+    return StopperCollision(
+        motion_after=motion_after,
         stopper_impulse=s.m
         * (motion_before.dL2 + hub_jump[0] * rear_leg.sin + hub_jump[1] * rear_leg.cos),
         foot_impulse=FootForce(
             momentum_after_x - momentum_before_x, momentum_after_z - momentum_before_z
         ),
-        energy_lost=kinetic_energy(s, motion_before) - kinetic_energy(s, motion_after),
-        hub_jump=hub_jump,
+        energy_loss=compute_kinetic_energy(s, motion_before)
+        - compute_kinetic_energy(s, motion_after),
+        hub_velocity_jump=hub_jump,
     )
 
 
-def hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
-    """Return the velocity of the hub along (x, z) with the foot of Leg 1 at rest, m/s."""
+def compute_hub_velocity(motion: Motion) -> tuple[Elementwise, Elementwise]:
+    """Return the velocity of the hub along (x, z), m/s, with the foot of Leg 1 at rest."""
     transverse_velocity = motion.L1 * motion.dtheta
     return (
-        motion.dL1 * motion.sin + transverse_velocity * motion.cos,
-        motion.dL1 * motion.cos - transverse_velocity * motion.sin,
+        motion.dL1 * motion.sin_theta + transverse_velocity * motion.cos_theta,
+        motion.dL1 * motion.cos_theta - transverse_velocity * motion.sin_theta,
     )
 
 
-def hub_velocity_jump(
+def compute_hub_velocity_jump(
     motion_before: Motion, motion_after: Motion
 ) -> tuple[Elementwise, Elementwise]:
     """Return the jump of the hub's velocity along (x, z), m/s."""
     (x, z), (velocity_after_x, velocity_after_z) = (
-        hub_velocity(motion_before),
-        hub_velocity(motion_after),
+        compute_hub_velocity(motion_before),
+        compute_hub_velocity(motion_after),
     )
     return velocity_after_x - x, velocity_after_z - z
 
 
-def locked_leg_impulses(
+def compute_locked_leg_impulses(
     s: Symbols,
     motion: Motion,
     hub_jump: tuple[Elementwise, Elementwise],
     leg_numbers: range,
 ) -> Float[Array, "n_legs_asked ..."]:
-    """Return the stopper impulse on the mass of each of `leg_numbers` for a jump of the hub's
-    velocity, N s.
+    """Return the impulse of the stopper on the mass of each of `leg_numbers`, N s.
 
-    The impulse is negative if the collision throws the leg off its stopper: a preload resists no
-    impulse.
+    The impulse follows from the jump of the hub's velocity. It is negative if the collision throws
+    the leg off its stopper, because the preload of a spring resists no impulse.
     """
-    leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.sin)) - 1)
-    radial_jump = hub_jump[0] * motion.sin + hub_jump[1] * motion.cos
-    transverse_jump = hub_jump[0] * motion.cos - hub_jump[1] * motion.sin
-    return s.m * (radial_jump * np.cos(leg_angles) + transverse_jump * np.sin(leg_angles))
+    leg_angles = s.alpha * (
+        np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.sin_theta)) - 1
+    )
+    radial_velocity_jump = hub_jump[0] * motion.sin_theta + hub_jump[1] * motion.cos_theta
+    transverse_velocity_jump = hub_jump[0] * motion.cos_theta - hub_jump[1] * motion.sin_theta
+    return s.m * (
+        radial_velocity_jump * np.cos(leg_angles) + transverse_velocity_jump * np.sin(leg_angles)
+    )
 
 
-def landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
-    """Return the fore and rear foot force just after a landing with both feet planted, N.
+def compute_landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
+    """Return the fore and the rear foot force just after a landing with both feet planted, N.
 
     The forces follow (B1) and eq. (38).
     """
-    circle = double_support_circle(s, landing.distance, landing.motion.sin, landing.motion.cos)
-    dtheta = landing.motion.dtheta
-    motion = landing.motion._replace(dL1=circle.G1 * dtheta, dL2=circle.G2 * dtheta)
-    acceleration = double_support_acceleration(s, landing.distance, motion)
-    rear_force = rear_foot_force(s, motion, acceleration)
-    return fore_foot_force(s, motion, acceleration, rear_force), rear_force
+    hub_circle = compute_double_support_circle(
+        s, landing.foot_distance, landing.motion_after.sin_theta, landing.motion_after.cos_theta
+    )
+    dtheta = landing.motion_after.dtheta
+    motion = landing.motion_after._replace(
+        dL1=hub_circle.dL1_dtheta * dtheta, dL2=hub_circle.dL2_dtheta * dtheta
+    )
+    acceleration = solve_double_support(s, landing.foot_distance, motion)
+    rear_force = compute_rear_foot_force(s, motion, acceleration)
+    return compute_fore_foot_force(s, motion, acceleration, rear_force), rear_force

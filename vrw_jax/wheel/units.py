@@ -1,8 +1,8 @@
-"""Units of length, time and mass of a wheel, in which numerical options hold.
+"""Units of length, time and mass of a wheel, in which numerical options are stated.
 
-The tolerances and time limits of a step are stated for a wheel of Table 1's length, mass and
-gravity. In its units every wheel has the size of Table 1's wheel. So no result depends on the units
-of the parameters.
+The tolerances and time limits of a step refer to a wheel with Table 1's length, mass and gravity.
+In its own units, every wheel has the size of Table 1's wheel. Therefore no result depends on the
+units of the parameters.
 """
 
 from typing import Any, NamedTuple
@@ -31,72 +31,90 @@ TABLE_1_MASS_KG = 18.0
 
 
 class WheelUnits(NamedTuple):
-    """Units of length, time and mass of a wheel, as numbers in SI. They have no derivatives."""
+    """Units of length, time and mass of a wheel, as SI numbers without derivatives."""
 
-    length: Any  # m
-    time: Any  # s
-    mass: Any  # kg
+    length_unit: Any  # m
+    time_unit: Any  # s
+    mass_unit: Any  # kg
 
-    def si_value(self, unit: str) -> Elementwise:
-        """Return the wheel's unit for an SI unit such as "N s/m", as a number in SI."""
-        length, time, mass = UNIT_POWERS[unit]
-        return self.length**length * self.time**time * self.mass**mass
+    def compute_unit_in_si(self, si_unit: str) -> Elementwise:
+        """Return the wheel's unit of a quantity as an SI number.
 
-    @property
-    def velocity(self) -> Elementwise:
-        """Return the unit of a velocity, m/s."""
-        return self.length / self.time
-
-    @property
-    def rate(self) -> Elementwise:
-        """Return the unit of an angular velocity, rad/s."""
-        return 1.0 / self.time
+        - `si_unit`: SI unit of the quantity, such as "N s/m".
+        """
+        length_power, time_power, mass_power = UNIT_POWERS[si_unit]
+        return (
+            self.length_unit**length_power * self.time_unit**time_power * self.mass_unit**mass_power
+        )
 
     @property
-    def acceleration(self) -> Elementwise:
-        """Return the unit of an acceleration, m/s^2."""
-        return self.velocity / self.time
+    def velocity_unit(self) -> Elementwise:
+        """Return the wheel's unit of velocity, m/s."""
+        return self.length_unit / self.time_unit
 
     @property
-    def energy(self) -> Elementwise:
-        """Return the unit of an energy, J."""
-        return self.mass * self.velocity * self.velocity
+    def rate_unit(self) -> Elementwise:
+        """Return the wheel's unit of angular velocity, rad/s."""
+        return 1.0 / self.time_unit
 
-    def scale_times(self, options: StepOptions) -> StepOptions:
-        """Return the options with times in seconds, from options with times in the wheel's unit."""
-        select_times = lambda o: (o.max_phase_time, o.dt0)
+    @property
+    def acceleration_unit(self) -> Elementwise:
+        """Return the wheel's unit of acceleration, m/s^2."""
+        return self.velocity_unit / self.time_unit
+
+    @property
+    def energy_unit(self) -> Elementwise:
+        """Return the wheel's unit of energy, J."""
+        return self.mass_unit * self.velocity_unit * self.velocity_unit
+
+    def scale_times_to_seconds(self, options: StepOptions) -> StepOptions:
+        """Return step options with times in seconds, from options with times in the wheel's
+        unit.
+        """
+        time_selector = lambda o: (o.max_phase_time, o.dt0)
         return eqx.tree_at(
-            select_times, options, tuple(self.time * x for x in select_times(options))
+            time_selector, options, tuple(self.time_unit * x for x in time_selector(options))
         )
 
 
 def compute_wheel_units(s: Symbols) -> WheelUnits:
-    """Return the units of a wheel: 1 m, 1 s and 1 kg for Table 1's wheel, to the last bit."""
-    length, gravity = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
-    return lax.stop_gradient(WheelUnits(length, jnp.sqrt(length / gravity), s.Mt / TABLE_1_MASS_KG))
+    """Return the units of a wheel. For Table 1's wheel they are exactly 1 m, 1 s and 1 kg."""
+    length_ratio, gravity_ratio = s.L0 / TABLE_1_LENGTH_M, s.g / TABLE_1_GRAVITY_M_PER_S2
+    return lax.stop_gradient(
+        WheelUnits(length_ratio, jnp.sqrt(length_ratio / gravity_ratio), s.Mt / TABLE_1_MASS_KG)
+    )
 
 
 def convert_to_wheel_units(params: WheelParams) -> WheelParams:
-    """Return the similar wheel of Table 1's length, gravity and mass: `params` in its own units."""
-    units = compute_wheel_units(params.symbols())
+    """Return `params` in the wheel's own units, which is a similar wheel with Table 1's length,
+    gravity and mass.
+    """
+    wheel_units = compute_wheel_units(params.symbols())
     return WheelParams(
         **{
-            name: getattr(params, name) / units.si_value(domain.unit)
-            for name, domain in PARAMETER_DOMAINS.items()
+            parameter_name: getattr(params, parameter_name)
+            / wheel_units.compute_unit_in_si(domain.unit)
+            for parameter_name, domain in PARAMETER_DOMAINS.items()
         },
         n_legs=params.n_legs,
     )
 
 
 def compute_wheel_units_of_rows(parameter_rows: np.ndarray, n_legs: int) -> WheelUnits:
-    """Return `compute_wheel_units` of many wheels by numpy; the units of an invalid wheel are 1.
+    """Return the units of many wheels, computed by NumPy. The units of an invalid wheel are 1.
 
     - `parameter_rows`: parameters of each wheel in the order of `PARAMETER_NAMES`.
     """
     values_by_name = dict(zip(PARAMETER_NAMES, np.asarray(parameter_rows).T, strict=False))
-    length = values_by_name["locked_length"] / TABLE_1_LENGTH_M
-    gravity = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
-    mass = (values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]) / TABLE_1_MASS_KG
-    is_valid = np.isfinite(length + gravity + mass) & (np.minimum(length, gravity) > 0.0)
-    length, gravity, mass = (np.where(is_valid, x, 1.0) for x in (length, gravity, mass))
-    return WheelUnits(length, np.sqrt(length / gravity), mass)
+    length_ratio = values_by_name["locked_length"] / TABLE_1_LENGTH_M
+    gravity_ratio = values_by_name["gravity"] / TABLE_1_GRAVITY_M_PER_S2
+    mass_ratio = (
+        values_by_name["hub_mass"] + n_legs * values_by_name["leg_mass"]
+    ) / TABLE_1_MASS_KG
+    is_valid_wheel = np.isfinite(length_ratio + gravity_ratio + mass_ratio) & (
+        np.minimum(length_ratio, gravity_ratio) > 0.0
+    )
+    length_ratio, gravity_ratio, mass_ratio = (
+        np.where(is_valid_wheel, x, 1.0) for x in (length_ratio, gravity_ratio, mass_ratio)
+    )
+    return WheelUnits(length_ratio, np.sqrt(length_ratio / gravity_ratio), mass_ratio)

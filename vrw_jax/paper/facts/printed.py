@@ -14,7 +14,14 @@ import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax.numerics import Scalar
-from vrw_jax.wheel import Motion, Symbols, WheelParams, length_at_touchdown, mass_matrix, momentum
+from vrw_jax.wheel import (
+    Motion,
+    Symbols,
+    WheelParams,
+    compute_length_at_touchdown,
+    compute_mass_matrix,
+    compute_momentum,
+)
 
 
 @jax.jit
@@ -23,7 +30,7 @@ def _compute_symbols_and_touchdown_length(
 ) -> tuple[Symbols, Array]:
     """Return the symbols of the paper, and the length of Leg 1 at touchdown in m."""
     s = params.symbols()
-    return s, length_at_touchdown(s, jnp.asarray(theta))
+    return s, compute_length_at_touchdown(s, jnp.asarray(theta))
 
 
 def compute_double_support_jacobian(
@@ -113,17 +120,17 @@ def compute_five_coordinate_mass_matrix(s: Symbols, theta: Scalar, L1: Scalar, L
     It consists of the mass matrix of the planted wheel and the momentum of a wheel whose foot
     moves.
     """
-    planted_mass_matrix = mass_matrix(s, L1, L2)
+    planted_mass_matrix = compute_mass_matrix(s, L1, L2)
     unit_vectors = jnp.eye(3)
     angular_block = jnp.stack(
         [
-            jnp.stack(planted_mass_matrix.multiply(tuple(unit_vector)))
+            jnp.stack(planted_mass_matrix.multiply_vector(tuple(unit_vector)))
             for unit_vector in unit_vectors
         ]
     )
     foot_momentum = jnp.stack(
         [
-            jnp.stack(momentum(s, Motion.from_angle(theta, L1, L2, *unit_vector)))
+            jnp.stack(compute_momentum(s, Motion.from_angle(theta, L1, L2, *unit_vector)))
             for unit_vector in unit_vectors
         ],
         axis=-1,
