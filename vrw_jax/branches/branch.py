@@ -145,12 +145,12 @@ class Branch:
         )
         is_stable = self.stable
         text_lines = [
-            f"Branch along {self.parameter}: {self.values.size} gaits from {self.values[0]:.6g} to "
-            f"{self.values[-1]:.6g}{parameter_unit}, {int(is_stable.sum())} stable, "
-            f"{int((~is_stable).sum())} not.",
+            f"Branch along {self.parameter}: {self.values.size} gaits from "
+            f"{self.values.min():.6g} to {self.values.max():.6g}{parameter_unit}, "
+            f"{int(is_stable.sum())} stable, {int((~is_stable).sum())} unstable.",
             f"  at {self.values[0]:.6g}: {self.ends[0]}",
             f"  at {self.values[-1]:.6g}: {self.ends[1]}",
-            f"  {len(self.special_points)} special points" + (":" if self.special_points else "."),
+            f"  special points: {len(self.special_points)}",
             *(
                 f"    {special_point}"
                 for special_point in self.special_points[:MAX_PRINTED_SPECIAL_POINTS]
