@@ -20,7 +20,8 @@ MAX_NOTEBOOK_BYTES = 400_000
 
 def test_there_are_notebooks():
     assert {path.stem for path in NOTEBOOKS} >= {
-        "branch", "ground", "identification", "sensitivities", "tolerances", "tuning",
+        "branch", "force_peaks", "ground", "identification", "sensitivities", "tolerances",
+        "tuning",
     }  # fmt: skip
 
 

@@ -242,7 +242,7 @@ def measure_gaits(
         values = {name: float(columns[name][i]) for name in BOX}
         params, state = vrw.WheelParams(**values), gaits["section_state"][i]
         values |= {name: float(x[i]) for name, x in gaits.items() if name != "section_state"}
-        landing = transitions.land(params.symbols(), *map(jnp.asarray, state))
+        landing = transitions.resolve_landing(params.symbols(), *map(jnp.asarray, state))
         values["landing_impulse"] = float(landing.fore_impulse.normal)
         values |= measure_step(params, state)
         rows.append(format_row(comparison, labels[i], values))

@@ -1,24 +1,56 @@
-"""Map the number of force peaks over stiffness and slope, at two dampings and natural lengths.
+"""Count the force peaks of gaits over stiffness, slope, damping, leg mass and friction.
 
-    python -m experiments.gaits.force_peaks [--redraw]
+    python -m experiments.gaits.force_peaks [--only PART ...] [--redraw]
 
-The damping ratios and natural lengths are those of the parameter sets `two_peaks` and `table_1`.
-Each of the four maps has 20 x 20 wheels. Their gaits are limit cycles of the paper's model on one
-mesh. For each gait the table also contains the time on one foot in periods of the damped bounce,
-and the quotient of this period and the step's duration. An overdamped leg has no bounce.
+The maps cover stiffness and slope, at the damping ratios and natural lengths of the parameter sets
+`two_peaks` and `table_1`. Each of the four maps has 20 x 20 wheels, whose gaits are limit cycles of
+the paper's model on one mesh. For each gait the table also contains the times of its peaks in
+periods of the damped bounce on one leg. An overdamped leg has no bounce.
 
-The command writes `force_peaks.csv` and the figure, and fills the block of
-docs/studies/one_peak_or_two.md. It takes one minute on one core.
+The parts are `maps` and those of `force_peak_borders`, `force_peak_comparisons` and
+`force_peak_stances`. The command writes their tables and three figures, and fills the blocks of
+docs/studies/one_peak_or_two.md. It takes half an hour on one core.
 """
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from scipy.interpolate import make_interp_spline
 
 import vrw_jax as vrw
+from experiments.gaits.force_peak_borders import (
+    BISECTION_TABLE,
+    CURVE_TABLE,
+    MAP_TABLE,
+    compute_borders,
+)
+from experiments.gaits.force_peak_comparisons import (
+    CONTACT_TABLE,
+    LEG_MASS_TABLE,
+    compute_comparisons,
+)
+from experiments.gaits.force_peak_figures import (
+    PEAK_COLORS,
+    PEAK_LABELS,
+    SLOPE_LABEL,
+    STIFFNESS_LABEL,
+    count_separated_peaks,
+    draw_causes,
+    draw_comparisons,
+    draw_peak_map,
+    format_log_axes,
+)
+from experiments.gaits.force_peak_stances import SPRING_MASS_TABLE, compute_stances
+from experiments.gaits.force_peak_wheels import (
+    GAIT_OPTIONS,
+    compute_bounce_periods,
+    compute_damping_ratio,
+    compute_peak_times,
+    compute_stiffness_number,
+    make_wheels,
+)
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     DOCS,
@@ -26,6 +58,7 @@ from experiments.shared.tables import (
     Row,
     describe_run,
     format_markdown,
+    group_rows,
     read_column,
     read_table,
     replace_block,
@@ -43,75 +76,46 @@ STIFFNESS_NUMBERS = np.geomspace(1.5, 24.0, N_PER_AXIS)
 SLOPES = np.geomspace(0.03, 0.4, N_PER_AXIS)
 """Slopes, rad, chosen because they cover both parameter sets."""
 
-MAP_OPTIONS = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
-"""One mesh for all gaits, chosen because gaits with two peaks need its resolution."""
+LEAST_RELATIVE_TROUGH = 1e-3
+"""Depth of a trough over the peak force, chosen because bisection leaves less if both vanish."""
 
 MEASURE_NAMES = ("n_force_peaks", "peak_force", "force_trough_depth", "dls_fraction",
                  "spectral_radius", "period")  # fmt: skip
-PEAK_COLORS = {0: "#56B4E9", 1: "#0072B2", 2: "#E69F00", 3: "#D55E00"}
-"""Colors of Okabe and Ito by number of peaks."""
+BOUNCE_COLUMNS = ("bounces", "step_bounces", "first_peak_to_touchdown", "peak_distance")
+"""Durations in periods of the bounce: of single support, of the step, from the first peak to the
+next touchdown, and from the first peak to the second."""
 
-MAP_TABLE = FIGURES / "force_peaks.csv"
 PAGE = DOCS / "studies/one_peak_or_two.md"
 
 
-def compute_total_mass(params: vrw.WheelParams) -> float:
-    """Return the mass of the wheel, kg."""
-    return float(params.hub_mass + params.n_legs * params.leg_mass)
-
-
-def compute_stiffness_number(params: vrw.WheelParams) -> float:
-    """Return the dimensionless stiffness k L0 / (M g)."""
-    weight = compute_total_mass(params) * float(params.gravity)
-    return float(params.stiffness * params.locked_length) / weight
-
-
-def compute_damping_ratio(params: vrw.WheelParams) -> float:
-    """Return the damping ratio c / (2 sqrt(k M)) of the wheel's mass on one leg."""
-    critical_damping = 2.0 * np.sqrt(float(params.stiffness) * compute_total_mass(params))
-    return float(params.damping) / critical_damping
-
-
-def compute_bounce_periods(stiffness: np.ndarray, ratio: np.ndarray, mass: float) -> np.ndarray:
-    """Return the periods of the wheel's damped bounce on one leg, s; NaN for overdamped legs."""
-    is_underdamped = ratio < 1.0
-    damped_rate = np.sqrt(stiffness / mass * np.where(is_underdamped, 1.0 - ratio**2, 1.0))
-    return np.where(is_underdamped, 2.0 * np.pi / damped_rate, np.nan)
-
-
-def compute() -> None:
+def compute_maps() -> None:
     """Search the gaits of all wheels, and write the table."""
-    table_1 = vrw.WheelParams()
     marked_params = [vrw.parameter_sets[name].params for name in MARKED_SETS]
     ratios = [compute_damping_ratio(params) for params in marked_params]
     lengths = [float(params.natural_length) for params in marked_params]
     ratio, length, number, slope = (
         x.ravel() for x in np.meshgrid(ratios, lengths, STIFFNESS_NUMBERS, SLOPES, indexing="ij")
     )
-    mass = compute_total_mass(table_1)
-    stiffness = number / compute_stiffness_number(table_1) * float(table_1.stiffness)
-    params = vrw.WheelParams(
-        stiffness=stiffness,
-        damping=2.0 * ratio * np.sqrt(stiffness * mass),
-        natural_length=length,
-        slope=slope,
-    )
-    gaits = vrw.limit_cycles(params, options=MAP_OPTIONS)
+    params = make_wheels(number, ratio, slope, length)
+    gaits = vrw.limit_cycles(params, options=GAIT_OPTIONS)
     measures = {name: np.asarray(x) for name, x in gaits.measures(MEASURE_NAMES).items()}
-    bounce_periods = compute_bounce_periods(stiffness, ratio, mass)
-    numbers = measures | {
-        "bounces": np.asarray(gaits.durations)[:, 1:].sum(1) / bounce_periods,
-        "bounce_to_step": bounce_periods / np.where(gaits.found, measures["period"], np.nan),
-    }
+    bounce_periods = compute_bounce_periods(params)
+    single_support = np.asarray(gaits.durations)[:, 1:].sum(1)
     rows = []
     for i, outcome in enumerate(np.asarray(gaits.outcome)):
         row = {"damping_ratio": f"{ratio[i]:.4f}", "natural_length": f"{length[i]:g}",
                "stiffness_number": f"{number[i]:.5g}", "slope": f"{slope[i]:.5g}",
                "outcome": vrw.Outcome(int(outcome)).name}  # fmt: skip
         if outcome == vrw.Outcome.STEPPED:
-            row |= {name: f"{x[i]:.4g}" for name, x in numbers.items() if np.isfinite(x[i])}
+            row |= {name: f"{x[i]:.4g}" for name, x in measures.items()}
+            if np.isfinite(bounce_periods[i]):
+                durations = {"bounces": single_support[i], "step_bounces": measures["period"][i]}
+                row |= {name: f"{x / bounce_periods[i]:.4g}" for name, x in durations.items()}
+                wheel = jax.tree.map(lambda x, i=i: np.broadcast_to(x, number.shape)[i], params)
+                times = compute_peak_times(wheel, np.asarray(gaits.section_state[i]))._asdict()
+                row |= {name: f"{x:.4g}" for name, x in times.items() if np.isfinite(x)}
         rows.append(row)
-    header = (*list(rows[0])[:5], *numbers)
+    header = (*list(rows[0])[:5], *MEASURE_NAMES, *BOUNCE_COLUMNS)
     write_named_rows(MAP_TABLE, [{name: row.get(name, "") for name in header} for row in rows])
 
 
@@ -120,17 +124,12 @@ def select_gaits(rows: list[Row], panel: tuple[str, str]) -> list[Row]:
     return [row for row in rows if row["n_force_peaks"] and get_panel(row) == panel]
 
 
-def has_whole_bounce(row: Row) -> bool:
-    """Return whether single support lasts at least one period of the bounce."""
-    return bool(row["bounces"]) and float(row["bounces"]) >= 1.0
-
-
 def get_panel(row: Row) -> tuple[str, str]:
     """Return the damping ratio and natural length of the map to which a wheel belongs."""
     return row["damping_ratio"], row["natural_length"]
 
 
-def summarize(rows: list[Row]) -> str:
+def summarize_maps(rows: list[Row]) -> str:
     """Return a table in Markdown: one line per map and number of peaks."""
     lines = []
     for panel in dict.fromkeys(map(get_panel, rows)):
@@ -145,51 +144,140 @@ def summarize(rows: list[Row]) -> str:
             lines.append([
                 f"{float(panel[0]):.2f}", f"{float(panel[1]):.2f}", n_peaks, len(group),
                 int(np.sum(read_column(group, "spectral_radius") >= 1.0)),
-                describe_range(group, "bounces"), sum(map(has_whole_bounce, group)),
-                describe_range(group, "bounce_to_step"), describe_range(group, "dls_fraction"),
+                *(describe_range(group, name) for name in ("first_peak_to_touchdown",
+                  "peak_distance", "bounces", "step_bounces", "dls_fraction")),
                 "–" if depth is None else f"{depth:.1%}",
             ])  # fmt: skip
-    header = ("damping ratio", "L*, m", "peaks", "gaits", "unstable", "bounces in single support",
-              "gaits with a whole bounce", "bounce period / step", "DLS fraction",
+    header = ("damping ratio", "L*, m", "peaks", "gaits", "unstable", "first peak to touchdown",
+              "first peak to second", "single support", "step", "DLS fraction",
               "deepest trough / peak")  # fmt: skip
     return format_markdown(header, lines)
 
 
+def summarize_comparisons() -> str:
+    """Return a table in Markdown: numbers of gaits by number of peaks, one line per map."""
+    contact_maps = group_rows(read_table(CONTACT_TABLE), "map")
+    groups = (
+        ("over leg mass and stiffness, the paper's model",
+         read_table(LEG_MASS_TABLE)),
+        ("over slope and stiffness, unilateral contact", contact_maps["stiffness"]),
+        ("over slope and friction, unilateral contact", contact_maps["friction"]),
+    )  # fmt: skip
+    lines = []
+    for label, rows in groups:
+        gaits = [row for row in rows if row["n_force_peaks"]]
+        n_peaks = np.array([count_separated_peaks(row) for row in gaits])
+        with_trough = [row for row, n in zip(gaits, n_peaks, strict=True) if n > 1]
+        lines.append([
+            label, len(rows), len(gaits), *(int(np.sum(n_peaks == n)) for n in range(2)),
+            len(with_trough), describe_range(with_trough, "dls_fraction"),
+        ])  # fmt: skip
+    header = ("map", "wheels", "gaits", "no peak", "one peak", "two or more with a trough",
+              "DLS fraction of those with a trough")  # fmt: skip
+    return format_markdown(header, lines)
+
+
+def summarize_curve() -> str:
+    """Return a table in Markdown: the curve of special points beside the border by bisection."""
+    curve = read_table(CURVE_TABLE)
+    stiffness, slope = (read_column(curve, name) for name in ("stiffness_number", "slope"))
+    order = np.argsort(stiffness)
+    interpolate = make_interp_spline(stiffness[order], slope[order], 3)
+    bisected = [row for row in select_borders("1")
+                if stiffness.min() < float(row["stiffness_number"]) < stiffness.max()]  # fmt: skip
+    difference = interpolate(read_column(bisected, "stiffness_number")) - read_column(
+        bisected, "slope"
+    )
+    header = ("points", "k L0 / (M g)", "slope, rad", "unstable", "bisected wheels",
+              "largest difference of slopes, rad")  # fmt: skip
+    line = [len(curve), describe_range(curve, "stiffness_number"), describe_range(curve, "slope"),
+            int(np.sum(read_column(curve, "spectral_radius") >= 1.0)), len(bisected),
+            f"{np.abs(difference).max():.0e}"]  # fmt: skip
+    return format_markdown(header, [line])
+
+
+def select_borders(natural_length: str) -> list[Row]:
+    """Return the bisected wheels with this natural length, m."""
+    return [row for row in read_table(BISECTION_TABLE) if row["natural_length"] == natural_length]
+
+
+def is_cut_off(row: Row) -> bool:
+    """Return whether the second peak of a border is lost at a touchdown, with a deep trough."""
+    return float(row["trough_to_peak"]) > LEAST_RELATIVE_TROUGH
+
+
+def summarize_bisections() -> str:
+    """Return a table in Markdown: one line per natural length and kind of border."""
+    lines = []
+    for natural_length in ("1", "1.02"):
+        borders = select_borders(natural_length)
+        for label, group in (
+            ("meets the trough", [row for row in borders if not is_cut_off(row)]),
+            ("touchdown at the peak", [row for row in borders if is_cut_off(row)]),
+        ):
+            lines.append([
+                natural_length, label, len(group),
+                *(describe_range(group, name) for name in ("stiffness_number", "slope",
+                  "first_peak_to_touchdown", "trough_to_peak", "dls_fraction")),
+            ])  # fmt: skip
+    header = ("L*, m", "end of the second peak", "wheels", "k L0 / (M g)", "slope, rad",
+              "first peak to touchdown", "trough / peak", "DLS fraction")  # fmt: skip
+    return format_markdown(header, lines)
+
+
+def summarize_spring_mass() -> str:
+    """Return a table in Markdown: the measures of the spring-mass walker."""
+    (row,) = read_table(SPRING_MASS_TABLE)
+    return format_markdown([name.replace("_", " ") for name in row], [list(row.values())])
+
+
 def describe_range(rows: list[Row], name: str) -> str:
-    """Return least and largest value of a column as text; a dash if its cells are empty."""
-    if not rows[0][name]:
+    """Return least and largest value of a column as text; a dash if it is empty."""
+    rows = [row for row in rows if row[name]]
+    if not rows:
         return "–"
     values = read_column(rows, name)
-    return f"{values.min():.2f} to {values.max():.2f}"
+    return f"{values.min():.3g} to {values.max():.3g}"
 
 
-def draw() -> None:
-    """Draw a map of the numbers of peaks per damping ratio and natural length."""
+def draw_maps() -> None:
+    """Draw a map of the numbers of peaks per damping ratio and natural length, with the border."""
     rows = read_table(MAP_TABLE)
     panels = list(dict.fromkeys(map(get_panel, rows)))
     figure, axes = plt.subplots(
         2, 2, figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 5.6), sharex=True, sharey=True
     )
     for axis, panel in zip(axes.T.ravel(), panels, strict=True):
-        draw_map(axis, select_gaits(rows, panel))
+        draw_peak_map(axis, [row for row in rows if get_panel(row) == panel],
+                      "slope", "stiffness_number", max(PEAK_COLORS))  # fmt: skip
+        format_log_axes(axis, [0.03, 0.05, 0.1, 0.2, 0.3], [2, 3, 5, 10, 20])
         axis.set_title(f"damping ratio {float(panel[0]):.2f}, $L^*$ = {float(panel[1]):.2f} m")
+        if float(panel[0]) < 1.0:
+            borders = select_borders(panel[1])
+            for fill, group in (
+                ("black", [row for row in borders if not is_cut_off(row)]),
+                ("white", [row for row in borders if is_cut_off(row)]),
+            ):
+                axis.plot(read_column(group, "slope"), read_column(group, "stiffness_number"),
+                          "o-", color="black", markerfacecolor=fill, markersize=4)  # fmt: skip
         for name, (marker, _) in MARKED_SETS.items():
             params = vrw.parameter_sets[name].params
             if panel == (f"{compute_damping_ratio(params):.4f}", f"{params.natural_length:g}"):
                 axis.plot(float(params.slope), compute_stiffness_number(params), marker,
                           color="white", markeredgecolor="black", markersize=9)  # fmt: skip
     for axis in axes[:, 0]:
-        axis.set_ylabel("stiffness $k L_0 / (M g)$")
+        axis.set_ylabel(STIFFNESS_LABEL)
     for axis in axes[-1]:
-        axis.set_xlabel("slope $\\phi$ [rad]")
+        axis.set_xlabel(SLOPE_LABEL)
     shown_peaks = sorted({int(row["n_force_peaks"]) for row in rows if row["n_force_peaks"]})
-    labels = {0: "no smooth peak", 1: "one peak", 2: "two peaks", 3: "three peaks"}
     figure.legend(
         handles=[
             Patch(color=plots.LIGHT_GRAY_COLOR, label="no gait found"),
-            *(Patch(color=PEAK_COLORS[n], label=labels[n]) for n in shown_peaks),
-            Line2D([], [], linestyle="none", marker=".", color="black",
-                   label="at least one bounce in single support"),
+            *(Patch(color=PEAK_COLORS[n], label=PEAK_LABELS[n]) for n in shown_peaks),
+            Line2D([], [], color="black", marker="o", markersize=4,
+                   label="border: second peak meets trough"),
+            Line2D([], [], color="black", marker="o", markersize=4, markerfacecolor="white",
+                   label="border: touchdown at second peak"),
             *(Line2D([], [], linestyle="none", marker=marker, color="white",
                      markeredgecolor="black", markersize=8, label=label)
               for marker, label in MARKED_SETS.values()),
@@ -200,42 +288,38 @@ def draw() -> None:
     plots.save(figure, FIGURES, "force_peaks")
 
 
-def draw_map(axis: Axes, gaits: list[Row]) -> None:
-    """Draw the numbers of peaks of one map, with a dot for at least one bounce."""
-    n_peaks, has_bounce = (
-        np.full((N_PER_AXIS, N_PER_AXIS), np.nan),
-        np.zeros((N_PER_AXIS,) * 2, bool),
-    )
-    for row in gaits:
-        i = int(np.argmin(np.abs(STIFFNESS_NUMBERS - float(row["stiffness_number"]))))
-        j = int(np.argmin(np.abs(SLOPES - float(row["slope"]))))
-        n_peaks[i, j] = int(row["n_force_peaks"])
-        has_bounce[i, j] = has_whole_bounce(row)
-    i, j = np.nonzero(has_bounce)
-    axis.plot(SLOPES[j], STIFFNESS_NUMBERS[i], ".", color="black", markersize=3)
-    axis.set_facecolor(plots.LIGHT_GRAY_COLOR)
-    axis.pcolormesh(SLOPES, STIFFNESS_NUMBERS, n_peaks, shading="nearest",
-                    cmap=ListedColormap(list(PEAK_COLORS.values())),
-                    vmin=-0.5, vmax=len(PEAK_COLORS) - 0.5, rasterized=True)  # fmt: skip
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.set_xticks([0.03, 0.05, 0.1, 0.2, 0.3], ["0.03", "0.05", "0.1", "0.2", "0.3"])
-    axis.set_yticks([2, 3, 5, 10, 20], ["2", "3", "5", "10", "20"])
-    axis.minorticks_off()
-
-
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument(
-        "--redraw", action="store_true", help="draw the stored table without computing"
-    )
-    is_redrawn = parse_and_start_jax(parser).redraw
-    if not is_redrawn:
-        compute()
-    source = None if is_redrawn else describe_run("experiments.gaits.force_peaks")
-    replace_block(PAGE, "force_peaks", summarize(read_table(MAP_TABLE)), source)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART",
+                        help="compute these parts alone: " + ", ".join(PARTS))  # fmt: skip
+    parser.add_argument("--redraw", action="store_true", help="draw stored tables alone")
+    arguments = parse_and_start_jax(parser)
+    computed_parts = [] if arguments.redraw else arguments.only
+    for part in computed_parts:
+        PARTS[part]()
+    run = describe_run("experiments.gaits.force_peaks")
+    blocks = {
+        "force_peaks": ("maps", summarize_maps(read_table(MAP_TABLE))),
+        "force_peak_curve": ("borders", summarize_curve()),
+        "force_peak_bisections": ("borders", summarize_bisections()),
+        "force_peak_comparisons": ("comparisons", summarize_comparisons()),
+        "force_peak_spring_mass": ("stances", summarize_spring_mass()),
+    }
+    for block, (part, text) in blocks.items():
+        replace_block(PAGE, block, text, run if part in computed_parts else None)
     with plots.figure_style():
-        draw()
+        draw_maps()
+        draw_causes(read_table(MAP_TABLE))
+        draw_comparisons()
+
+
+PARTS = {
+    "maps": compute_maps,
+    "borders": compute_borders,
+    "comparisons": compute_comparisons,
+    "stances": compute_stances,
+}
+"""Functions that compute the tables, by the name of a part."""
 
 
 if __name__ == "__main__":
