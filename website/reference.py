@@ -51,14 +51,14 @@ def toml_page() -> str:
     lines = [_OPENING]
     lines += _section(
         "wheel",
-        "Parameters in this table are the same in all samples. Missing keys have the values of "
-        "Table 1.",
+        "The table `[wheel]` contains the parameters that are the same in all samples. Missing "
+        "keys have the values of Table 1 of the paper.",
     )
     wheel = [(f"`{n}`", f"{_DEFAULTS[n]:g}", d.unit, str(d).split(")")[0] + ")", d.description)
              for n, d in PARAMETER_DOMAINS.items()]  # fmt: skip
     wheel.append(("`n_legs`", "8", "", "5 and more", "number of legs, a whole number"))
     lines += format_markdown_table(("key", "default", "unit", "allowed", "meaning"), wheel)
-    lines += _section("model", "This table contains the model and its settings.")
+    lines += _section("model", "The table `[model]` contains the model and its settings.")
     model_names = list_model_config_names()
     choices = ", ".join(f'`"{name}"`' for name in model_names)
     rows = [("`name`", "", '`"viscoelastic"`', f"one of {choices}")]
@@ -89,18 +89,19 @@ starts. `python -m website --pages` generates this page from the sources.
 _HEADER = ("key", "default", "meaning")
 _DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
-    ("options", StepOptions, "This table contains the numerical options of a step."),
-    ("gait", GaitConfig, "This table contains the walk of `vrw gait`."),
+    ("options", StepOptions, "The table `[options]` contains the numerical options of a step."),
+    ("gait", GaitConfig, "The table `[gait]` contains the options of the walk of `vrw gait`."),
     (
         "scan",
         ScanConfig,
-        "This table contains the results of `vrw scan`. A separate table contains the design.",
+        "The table `[scan]` lists the measures that `vrw scan` computes, and contains the options "
+        "of the scan. A separate table contains the design.",
     ),
-    ("branch", BranchConfig, "This table contains the branch of `vrw continue`."),
+    ("branch", BranchConfig, "The table `[branch]` defines the branch of `vrw continue`."),
     (
         "tune",
         TuneConfig,
-        "This table contains the objective, bounds and constraints of `vrw tune`.",
+        "The table `[tune]` contains the objective, bounds and constraints of `vrw tune`.",
     ),
 )
 _GRID = (
@@ -157,28 +158,31 @@ def measures_page() -> str:
 _ON_MEASURES = """# Measures
 
 Every quantity has one name, symbol and unit in steps, cycles, trajectories, scans, branches and
-figures: `vrw.MEASURES["speed"].unit`. Scans and tuning accept the names of steps, margins and
-cycles. Scans also accept derivatives, as in `"d speed / d damping"`. `python -m website --pages`
-generates this page from the sources.
+figures: `vrw.MEASURES["speed"].unit`. Scans and tuning accept the names of measures of steps and
+cycles, and of margins. Scans also accept derivatives, as in `"d speed / d damping"`.
+`python -m website --pages` generates this page from the sources.
 """
 _GROUPS = (
-    ("Of a step", STEP_MEASURES, "`vrw.step`, gaits and scans report these measures."),
-    ("Margins", MARGIN_MEASURES, "A margin is positive while its condition holds. "
-        "`step.margins` and scans report margins."),
+    ("Of a step", STEP_MEASURES,
+        "The table lists measures that `vrw.step`, gaits and scans report."),
+    ("Margins", MARGIN_MEASURES, "A margin is positive if its condition holds. "
+        "`step.margins` and scans contain the margins of the table."),
     ("Of a step with unilateral contact", UNILATERAL_STEP_MEASURES, "Steps with unilateral "
-        "contact report these measures in addition to those of a step."),
+        "contact report the measures of this table in addition to those of a step."),
     ("Margins of stoppers with unilateral contact", STOPPER_MARGIN_MEASURES,
-        "Steps with stoppers that hold legs in the air report these margins."),
+        "Steps with stoppers that hold legs in the air report the margins of this table."),
     ("Of a gait", LIMIT_CYCLE_MEASURES | GAIT_SENSITIVITY_MEASURES,
-        "Limit cycles report these measures."),
+        "The table lists measures that limit cycles report."),
     ("Of the force in a gait", FORCE_PEAK_MEASURES, "Limit cycles of the paper's model report "
-        "these measures. `vrw.force_peaks` returns them for walks, but for the impulse."),
+        "the measures of this table. Except for the impulse, `vrw.force_peaks` returns the same "
+        "measures for walks."),
     ("Of walks over random slopes", PASSAGE_MEASURES,
-        "Scans with `slope_sd` report these measures."),
+        "Scans with `slope_sd` report the measures of this table."),
     ("Of a trajectory", TRAJECTORY_MEASURES,
-        "`vrw.simulate` returns these coordinates and variables."),
+        "The table lists the coordinates and variables of the result of `vrw.simulate`."),
     ("Of a trajectory with unilateral contact", CONTACT_MEASURES,
-        "`vrw.simulate` returns these variables of each leg."),
+        "With unilateral contact the result of `vrw.simulate` contains these variables of each "
+        "leg."),
     ("Parameters", PARAMETER_MEASURES, "The parameters are the axes of scans and branches."),
 )  # fmt: skip
 

@@ -133,14 +133,14 @@ def root(
 @app.command()
 def gait(
     config: Annotated[
-        Path | None, typer.Argument(help="TOML file; without one the wheel of Table 1.")
+        Path | None, typer.Argument(help="TOML file; by default the wheel of Table 1.")
     ] = None,
     changes: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter; may be repeated."),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, max=MAX_OPTION_INTEGER, help="Steps to walk.")
+        int | None, typer.Option(min=1, max=MAX_OPTION_INTEGER, help="Number of steps to walk.")
     ] = None,
 ) -> None:
     """Walk a wheel and print its gait: durations, speed, indicators, force peaks and margins.
@@ -225,7 +225,7 @@ def explore(
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(help="Where to write them.")] = Path("configs"),
+    folder: Annotated[Path, typer.Argument(help="Folder for the configs.")] = Path("configs"),
 ) -> None:
     """Write the example configs, from which you can derive your own.
 
@@ -334,7 +334,7 @@ def scan(
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Only print sizes, and memory and time measured on some samples."
+            "--explain", help="Only print sizes, and memory and time estimated from some samples."
         ),
     ] = False,
     verify: Annotated[
@@ -343,14 +343,14 @@ def scan(
     chunk: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MAX_OPTION_INTEGER, help="Most samples that are written at a time."
+            min=1, max=MAX_OPTION_INTEGER, help="Number of samples in a chunk of the store."
         ),
     ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Compute on the dask cluster at this address; 'local' starts one here.",
+            help="Address of a dask cluster; 'local' starts a cluster on this machine.",
         ),
     ] = None,
     picture: PictureOption = True,
@@ -399,7 +399,7 @@ def scan(
 
 @app.command()
 def robustness(
-    config: Annotated[Path, typer.Argument(help="TOML file with slope_sd in its table [scan].")],
+    config: Annotated[Path, typer.Argument(help=r"TOML file with slope_sd in its table \[scan].")],
     folder: FolderOption = None,
     picture: PictureOption = True,
 ) -> None:

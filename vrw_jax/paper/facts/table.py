@@ -22,7 +22,7 @@ from vrw_jax.printing import format_markdown_table
 FACTS_PAGE_INTRODUCTION = (
     "The paper is *Modeling and analysis of passive viscoelastic-legged rimless wheel that "
     "generates measurable period of double-limb support*. “Independent code” is a solver in the "
-    "paper's five constrained coordinates. It provides the reference if the paper prints no "
+    "paper's five constrained coordinates. This solver is the reference if the paper prints no "
     "number, or only a curve. A tolerance is half a unit of the last published digit unless the "
     "table gives another reason."
 )
@@ -74,7 +74,8 @@ def format_facts_page(paper_facts: Sequence[PaperFact]) -> str:
         "",
         "Figure 10 uses the slope 0.30 rad. Section 5.2 prints 0.10, but at this slope the gaits "
         "do not agree with the numbers of the figure (last group). With Coulomb friction the rear "
-        "foot would slip in the landing. In this model, as in the paper, it does not slip.",
+        "foot would slip in the landing. The paper assumes that the foot does not slip, "
+        "and so does this model.",
     ]
     for group_title, facts_of_group in itertools.groupby(
         paper_facts, lambda paper_fact: paper_fact.group
