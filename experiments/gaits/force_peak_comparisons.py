@@ -1,9 +1,10 @@
-"""Count force peaks over leg mass, and with unilateral contact.
+"""Count force peaks over damping and leg mass, and with unilateral contact.
 
     python -m experiments.gaits.force_peak_comparisons
 
-All wheels have L* = L0, and the damping ratio of the parameter set `two_peaks`. The command writes
-`force_peak_leg_mass.csv` and `force_peak_contact.csv`.
+All wheels have L* = L0. Except in the map over damping, they have the damping ratio of the
+parameter set `two_peaks`. The command writes `force_peak_damping.csv`, `force_peak_leg_mass.csv`
+and `force_peak_contact.csv`.
 """
 
 import jax
@@ -15,6 +16,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, write_named_rows
 
 LEG_MASS_TABLE = FIGURES / "force_peak_leg_mass.csv"
+DAMPING_TABLE = FIGURES / "force_peak_damping.csv"
 CONTACT_TABLE = FIGURES / "force_peak_contact.csv"
 
 LIGHT_DAMPING = compute_damping_ratio(vrw.parameter_sets["two_peaks"].params)
@@ -23,6 +25,9 @@ STIFFNESS_NUMBERS = np.geomspace(3.0, 24.0, N_PER_AXIS)
 SLOPES = np.geomspace(0.03, 0.2, N_PER_AXIS)
 LEG_SHARES = np.linspace(0.05, 0.75, N_PER_AXIS)
 """Masses of all legs as fractions of the mass of the wheel; that of Table 1 is 0.44."""
+
+DAMPING_RATIOS = np.linspace(0.05, 1.15, N_PER_AXIS)
+"""Damping ratios, chosen because they cover the parameter sets `two_peaks` and `table_1`."""
 
 MAP_SLOPE = 0.075  # rad, that of the parameter set `two_peaks`
 FRICTIONS = np.geomspace(0.2, 3.0, N_PER_AXIS)
@@ -35,6 +40,15 @@ def compute_leg_masses() -> None:
     number, share = (x.ravel() for x in np.meshgrid(STIFFNESS_NUMBERS, LEG_SHARES, indexing="ij"))
     params = make_wheels(number, LIGHT_DAMPING, MAP_SLOPE, leg_share=share)
     write_named_rows(LEG_MASS_TABLE, make_lines(params, number, "leg_share", share))
+
+
+def compute_dampings() -> None:
+    """Search gaits over stiffness and damping ratio at one slope, and write their force peaks."""
+    number, ratio = (
+        x.ravel() for x in np.meshgrid(STIFFNESS_NUMBERS, DAMPING_RATIOS, indexing="ij")
+    )
+    params = make_wheels(number, ratio, MAP_SLOPE)
+    write_named_rows(DAMPING_TABLE, make_lines(params, number, "damping_ratio", ratio))
 
 
 def make_lines(
@@ -97,6 +111,7 @@ def compute_contact_gaits(
 def compute_comparisons() -> None:
     """Compute all tables."""
     compute_leg_masses()
+    compute_dampings()
     compute_contact()
 
 

@@ -10,16 +10,20 @@ from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+import vrw_jax as vrw
 from experiments.gaits.force_peak_comparisons import (
     CONTACT_TABLE,
+    DAMPING_TABLE,
     FRICTION_STIFFNESS_NUMBER,
     LEG_MASS_TABLE,
     MAP_FRICTION,
     MAP_SLOPE,
 )
-from experiments.gaits.force_peak_stances import STANCE_TABLE
+from experiments.gaits.force_peak_stances import SPRING_MASS_TABLE, STANCE_TABLE
 from experiments.gaits.force_peak_wheels import (
     TABLE_1,
+    compute_damping_ratio,
+    compute_stiffness_number,
     compute_total_mass,
 )
 from experiments.shared.tables import FIGURES, Row, group_rows, read_column, read_table
@@ -80,15 +84,16 @@ def draw_peak_map(
 
 
 def draw_causes(map_rows: list[Row]) -> None:
-    """Draw forces over a stance, and times of peaks in periods of the bounce."""
+    """Draw forces over a stance, times of peaks in periods of the bounce, and a map of damping."""
     figure, panels = plt.subplot_mosaic(
-        [["stances", "times"]],
-        figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 3.3),
-        width_ratios=(1.25, 1.0),
+        [["stances", "stances"], ["times", "dampings"]],
+        figsize=(plots.PAGE_FIGURE_WIDTH_INCHES, 5.4),
+        height_ratios=(1.0, 1.15),
     )
     draw_stances(panels["stances"])
     draw_peak_times(panels["times"], map_rows)
-    for letter, axis in zip("ab", panels.values(), strict=True):
+    draw_dampings(panels["dampings"])
+    for letter, axis in zip("abc", panels.values(), strict=True):
         draw_panel_letter(axis, letter)
     plots.save(figure, FIGURES, "force_peak_causes")
 
@@ -106,8 +111,8 @@ def draw_stances(axis: Axes) -> None:
     axis.text(1.01, 0.93, "next touchdown", fontsize=8, transform=axis.get_xaxis_transform())
     axis.set_xlabel("time since the landing of the foot [durations of a step]")
     axis.set_ylabel("force on the foot / weight")
-    axis.set_ylim(0.0, 1.75)
-    axis.legend(loc="upper left")
+    axis.set_ylim(0.0, 1.6)
+    axis.legend(loc="upper right")
 
 
 def draw_peak_times(axis: Axes, map_rows: list[Row]) -> None:
@@ -123,6 +128,28 @@ def draw_peak_times(axis: Axes, map_rows: list[Row]) -> None:
     axis.set_xlabel("first peak to next touchdown\n[periods of the bounce]")
     format_stiffness_axis(axis)
     axis.legend(loc="lower right")
+
+
+def draw_dampings(axis: Axes) -> None:
+    """Draw the numbers of peaks over damping and stiffness, and the marked walkers."""
+    draw_peak_map(axis, read_table(DAMPING_TABLE), "damping_ratio", "stiffness_number", 3)
+    for name, marker, label in (
+        ("table_1", "D", "Table 1 (at 0.3 rad)"),
+        ("two_peaks", "*", "two-peak wheel"),
+    ):
+        params = vrw.parameter_sets[name].params
+        axis.plot(compute_damping_ratio(params), compute_stiffness_number(params), marker,
+                  color="white", markeredgecolor="black", markersize=8, label=label,
+                  linestyle="none", clip_on=False)  # fmt: skip
+    spring_mass = read_table(SPRING_MASS_TABLE)[0]
+    axis.plot(0.0, float(spring_mass["stiffness_number"]), "^", color="white",
+              markeredgecolor="black", markersize=7, label="spring-mass walker",
+              linestyle="none", clip_on=False)  # fmt: skip
+    axis.set_xlabel("damping ratio $c / (2 \\sqrt{k M})$")
+    axis.set_title(f"slope {MAP_SLOPE:g} rad")
+    axis.set_xlim(left=0.0)
+    format_stiffness_axis(axis)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=2, fontsize=7)
 
 
 def format_stiffness_axis(axis: Axes) -> None:

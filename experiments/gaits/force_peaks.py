@@ -28,6 +28,7 @@ from experiments.gaits.force_peak_borders import (
 )
 from experiments.gaits.force_peak_comparisons import (
     CONTACT_TABLE,
+    DAMPING_TABLE,
     LEG_MASS_TABLE,
     compute_comparisons,
 )
@@ -158,6 +159,7 @@ def summarize_comparisons() -> str:
     """Return a table in Markdown: numbers of gaits by number of peaks, one line per map."""
     contact_maps = group_rows(read_table(CONTACT_TABLE), "map")
     groups = (
+        ("over damping and stiffness, the paper's model", read_table(DAMPING_TABLE)),
         ("over leg mass and stiffness, the paper's model",
          read_table(LEG_MASS_TABLE)),
         ("over slope and stiffness, unilateral contact", contact_maps["stiffness"]),
