@@ -265,8 +265,10 @@ def slowing(rows: list[Row]) -> Figure:
         error = read_column(rows, f"{name}_period_error")
         look = {"color": colour, "marker": marker, "ms": 3.5, "lw": 0.9}
         right.loglog(x, error, label=result, **look)
-    left_part.set(xlabel="slope less that of the stop [rad]", ylabel="period [s]")
-    right.set(xlabel="slope less that of the stop [rad]", ylabel="relative error of the period")
+    left_part.set(xlabel="slope minus the least slope of a gait [rad]", ylabel="period [s]")
+    right.set(
+        xlabel="slope minus the least slope of a gait [rad]", ylabel="relative error of the period"
+    )
     for axes in (left_part, right):
         axes.grid(color="0.9", lw=0.4)
         axes.legend()

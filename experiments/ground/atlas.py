@@ -153,12 +153,12 @@ def draw() -> None:
         axes[0, column].set_title(label)
         axes[-1, column].set_xlabel("damping $c$ [N·s/m]")
         figure.colorbar(image, ax=axes[:, column], location="bottom", extend="both", aspect=18)
-    for axis, text in zip(axes[:, 0], ("slower", "faster of two"), strict=True):
-        axis.set_ylabel(f"{text}: friction coefficient $\\mu$")
+    for axis, text in zip(axes[:, 0], ("slower gait", "faster gait"), strict=True):
+        axis.set_ylabel(f"{text}: friction $\\mu$")
     lines = [
         Line2D([], [], **FOLD_MARKER, label="fold that ends the slow gait"),
         Line2D([], [], color="black", linewidth=0.8, label="$\\tan\\phi$: no gait below"),
-        Patch(color=NO_GAIT_COLOR, label="one gait attracts"),
+        Patch(color=NO_GAIT_COLOR, label="no such gait"),
     ]
     figure.legend(handles=lines, loc="outside lower center", ncols=3)
     plots.save(figure, FIGURES, "ground_atlas")

@@ -28,7 +28,7 @@ N_FIRST, SEED, SOLVER = 10, 0, "Tsit5"
 DAMPING, FRICTION = (150.0, 350.0), (0.5, 1.2)
 START = (0.1, 1.6, -0.1)
 TOLERANCES = (3e-13, *(10.0**-power for power in range(12, 4, -1)))  # The first is the reference.
-STOPPERS = {"bilateral": "that hold", "one-sided": "that only push"}
+STOPPERS = {"bilateral": "bilateral stoppers", "one-sided": "one-sided stoppers"}
 DIP_DEPTH_PER_ATOL, MIN_DIP_DEPTH = 1e-2, 1e-13
 TABLE = FIGURES / "ground_cut.csv"
 HEADER = ("stoppers", "tolerance", "cut_m", "median_s", "p90_s", "largest_s", "tried_per_step")
@@ -83,11 +83,11 @@ def draw() -> None:
     ):
         tolerances = read_column(rows, "tolerance")[1:]
         for name, line in (("median_s", "-"), ("p90_s", "--"), ("largest_s", ":")):
-            label = f"{STOPPERS[stoppers]}: {name[:-2].replace('p90', '90 %')}"
+            label = f"{STOPPERS[stoppers]}: {name[:-2].replace('p90', '90th percentile')}"
             axis.loglog(
                 tolerances, read_column(rows, name)[1:], line, color=color, marker=".", label=label
             )
-    axis.set(xlabel="tolerance; a hundredth of it in m is cut", ylabel="error of a step's time [s]")
+    axis.set(xlabel="tolerance", ylabel="error of the step's duration [s]")
     axis.legend(fontsize="small")
     plots.save(figure, FIGURES, "ground_cut")
 

@@ -158,7 +158,7 @@ def draw(rows: list[Any]) -> None:
             first = [(float(r["samples"]), float(r[key])) for r in cold]
             text = f"{label}, with compiling"
             axes.plot(*zip(*first, strict=True), mark, color=colour, mfc="white", ms=4, label=text)
-        right.axhline(2048, color=plots.DARK_GRAY_COLOR, linestyle=":", label="aimed at, at most")
+        right.axhline(2048, color=plots.DARK_GRAY_COLOR, linestyle=":", label="2 GiB")
         for axes in (left_part, right):
             axes.legend(fontsize=7)
     plots.save(figure, FIGURES, "scan_benchmark")

@@ -161,7 +161,7 @@ def panels(rows: list[Row], quantities: list[str], x_of, x_label: str) -> Figure
     for quantity, axes in zip(quantities, grid, strict=True):
         draw_panel(axes, rows, quantity, x_of)
         axes.set_xlabel(x_label)
-    grid[0].set_ylabel("error, 99 % of lanes below it;\nbar from the median to the worst")
+    grid[0].set_ylabel("error, 99th percentile;\nbars from the median to the maximum")
     solution: dict[str, object] = {}
     for axes in grid:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

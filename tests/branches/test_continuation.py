@@ -136,6 +136,8 @@ def test_the_branch_turns_back_at_a_fold_and_continues_unstable():
     values, b = branch.values, 0.3
     turn = int(np.argmin(values))
     assert 0 < turn < values.size - 1
+    printed_range = f"from {values.min():.6g} to {values.max():.6g}"
+    assert printed_range in str(branch), "both ends of a branch with a fold have large values"
     x = branch.dataset.x.values[:, 0]
     residual = values * x**2 + (1.0 - b) * x - 1.0
     assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(values * x**2).max())

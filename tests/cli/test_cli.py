@@ -287,6 +287,7 @@ def test_a_gait_is_printed_with_its_margins(config: Path) -> None:
 
 def test_help_shows_brackets_and_every_command(config: Path) -> None:
     assert "[branch]" in run_command("continue", "--help").output
+    assert "[scan]" in run_command("robustness", "--help").output
     for command in ("init", "tune", "continue"):
         assert run_command(command, "--help").exit_code == 0
 

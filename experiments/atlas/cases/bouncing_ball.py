@@ -55,7 +55,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         error = np.abs(walk_result.times - reference[:n]) + 1e-17
         axes.semilogy(np.arange(1, n + 1), error, marker, ms=3, label=f"{walk_result.method}: {n}")
     axes.set_xlabel("bounce")
-    axes.set_ylabel("error of its time [s]")
+    axes.set_ylabel("error of the event time [s]")
     axes.legend(title="bounces found")
 
 

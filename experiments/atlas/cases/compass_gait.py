@@ -125,7 +125,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         label="published",
     )
     axes.set_xlabel("angle from the vertical [rad]")
-    axes.set_ylabel("its rate [rad/s]")
+    axes.set_ylabel("angular velocity [rad/s]")
     axes.legend()
 
 

@@ -188,7 +188,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         axes.loglog(depths[missed], np.full(missed.sum(), 30.0**k), "x", color=line[0].get_color())
     axes.loglog(depths, 1e-16 / (W * np.sqrt(2.0 * depths)), "k-", lw=0.7, label="rounding")
     axes.set_xlabel("depth of touching")
-    axes.set_ylabel("error of its time (×: missed)")
+    axes.set_ylabel("error of the event time (×: missed)")
     axes.legend(loc="center right", bbox_to_anchor=(1.0, 0.6))
 
 

@@ -127,13 +127,13 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
         [t.relative_error[1] for t, _ in result_list],
         "o--",
         mfc="w",
-        label="its own estimate",
+        label="estimated error",
     )
     naive = [
         abs(multiply_segments(np.linalg.multi_dot(maps[::-1]))[1] / SMALL_MULTIPLIER - 1.0)
         for _, maps in result_list
     ]
-    axes.loglog(counts, naive, "s:", label="their product")
+    axes.loglog(counts, naive, "s:", label="product of the matrices")
     axes.set_xlabel("segments")
     axes.set_ylabel("relative error of $\\exp(-48\\pi)$")
     axes.legend()

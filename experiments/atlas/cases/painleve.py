@@ -124,7 +124,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     for angle, rate, _ in STATES.values():
         axes.plot(angle, rate, "ko", ms=4)
     axes.set_xlabel("angle to the ground [rad]")
-    axes.set_ylabel("its rate [rad/s]")
+    axes.set_ylabel("angular velocity [rad/s]")
 
 
 CASE = Case(

@@ -86,7 +86,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
             label=walk_result.method,
         )
     axes.set_xlabel("event: on the pin, off the pin, ...")
-    axes.set_ylabel("error of its time [s]")
+    axes.set_ylabel("error of the event time [s]")
     axes.set_ylim(1e-19, 1e-10)
     axes.legend(loc="lower center", ncols=4)
 

@@ -69,7 +69,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
             depths[missed], np.full(missed.sum(), 3.0 ** (1 + k)), "x", color=line[0].get_color()
         )
     axes.set_xlabel("depth of the dip")
-    axes.set_ylabel("error of its time (×: missed)")
+    axes.set_ylabel("error of the event time (×: missed)")
     axes.legend()
 
 

@@ -208,7 +208,7 @@ def draw(figure: Figure, rows: list[dict[str, str]]) -> None:
     axes.plot(walk_result.states[:, 3], walk_result.states[:, 4], "k.", label="events")
     axes.plot(SECTION, PUBLISHED_RATES[1], "*", color="C1", ms=9, label="published")
     axes.set_xlabel("angle of the bird [rad]")
-    axes.set_ylabel("its rate [rad/s]")
+    axes.set_ylabel("angular velocity [rad/s]")
     axes.legend()
 
 
