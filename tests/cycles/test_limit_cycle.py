@@ -308,6 +308,7 @@ def test_a_missing_gait_is_nan_in_value_and_derivative_on_request():
     assert all(np.isnan(value) for value in result.values())
 
 
+@pytest.mark.slow  # compiles reverse derivatives of a cycle twice
 def test_step_and_cycle_agree_on_the_smooth_margin():
     of_cycle = lambda params: vrw.limit_cycle(params).takeoff_acceleration
 

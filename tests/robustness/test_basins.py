@@ -206,7 +206,7 @@ def test_just_below_the_smallest_disturbance_five_coordinates_walk_on(gait_step,
     assert ending in ("touchdown", five_coordinates.TOUCHDOWN_EARLY)
 
 
-@pytest.mark.parametrize("damping", [100.0, 200.0])
+@pytest.mark.parametrize("damping", [pytest.param(100.0, marks=pytest.mark.slow), 200.0])
 def test_no_smaller_disturbance_at_random_instants_leaves_the_basin(damping):
     # At these dampings the smallest disturbances are in SLS-I and in double support.
     params = vrw.WheelParams(damping=damping)

@@ -218,6 +218,7 @@ def test_bad_arguments_are_one_sentence(changes, choices, sentence):
         vrw.first_passage(vrw.WheelParams(**changes), **({"slope_sd": 0.01} | choices))
 
 
+@pytest.mark.slow  # a million counted steps
 def test_derivatives_of_sampled_means_are_those_of_quadrature():
     """For the rigid wheel, with respect to every parameter and the standard deviation."""
     slope_sd = 2.0 * DEGREE

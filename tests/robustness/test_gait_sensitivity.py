@@ -90,20 +90,33 @@ def test_gradients_are_central_differences():
     assert abs(gradient / ((4.0 * inner - outer) / 3.0) - 1.0) < 1e-6
 
 
-def test_the_norm_is_a_measure_of_cycles_tables_and_scans(tmp_path):
-    names = ["gait_sensitivity_period", "gait_sensitivity_speed"]
+NORM_NAMES = ["gait_sensitivity_period", "gait_sensitivity_speed"]
+
+
+def test_the_norm_is_a_measure_of_cycles():
     expected = vrw.gait_sensitivity(TABLE_1, ("period", "speed")).norm
     cycle = vrw.limit_cycle(TABLE_1)
-    np.testing.assert_allclose([cycle.measure(name) for name in names], expected, rtol=1e-12)
-    table = vrw.sensitivities(TABLE_1, measures=names)
+    np.testing.assert_allclose([cycle.measure(name) for name in NORM_NAMES], expected, rtol=1e-12)
+
+
+@pytest.mark.slow  # compiles second derivatives of a step for a batch
+def test_the_norm_is_a_measure_of_scans(tmp_path):
+    expected = vrw.gait_sensitivity(TABLE_1, ("period", "speed")).norm
+    design = vrw.grid(damping=[150.0, 200.0])
+    scan = vrw.scan(design, measures=NORM_NAMES, store=tmp_path / "scan")
+    np.testing.assert_allclose(scan.gait_sensitivity_period.values[1], expected[0], rtol=1e-9)
+
+
+@pytest.mark.slow  # compiles derivatives of derivatives of a cycle
+def test_the_norm_is_a_measure_of_tables_of_sensitivities():
+    expected = vrw.gait_sensitivity(TABLE_1, ("period", "speed")).norm
+    table = vrw.sensitivities(TABLE_1, measures=NORM_NAMES)
     np.testing.assert_allclose(table.value, expected, rtol=1e-9)
     gradient = jax.jit(jax.grad(lambda p: vrw.gait_sensitivity(p, "period").norm[0]))(TABLE_1)
     exact = [gradient.damping, gradient.slope]
-    of_table = table.derivative.sel(measure=names[0], parameter=["damping", "slope"])
+    of_table = table.derivative.sel(measure=NORM_NAMES[0], parameter=["damping", "slope"])
     np.testing.assert_allclose(of_table, exact, rtol=1e-7)
     assert table.measure_unit.values.tolist() == ["s/rad", "m/(s rad)"]
-    scan = vrw.scan(vrw.grid(damping=[150.0, 200.0]), measures=names, store=tmp_path / "scan")
-    np.testing.assert_allclose(scan.gait_sensitivity_period.values[1], expected[0], rtol=1e-9)
 
 
 def test_the_rigid_wheel_has_the_norm_of_its_closed_map():
