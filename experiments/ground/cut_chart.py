@@ -77,7 +77,7 @@ def compute(wheels: int) -> None:
 
 def draw() -> None:
     """Draw median, 90th percentile and largest error over the tolerance."""
-    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE_FIGURE_WIDTH_INCHES, 2.8))
+    figure, axis = plt.subplots(figsize=(0.6 * plots.PAGE_FIGURE_WIDTH_INCHES, 3.4))
     for color, (stoppers, rows) in zip(
         ("#0072B2", "#D55E00"), group_rows(read_table(TABLE), "stoppers").items(), strict=True
     ):
@@ -88,7 +88,7 @@ def draw() -> None:
                 tolerances, read_column(rows, name)[1:], line, color=color, marker=".", label=label
             )
     axis.set(xlabel="tolerance", ylabel="error of the step's duration [s]")
-    axis.legend(fontsize="small")
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     plots.save(figure, FIGURES, "ground_cut")
 
 

@@ -79,7 +79,7 @@ def draw() -> None:
     axes[1].bar(positions, 100.0 * share, color=colors(0), label="the paper's wheel")
     axes[1].bar(positions, 100.0 * (1.0 - share), bottom=100.0 * share, **ground)
     axes[1].set(ylabel="share of gaits [%]", title="chosen model")
-    cost = {r["rung"]: float(r["us_in_a_batch"]) for r in read_table(COST_TABLE)}
+    cost = {r["model"]: float(r["us_in_a_batch"]) for r in read_table(COST_TABLE)}
     paper = np.full(len(FRICTION), cost["paper"])  # Every gait is computed with this model first.
     axes[2].bar(positions, paper, color=colors(0))
     axes[2].bar(positions, (1.0 - share) * cost["ground"], bottom=paper, **ground)

@@ -124,7 +124,7 @@ def measure_costs() -> None:
         ]
         rows.append(row)
         print(row, flush=True)
-    write_table(FIGURES / "rung_costs.csv", ("rung", "ms_alone", "us_in_a_batch"), rows)
+    write_table(FIGURES / "rung_costs.csv", ("model", "ms_alone", "us_in_a_batch"), rows)
     show_table(
         "benchmarks/contact.md", FIGURES / "rung_costs.csv", "experiments.ground.model_table"
     )

@@ -113,11 +113,11 @@ def measure_hit_rate() -> dict[str, int]:
     x = np.asarray(cold.section_state)
     away = np.max(np.abs(np.asarray(walk(params, cold.section_state)) - x), axis=-1)
     return {
-        "sets": N_SETS,
-        "reached by continuation": int(reached.sum()),
-        "of those found from a cold start": int((reached & values_array).sum()),
-        "found besides": int((values_array & ~reached).sum()),
-        "found, but not confirmed by the event-driven step to 1e-7": int(
+        "random wheels": N_SETS,
+        "gait reached by continuation": int(reached.sum()),
+        "gait also found without a guess": int((reached & values_array).sum()),
+        "gait found without a guess only": int((values_array & ~reached).sum()),
+        "gait found, but not confirmed by the event-driven step to 1e-7": int(
             (values_array & ~(away < 1e-7)).sum()
         ),
     }

@@ -38,7 +38,7 @@ COLUMNS = {
     "all twelve": ("section_state", *PARAMETER_NAMES),
 }
 LABELS = (
-    "lanes' machine code",
+    "lane engine, machine code",
     "heyoka, variational equations",
     "numba, central differences",
     "diffrax engine, forward mode",
@@ -55,8 +55,8 @@ print(time.perf_counter() - began)
 """
 SINGLE_WHEEL_CALLS = {
     "return_map": "jax.jit(vrw.return_map)",
-    "its Jacobian by the state": "jax.jit(jax.jacfwd(vrw.return_map, 1))",
-    "its Jacobian by all twelve": "jax.jit(jax.jacfwd(vrw.return_map, (0, 1)))",
+    "Jacobian of return_map, state": "jax.jit(jax.jacfwd(vrw.return_map, 1))",
+    "Jacobian of return_map, all twelve inputs": "jax.jit(jax.jacfwd(vrw.return_map, (0, 1)))",
     "step": "jax.jit(vrw.step)",
     "simulate of three steps": "(lambda params, x: vrw.simulate(params, x, 3).time.values)",
 }
@@ -242,17 +242,18 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     chosen = parse_and_start_jax(parser)
     header = (
-        "tolerance", "tightened by", "columns", "µs a lane", "of the values'",
-        "p99 error of values", "of derivatives",
+        "tolerance", "tightened by", "columns", "µs per element", "multiple of the values' time",
+        "p99 error of values", "p99 error of derivatives",
     )  # fmt: skip
     batches = format_markdown(header, in_batches(chosen.lanes, chosen.repeats))
     one = format_markdown(
-        ("one wheel", "µs", "first answer, s", "the same, cached, s"), measure_single_calls()
+        ("one wheel", "µs", "first result of a process, s", "first result with cached code, s"),
+        measure_single_calls(),
     )
     others = compare_with_others(chosen.lanes, chosen.repeats)
     draw_chart(others)
     header = ("method", "tolerance", "p99 error", "steps with 7 columns per second and core",
-              "of the lanes'")  # fmt: skip
+              "relative speed")  # fmt: skip
     compared = format_markdown(header, find_fastest(others))
     result = (
         f"{describe_processor()}; load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."

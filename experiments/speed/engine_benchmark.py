@@ -219,7 +219,7 @@ def write(table, shares, cost, out):
     best = at_claimed_error(table)
     fastest = best["lanes"]["steps_per_s"]
     header = ("engine", "method, tolerance", "p99 error", "gait steps per second and core")
-    header = (*header, "of the lane engine's")
+    header = (*header, "relative speed")
     cells = [
         (
             LABELS[name],

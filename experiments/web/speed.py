@@ -151,19 +151,19 @@ def main() -> None:
         chromium["unilateral"],
     )
     rows = [
-        ("a slider moved: gait, multipliers, forces, margins", f"{node['update']:.1f} ms",
-         f"{times[0]:.0f} ms, 95 in 100 below {times[1]:.0f}"),
-        ("the same without a gait: searched, then walked until it ends",
-         "{:.0f} ms, 95 in 100 below {:.0f}, none above {:.0f}".format(*node["lost"]), ""),
+        ("gait, multipliers, forces and margins after a slider moves", f"{node['update']:.1f} ms",
+         f"{times[0]:.0f} ms, 95 % below {times[1]:.0f} ms"),
+        ("the same for a wheel without a gait: search, and walk until the fall",
+         "{:.0f} ms, 95 % below {:.0f} ms, none above {:.0f} ms".format(*node["lost"]), ""),
         ("a basin of 64 × 64 starts", f"{node['basin'] / 1000:.2f} s", f"{basin:.1f} s"),
         ("a map of 65 × 65 gaits", "", f"{full_values:.1f} s"),
-        ("unilateral contact: a slider moved a little",
-         "{:.0f} ms, 95 in 100 below {:.0f}".format(*node["real"]),
-         f"{real[0]:.0f} ms, 95 in 100 below {real[1]:.0f}"),
+        ("unilateral contact: gait after a slider moves a little",
+         "{:.0f} ms, 95 % below {:.0f} ms".format(*node["real"]),
+         f"{real[0]:.0f} ms, 95 % below {real[1]:.0f} ms"),
         ("unilateral contact: a basin of 32 × 32 starts", "", f"{slow:.0f} s"),
         ("unilateral contact: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
     ]  # fmt: skip
-    table = format_markdown(("", "Node, CPU time", "Chromium, wall time, all drawn"), rows)
+    table = format_markdown(("", "Node, CPU time", "Chromium, wall time, with drawing"), rows)
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     replace_block(
         ROOT / "docs" / "explore.md",
